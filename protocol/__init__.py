@@ -1,0 +1,1 @@
+"""The wire: interface definition, framing, segmentation and transports (sans-I/O codecs first)."""

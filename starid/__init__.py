@@ -1,0 +1,1 @@
+"""Star catalogue, camera, detection, identification and attitude: the numerics of a star tracker."""
