@@ -1,0 +1,37 @@
+# make demo   set up and run the product end to end; results in out/demo
+# make test   set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
+# make lint   ruff and mypy --strict
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# pip's start-up look at the network for a newer pip is of no use here
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help demo test lint clean
+help:
+	@sed -n 's/^# make /make /p' Makefile
+
+$(VENV)/.product: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "starhil needs Python 3.11 or newer; call: make PYTHON=/path/to/python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.developer: $(VENV)/.product
+	$(BIN)/pip install --quiet --editable '.[test,lint]'
+	@touch $@
+
+demo: $(VENV)/.product
+	$(BIN)/python tools/demo.py --out out/demo
+
+test: $(VENV)/.developer
+	$(BIN)/python -m pytest -m "not socketcan"
+	tools/test_on_vcan $(BIN)/python
+
+lint: $(VENV)/.developer
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) out build dist
