@@ -1,0 +1,310 @@
+"""Attitude: one rotation from ICRS into the sensor frame, and every way in and out of it.
+
+Conventions, binding everywhere in the project:
+
+- The sensor frame is +x right (columns of the image), +y down (rows), +z boresight.
+- A quaternion is scalar-last ``(x, y, z, w)`` and *rotates vectors*: ``v_sensor = q ⊗ v_icrs ⊗ q*``, the
+  convention of ``scipy.spatial.transform.Rotation``. The (Shuster) attitude quaternion of the spacecraft
+  literature has the vector part of opposite sign.
+- Roll is the angle by which celestial north is turned, counter-clockwise in the image, from image up.
+  With b the boresight and n, e the unit vectors to north and east at b, the rows of the matrix are
+  ``x = −sin(roll)·n − cos(roll)·e``, ``y = −cos(roll)·n + sin(roll)·e``, ``z = b``.
+- At a celestial pole right ascension is undefined: it is reported as 0° and roll carries the whole turn,
+  so that the triple always rebuilds the attitude.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.errors import StaridError
+
+ARCSEC_PER_RAD: Final = 180.0 * 3600.0 / math.pi
+"""Arcseconds in one radian."""
+
+_POLE_RADIUS: Final = 1e-12
+"""Boresights nearer to a pole than this (radians) are reported as being on it."""
+
+_ROTATION_TOLERANCE: Final = 1e-6
+"""Largest deviation from orthonormality that `Attitude.from_matrix` accepts."""
+
+_SMALL_ANGLE: Final = 1e-8
+"""Below this angle (radians) sin(a/2)/a is 1/2 to the last bit."""
+
+
+@dataclass(frozen=True)
+class AttitudeError:
+    """How far one attitude is from another.
+
+    Attributes
+    ----------
+    cross_boresight_arcsec : float
+        Angle between the two boresights, ≥ 0.
+    roll_arcsec : float
+        Rotation about the boresight (the twist of the swing-twist split), ≥ 0.
+    total_arcsec : float
+        Angle of the whole rotation between the two, ≥ 0.
+    rotation_vector_rad : ndarray (3,)
+        Rotation vector e in the sensor frame, radians: ``A_this = exp(−[e]×)·A_truth``, that is, this
+        attitude is the truth after the sensor has turned by +e.
+    """
+
+    cross_boresight_arcsec: float
+    roll_arcsec: float
+    total_arcsec: float
+    rotation_vector_rad: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Attitude:
+    """The orientation of the sensor against ICRS, held as a unit quaternion.
+
+    Attributes
+    ----------
+    quaternion_xyzw : ndarray (4,)
+        Scalar-last unit quaternion ICRS→sensor, scalar part ≥ 0, read-only.
+
+    Raises
+    ------
+    StaridError
+        The quaternion is not four finite numbers, or all of them are zero.
+    """
+
+    quaternion_xyzw: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        values = np.array(self.quaternion_xyzw, dtype=np.float64)
+        if values.shape != (4,):
+            raise StaridError(f"attitude quaternion: {values.shape} given, four numbers x, y, z, w needed")
+        x, y, z, w = values.tolist()
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        if not (math.isfinite(norm) and norm > 0.0):
+            raise StaridError(
+                f"attitude quaternion: {values.tolist()} has no direction; give four finite numbers"
+            )
+        values /= -norm if w < 0.0 else norm
+        values.flags.writeable = False
+        object.__setattr__(self, "quaternion_xyzw", values)
+
+    @classmethod
+    def from_quaternion(cls, quaternion_xyzw: ArrayLike) -> Self:
+        """Attitude of a scalar-last quaternion (4,) of any length and sign."""
+        return cls(np.asarray(quaternion_xyzw, dtype=np.float64))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Self:
+        """Attitude of a rotation matrix.
+
+        Parameters
+        ----------
+        matrix : array (3, 3)
+            ICRS→sensor; its rows are the sensor's axes in ICRS.
+
+        Raises
+        ------
+        StaridError
+            The matrix is not a proper rotation to 1e-6.
+        """
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.shape != (3, 3):
+            raise StaridError(f"attitude matrix: shape {m.shape} given, (3, 3) needed")
+        deviation = float(np.max(np.abs(m @ m.T - np.eye(3))))
+        if not deviation <= _ROTATION_TOLERANCE or float(np.linalg.det(m)) < 0.0:
+            raise StaridError(
+                "attitude matrix: not a rotation; its rows must be orthonormal and right-handed"
+            )
+        return cls(_quaternion_of(m))
+
+    @classmethod
+    def from_radec_roll(cls, ra_deg: float, dec_deg: float, roll_deg: float) -> Self:
+        """Attitude of a boresight and a roll.
+
+        Parameters
+        ----------
+        ra_deg, dec_deg : float
+            Boresight, degrees ICRS; right ascension of any turn, declination within ±90°.
+        roll_deg : float
+            Angle of celestial north, counter-clockwise in the image, from image up, degrees.
+
+        Raises
+        ------
+        StaridError
+            A value is not finite, or the declination is beyond ±90°.
+        """
+        if not (math.isfinite(ra_deg) and math.isfinite(roll_deg) and -90.0 <= dec_deg <= 90.0):
+            raise StaridError(
+                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: degrees needed, Dec within ±90"
+            )
+        north, east, boresight = _local_frame(math.radians(ra_deg % 360.0), math.radians(dec_deg))
+        roll = math.radians(roll_deg % 360.0)
+        s, c = math.sin(roll), math.cos(roll)
+        return cls(_quaternion_of(np.array([-s * north - c * east, -c * north + s * east, boresight])))
+
+    @classmethod
+    def identity(cls) -> Self:
+        """Sensor axes along the ICRS axes: boresight at the north celestial pole."""
+        return cls(np.array([0.0, 0.0, 0.0, 1.0]))
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float64]:
+        """Rotation matrix (3, 3) ICRS→sensor, read-only: ``v_sensor = matrix @ v_icrs``."""
+        x, y, z, w = self.quaternion_xyzw.tolist()
+        m = np.array(
+            [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+                [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+                [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+            ]
+        )
+        m.flags.writeable = False
+        return m
+
+    @property
+    def boresight(self) -> NDArray[np.float64]:
+        """Unit vector (3,) of the boresight in ICRS."""
+        axis: NDArray[np.float64] = self.matrix[2]
+        return axis
+
+    @cached_property
+    def _radec_roll(self) -> tuple[float, float, float]:
+        (x0, x1, x2), (y0, y1, y2), (bx, by, bz) = self.matrix.tolist()
+        from_axis = math.hypot(bx, by)
+        on_pole = from_axis < _POLE_RADIUS
+        ra = 0.0 if on_pole else math.atan2(by, bx)
+        dec = math.copysign(0.5 * math.pi, bz) if on_pole else math.atan2(bz, from_axis)
+        sa, ca, sd, cd = math.sin(ra), math.cos(ra), math.sin(dec), math.cos(dec)
+        x_north, y_north = -sd * (ca * x0 + sa * x1) + cd * x2, -sd * (ca * y0 + sa * y1) + cd * y2
+        x_east, y_east = ca * x1 - sa * x0, ca * y1 - sa * y0
+        roll = math.atan2(y_east - x_north, -x_east - y_north)
+        return _turn(ra), math.degrees(dec), _turn(roll)
+
+    @property
+    def ra_deg(self) -> float:
+        """Right ascension of the boresight, degrees in [0, 360); 0 on a pole."""
+        return self._radec_roll[0]
+
+    @property
+    def dec_deg(self) -> float:
+        """Declination of the boresight, degrees in [−90, 90]."""
+        return self._radec_roll[1]
+
+    @property
+    def roll_deg(self) -> float:
+        """Roll, degrees in [0, 360): celestial north, counter-clockwise in the image, from image up."""
+        return self._radec_roll[2]
+
+    def to_sensor(self, vectors_icrs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vectors (n, 3) or (3,) in ICRS, expressed in the sensor frame."""
+        turned: NDArray[np.float64] = vectors_icrs @ self.matrix.T
+        return turned
+
+    def to_icrs(self, vectors_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vectors (n, 3) or (3,) in the sensor frame, expressed in ICRS."""
+        turned: NDArray[np.float64] = vectors_sensor @ self.matrix
+        return turned
+
+    def rotated(self, rotation_vector_sensor_rad: ArrayLike) -> Attitude:
+        """Attitude after the sensor has turned by +v: ``A' = exp(−[v]×)·A``.
+
+        Parameters
+        ----------
+        rotation_vector_sensor_rad : array (3,)
+            Rotation vector in the sensor frame, radians; any size.
+        """
+        vx, vy, vz = (float(c) for c in np.asarray(rotation_vector_sensor_rad, dtype=np.float64))
+        angle = math.sqrt(vx * vx + vy * vy + vz * vz)
+        k = -0.5 if angle < _SMALL_ANGLE else -math.sin(0.5 * angle) / angle
+        turn = (k * vx, k * vy, k * vz, math.cos(0.5 * angle))
+        return Attitude(_multiply(turn, self.quaternion_xyzw.tolist()))
+
+    def error_to(self, truth: Attitude) -> AttitudeError:
+        """How far this attitude is from the truth, split into cross-boresight and roll."""
+        tx, ty, tz, tw = truth.quaternion_xyzw.tolist()
+        x, y, z, w = _multiply(self.quaternion_xyzw.tolist(), (-tx, -ty, -tz, tw)).tolist()
+        if w < 0.0:
+            x, y, z, w = -x, -y, -z, -w
+        cross = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
+        roll = 2.0 * math.atan2(abs(z), w)
+        half_sine = math.sqrt(x * x + y * y + z * z)
+        total = 2.0 * math.atan2(half_sine, w)
+        k = -2.0 if half_sine < _SMALL_ANGLE else -total / half_sine
+        return AttitudeError(
+            cross_boresight_arcsec=cross * ARCSEC_PER_RAD,
+            roll_arcsec=roll * ARCSEC_PER_RAD,
+            total_arcsec=total * ARCSEC_PER_RAD,
+            rotation_vector_rad=np.array([k * x, k * y, k * z]),
+        )
+
+    def __str__(self) -> str:
+        return f"RA {self.ra_deg:.4f}° Dec {self.dec_deg:+.4f}° roll {self.roll_deg:.4f}°"
+
+
+def random_attitude(rng: np.random.Generator) -> Attitude:
+    """Attitude drawn uniformly from all rotations (normalised four-dimensional Gaussian)."""
+    return Attitude(rng.standard_normal(4))
+
+
+def propagate(attitude: Attitude, rate_rad_s: ArrayLike, dt: float) -> Attitude:
+    """Attitude after `dt` seconds at a constant rate (3,) in rad/s, expressed in the sensor frame."""
+    return attitude.rotated(np.asarray(rate_rad_s, dtype=np.float64) * dt)
+
+
+def rate_between(first: Attitude, second: Attitude, dt: float) -> NDArray[np.float64]:
+    """Constant rate (3,) in rad/s, sensor frame, that leads from the first to the second in `dt` seconds."""
+    return second.error_to(first).rotation_vector_rad / dt
+
+
+def interpolate(first: Attitude, second: Attitude, fraction: float) -> Attitude:
+    """Attitude on the shortest turn between two, at `fraction` of it (0 = first, 1 = second)."""
+    return first.rotated(second.error_to(first).rotation_vector_rad * fraction)
+
+
+def _turn(angle: float) -> float:
+    """Angle in degrees, [0, 360), of radians."""
+    degrees = math.degrees(angle) % 360.0
+    return 0.0 if degrees == 360.0 else degrees
+
+
+def _local_frame(
+    ra: float, dec: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the unit vectors to north, to east and outward at a point of the sky (radians)."""
+    sa, ca, sd, cd = math.sin(ra), math.cos(ra), math.sin(dec), math.cos(dec)
+    north = np.array([-sd * ca, -sd * sa, cd])
+    return north, np.array([-sa, ca, 0.0]), np.array([cd * ca, cd * sa, sd])
+
+
+def _multiply(
+    left: tuple[float, ...] | list[float], right: tuple[float, ...] | list[float]
+) -> NDArray[np.float64]:
+    """Hamilton product of two scalar-last quaternions: the rotation `right`, then `left`."""
+    ax, ay, az, aw = left
+    bx, by, bz, bw = right
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def _quaternion_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scalar-last quaternion (4,) of a rotation matrix, from its largest component (Shepperd 1978)."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
+    rows = (
+        (squares[0], b + d, c + g, h - f),
+        (b + d, squares[1], f + h, c - g),
+        (c + g, f + h, squares[2], d - b),
+        (h - f, c - g, d - b, squares[3]),
+    )
+    q = np.array(rows[squares.index(max(squares))])
+    return q / math.sqrt(float(q @ q))
