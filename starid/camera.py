@@ -1,0 +1,353 @@
+"""The camera: where a direction of the sensor frame falls on the pixel array, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, Literal, Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.attitude import Attitude
+from starid.errors import StaridError
+from starid.projection import (
+    CX,
+    CY,
+    EQUIDISTANT,
+    FLAT,
+    FX,
+    FY,
+    K1,
+    LIMIT2,
+    PINHOLE,
+    WIDTH,
+    back_project_kernel,
+    distort_slopes,
+    jacobian_kernel,
+    project_kernel,
+    undistort,
+)
+
+Model = Literal["pinhole", "equidistant", "flat"]
+
+_MODEL_CODES: Final[dict[str, int]] = {"pinhole": PINHOLE, "equidistant": EQUIDISTANT, "flat": FLAT}
+_WIDEST_FOV_DEG: Final[dict[str, float]] = {"pinhole": 170.0, "equidistant": 360.0, "flat": 360.0}
+_MAX_SIDE: Final = 65535
+_DISTORTION_TERMS: Final = 5
+_BORDER_SAMPLES: Final = 65
+_MARGIN: Final = 1.1
+_FOLD_SHARE: Final = 0.9
+_FOV_ITERATIONS: Final = 20
+_FOV_CONVERGED: Final = 1e-12
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pixel array behind a lens.
+
+    Attributes
+    ----------
+    width, height : int
+        Size of the pixel array, pixels.
+    focal_px : (float, float)
+        Focal lengths fx, fy in pixels (pixels per radian at the centre for every model).
+    centre_px : (float, float)
+        Where the boresight falls, (cx, cy) in pixels; pixel centres are integers.
+    model : {"pinhole", "equidistant", "flat"}
+        Mapping from direction to plane. "flat" is longitude and latitude about the boresight; how the
+        thesis's flat RA–Dec plane comes out of it is told in `flat_view`.
+    distortion : tuple of 5 floats
+        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, acting on the plane; fewer are
+        filled up with zeros.
+
+    Raises
+    ------
+    StaridError
+        A value is out of its range, or the distortion folds the image, so that one pixel would see two
+        directions.
+    """
+
+    width: int
+    height: int
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    model: Model = "pinhole"
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            side = getattr(self, name)
+            if isinstance(side, bool) or not isinstance(side, int | np.integer) or not 1 <= side <= _MAX_SIDE:
+                raise StaridError(f"camera {name}: {side!r} given, a whole number 1…{_MAX_SIDE} needed")
+            object.__setattr__(self, name, int(side))
+        if self.model not in _MODEL_CODES:
+            raise StaridError(f"camera model: {self.model!r} given, one of {', '.join(_MODEL_CODES)} needed")
+        fx, fy = _numbers("focal_px", self.focal_px, 2)
+        if not (fx > 0.0 and fy > 0.0):
+            raise StaridError(f"camera focal_px: ({fx}, {fy}) given, two positive numbers of pixels needed")
+        object.__setattr__(self, "focal_px", (fx, fy))
+        object.__setattr__(self, "centre_px", _numbers("centre_px", self.centre_px, 2))
+        given = tuple(self.distortion)
+        if len(given) > _DISTORTION_TERMS:
+            raise StaridError(
+                f"camera distortion: {len(given)} terms given, at most k1, k2, p1, p2, k3 are known"
+            )
+        object.__setattr__(self, "distortion", _numbers("distortion", _padded(given), _DISTORTION_TERMS))
+        _ = self.params
+
+    @classmethod
+    def from_fov(
+        cls,
+        fov_deg: float = 42.0,
+        width: int = 937,
+        height: int = 937,
+        model: Model = "pinhole",
+        distortion: Sequence[float] = (),
+    ) -> Self:
+        """Camera centred on its pixel array whose full width sees `fov_deg`.
+
+        Parameters
+        ----------
+        fov_deg : float
+            Horizontal field through the centre, from the left edge of the first column to the right edge of
+            the last, degrees, distortion included.
+        width, height : int
+            Pixels.
+        model, distortion
+            As in the class.
+        """
+        widest = _WIDEST_FOV_DEG.get(model, 360.0)
+        if not 0.0 < fov_deg <= widest:
+            raise StaridError(
+                f"camera fov_deg: {fov_deg} given, degrees in (0, {widest:g}] needed for {model}"
+            )
+        half = math.radians(fov_deg) / 2.0
+        reach = math.tan(half) if model == "pinhole" else half
+        centre = ((width - 1) / 2.0, (height - 1) / 2.0)
+        terms = cast("tuple[float, float, float, float, float]", tuple(distortion))
+        if not any(terms):
+            focal = width / 2.0 / reach
+            return cls(width, height, (focal, focal), centre, model, terms)
+        k1, k2, _, _, k3 = _numbers("distortion", _padded(terms), _DISTORTION_TERMS)
+        s = reach * reach
+        stretch = 1.0 + s * (k1 + s * (k2 + s * k3))
+        if stretch <= 0.0:
+            raise _fold_error(terms)
+        focal = width / 2.0 / (reach * stretch)
+        camera = cls(width, height, (focal, focal), centre, model, terms)
+        for _ in range(_FOV_ITERATIONS):
+            ratio = camera.fov_deg / fov_deg
+            focal *= ratio
+            camera = cls(width, height, (focal, focal), centre, model, terms)
+            if abs(ratio - 1.0) < _FOV_CONVERGED:
+                break
+        return camera
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Camera from the keys that `to_dict` writes; `fov_deg` may stand for focal_px and centre_px."""
+        known = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known - {"fov_deg"})
+        if unknown:
+            raise StaridError(
+                f"camera: unknown key {unknown[0]!r}; known are {', '.join(sorted(known | {'fov_deg'}))}"
+            )
+        given = dict(values)
+        if "fov_deg" in given:
+            clash = sorted({"focal_px", "centre_px"} & given.keys())
+            if clash:
+                raise StaridError(f"camera: fov_deg and {clash[0]} exclude each other; give one")
+            return cls.from_fov(**given)
+        missing = sorted({"width", "height", "focal_px", "centre_px"} - given.keys())
+        if missing:
+            raise StaridError(
+                f"camera: key {missing[0]!r} missing; give it, or fov_deg with width and height"
+            )
+        return cls(**given)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values under the field names, fit for TOML and JSON."""
+        values = dataclasses.asdict(self)
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+
+    @cached_property
+    def params(self) -> NDArray[np.float64]:
+        """The camera as the plain array that the kernels of `starid.projection` take, read-only."""
+        params = np.array(
+            [
+                _MODEL_CODES[self.model],
+                *self.focal_px,
+                *self.centre_px,
+                *self.distortion,
+                self.width,
+                self.height,
+                math.pi**2 if self.model == "equidistant" else math.inf,
+            ],
+            dtype=np.float64,
+        )
+        if any(self.distortion):
+            params[LIMIT2] = _one_to_one_limit(params, self.border(_BORDER_SAMPLES)) ** 2
+        params.flags.writeable = False
+        return params
+
+    @cached_property
+    def identity(self) -> str:
+        """Short checksum of every value, for the names of things cached for this camera."""
+        text = repr((self.width, self.height, self.focal_px, self.centre_px, self.model, self.distortion))
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def pixel_scale_rad(self) -> float:
+        """Angle that one pixel sees at the centre, radians (geometric mean of both axes)."""
+        return 1.0 / math.sqrt(self.focal_px[0] * self.focal_px[1])
+
+    @cached_property
+    def fov_deg(self) -> float:
+        """Horizontal field on the row of the centre, edge to edge of the pixel array, degrees."""
+        row = self.centre_px[1]
+        edges = self.back_project(np.array([[-0.5, row], [self.width - 0.5, row]]))
+        left, right = np.arctan2(edges[:, 0], edges[:, 2])
+        return math.degrees(right - left)
+
+    @cached_property
+    def field_radius_rad(self) -> float:
+        """Largest angle from the boresight to the border of the pixel array, radians."""
+        vectors = self.back_project(self.border(_BORDER_SAMPLES))
+        angles = np.arctan2(np.hypot(vectors[:, 0], vectors[:, 1]), vectors[:, 2])
+        return math.pi if bool(np.any(np.isnan(angles))) else float(np.max(angles))
+
+    def border(self, samples: int) -> NDArray[np.float64]:
+        """Positions (4·samples, 2) in pixels along the outer edge of the pixel array."""
+        t = np.linspace(0.0, 1.0, samples)
+        x, y = -0.5 + t * self.width, -0.5 + t * self.height
+        right, bottom = self.width - 0.5, self.height - 0.5
+        sides = [(x, np.full(samples, -0.5)), (x, np.full(samples, bottom))]
+        sides += [(np.full(samples, -0.5), y), (np.full(samples, right), y)]
+        return np.concatenate([np.column_stack(side) for side in sides])
+
+    def project(self, vectors: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Pixel positions of directions.
+
+        Parameters
+        ----------
+        vectors : array (n, 3)
+            Directions in the sensor frame, of any length.
+
+        Returns
+        -------
+        xy : ndarray (n, 2)
+            Pixels. Directions just outside the field get their true position, those that the lens cannot
+            map get NaN.
+        inside : ndarray (n,) of bool
+            The direction falls on the pixel array: [−0.5, width − 0.5) × [−0.5, height − 0.5).
+        """
+        return project_kernel(self.params, _table("directions", vectors, 3))
+
+    def back_project(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """Return the unit vectors (n, 3) of the sensor frame seen by positions (n, 2) in pixels.
+
+        The inverse of `project` to 1e-6 px. A position that sees no direction (a corner beyond the image
+        circle of a very wide lens) gets NaN.
+        """
+        return back_project_kernel(self.params, _table("positions", xy, 2))
+
+    def jacobian(self, vectors: ArrayLike) -> NDArray[np.float64]:
+        """Return the derivative (n, 2, 3) of the pixel position by the direction, in pixels per unit.
+
+        It is taken at unit vectors (n, 3) and is zero along the direction itself. For a rotation of the sensor by a small vector e (radians,
+        sensor frame) the directions move by ``v × e``, so the positions move by ``J (v × e)``.
+        """
+        return jacobian_kernel(self.params, _table("directions", vectors, 3))
+
+
+def flat_view(camera: Camera, ra_deg: float, dec_deg: float) -> tuple[Camera, Attitude]:
+    """Show the flat RA–Dec plane of the thesis through the common camera interface.
+
+    The thesis draws a star at ``x = α − α_c``, ``y = δ − δ_c`` (degrees, no cos δ), whatever the
+    declination of the frame's centre. That is no rotation of the sphere, but it is the "flat" model seen
+    from the celestial equator with the centre of the image moved by δ_c: the returned attitude looks at
+    (α_c, 0°) with roll 0, and the returned camera has ``cy + fy·δ_c``. Through the pair, the point
+    (α_c, δ_c) falls on the centre of the given camera, east is left and north is up, and project and
+    back-project hold as for every camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        A camera with model "flat".
+    ra_deg, dec_deg : float
+        Centre of the frame, degrees.
+    """
+    if camera.model != "flat":
+        raise StaridError(f"camera model: {camera.model!r} given, a flat view needs 'flat'")
+    cx, cy = camera.centre_px
+    moved = dataclasses.replace(camera, centre_px=(cx, cy + camera.focal_px[1] * math.radians(dec_deg)))
+    return moved, Attitude.from_radec_roll(ra_deg, 0.0, 0.0)
+
+
+def _numbers(name: str, values: Any, count: int) -> tuple[float, ...]:
+    """`count` finite floats, or an error that names the field."""
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        raise StaridError(f"camera {name}: {values!r} given, {count} finite numbers needed")
+    return numbers
+
+
+def _padded(terms: tuple[float, ...]) -> tuple[float, ...]:
+    """Distortion terms filled up with zeros."""
+    return (*terms, *(0.0,) * (_DISTORTION_TERMS - len(terms)))
+
+
+def _fold_error(terms: Sequence[float]) -> StaridError:
+    """Say that a distortion folds the image."""
+    return StaridError(
+        f"camera distortion {[float(term) for term in terms]}: folds the image inside the frame; "
+        "use smaller terms, a longer focal length or the equidistant model"
+    )
+
+
+def _table(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
+    """Contiguous float array (n, columns), or an error that names it."""
+    table = np.ascontiguousarray(values, dtype=np.float64)
+    if table.ndim != 2 or table.shape[1] != columns:
+        raise StaridError(f"camera: {name} of shape {table.shape} given, (n, {columns}) needed")
+    return table
+
+
+def _one_to_one_limit(params: NDArray[np.float64], border: NDArray[np.float64]) -> float:
+    """Radius in the plane of a disc that holds the whole image and on which the distortion is one-to-one.
+
+    The radial part turns back at the smallest positive root of 1 + 3k₁r² + 5k₂r⁴ + 7k₃r⁶. The disc ends
+    before it, so that no star from beyond is folded into the image; on the disc the determinant of the
+    distortion must stay positive, tangential part included.
+    """
+    k1, k2, _, _, k3 = params[K1:WIDTH]
+    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    turns = [float(r.real) for r in roots if abs(r.imag) < 1e-9 * abs(r) and r.real > 0.0]
+    fold = math.sqrt(min([*turns, params[LIMIT2]]))
+    probe = params.copy()
+    probe[LIMIT2] = fold**2
+    reach = 0.0
+    for u, v in border:
+        a, b, solved = undistort(probe, (u - params[CX]) / params[FX], (v - params[CY]) / params[FY])
+        if not solved:
+            raise _fold_error(params[K1:WIDTH].tolist())
+        reach = max(reach, math.hypot(a, b))
+    limit = min(_MARGIN * reach, reach + _FOLD_SHARE * (fold - reach))
+    for radius in np.linspace(0.0, limit, 40):
+        for angle in np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False):
+            j11, j12, j22 = distort_slopes(params, radius * math.cos(angle), radius * math.sin(angle))
+            if j11 * j22 - j12 * j12 <= 0.0 or j11 <= 0.0:
+                raise _fold_error(params[K1:WIDTH].tolist())
+    return limit
+
+
+DEFAULT_CAMERA: Final = Camera.from_fov()
+"""The camera of the thesis and of the emulator: pinhole, 937 × 937 pixels, 42° wide."""
