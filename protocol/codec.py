@@ -1,0 +1,380 @@
+"""Rows of the interface definition as codecs: physical values to wire bytes and back, over construct."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, Literal
+
+import construct
+
+from protocol.values import (
+    F32_MAX,
+    INTEGER_RANGES,
+    EnumDefinition,
+    FieldError,
+    LengthError,
+    Value,
+    limits_text,
+    number_of,
+    to_f32,
+)
+
+RowKind = Literal["telecommand", "telemetry"]
+FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
+
+_CONSTRUCTS: Final[dict[str, Any]] = {
+    "u8": construct.Int8ul,
+    "i8": construct.Int8sl,
+    "u16": construct.Int16ul,
+    "i16": construct.Int16sl,
+    "u32": construct.Int32ul,
+    "i32": construct.Int32sl,
+    "u64": construct.Int64ul,
+    "i64": construct.Int64sl,
+    "f32": construct.Float32l,
+    "f64": construct.Float64l,
+}
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A run of bytes in a row: one scalar, or the raw bytes of a field."""
+
+    index: int
+    """Position among the row's slots."""
+    type: str
+    """u8 … i64, f32, f64, or `bytes`."""
+    offset: int
+    """First byte in the row."""
+    size: int
+    """Number of bytes."""
+
+    @property
+    def key(self) -> str:
+        """Name of the slot in the construct layout."""
+        return f"slot_{self.index}"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One value of a row: a slot of its own, or some bits of one."""
+
+    name: str
+    """Key in the row's values; empty for unused bytes."""
+    kind: FieldKind
+    slot: Slot
+    shift: int = 0
+    """Lowest bit in the slot (flags and bit groups)."""
+    width: int = 0
+    """Bits in the slot; 0 where the field has the slot to itself."""
+    unit: str = ""
+    scale: float = 1.0
+    """Physical = raw * scale + bias."""
+    bias: float = 0.0
+    minimum: float | None = None
+    """Least physical value; None if only the type limits it."""
+    maximum: float | None = None
+    enum: EnumDefinition | None = None
+    default: bool | int | float | str | None = None
+    parameter: str | None = None
+    """Name of the parameter that the field sets or reports."""
+    provenance: str = "ours"
+    doc: str = ""
+
+    @property
+    def type(self) -> str:
+        """Type of the slot."""
+        return self.slot.type
+
+    @property
+    def offset(self) -> int:
+        """First byte in the row."""
+        return self.slot.offset
+
+    @property
+    def size(self) -> int:
+        """Bytes of the slot."""
+        return self.slot.size
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the physical value is a scaled integer and so a float."""
+        return self.scale != 1.0 or self.bias != 0.0
+
+    @cached_property
+    def raw_limits(self) -> tuple[int, int]:
+        """Least and greatest raw value of an integer, flag, bit group or enumeration."""
+        low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+        if self.minimum is not None:
+            low = max(low, round((self.minimum - self.bias) / self.scale))
+        if self.maximum is not None:
+            high = min(high, round((self.maximum - self.bias) / self.scale))
+        return low, high
+
+    @cached_property
+    def physical_limits(self) -> tuple[float, float]:
+        """Least and greatest physical value of a number."""
+        if self.kind == "float":
+            widest = F32_MAX if self.slot.type == "f32" else math.inf
+            low = -widest if self.minimum is None else self.minimum
+            return low, widest if self.maximum is None else self.maximum
+        low_raw, high_raw = self.raw_limits
+        return low_raw * self.scale + self.bias, high_raw * self.scale + self.bias
+
+    @cached_property
+    def _divisor(self) -> int | None:
+        """1/scale where that is a whole number: dividing by it gives the nearest decimal."""
+        inverse = round(1.0 / self.scale)
+        return inverse if inverse and abs(inverse * self.scale - 1.0) < 1e-12 else None
+
+    @cached_property
+    def empty(self) -> bool | int | float | str | bytes:
+        """The value that telemetry carries where none is given: the default, else zero."""
+        if self.default is not None:
+            return self.default
+        match self.kind:
+            case "flag":
+                return False
+            case "enum":
+                enum = self.enum
+                return next(iter(enum.values)) if enum is not None else 0
+            case "bytes":
+                return bytes(self.size)
+            case "text":
+                return ""
+            case "float":
+                return 0.0
+            case _:
+                return min(max(0, self.raw_limits[0]), self.raw_limits[1]) * self.scale + self.bias
+
+    def to_raw(
+        self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
+    ) -> int | float | bytes:
+        """Turn a physical value into the raw value of its slot or bits; raise FieldError if it cannot be."""
+        match self.kind:
+            case "bytes":
+                return self._bytes_to_raw(value, where, index)
+            case "text":
+                return self._text_to_raw(value, where, index)
+            case "flag":
+                if isinstance(value, bool) or value in (0, 1):
+                    return int(value)
+                raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
+            case "enum":
+                return self._enum_to_raw(value, where, check=check, index=index)
+            case "float":
+                return self._float_to_raw(value, where, check=check, saturate=saturate, index=index)
+            case _:
+                return self._integer_to_raw(value, where, check=check, saturate=saturate, index=index)
+
+    def to_physical(self, raw: Any) -> Value:
+        """Turn a raw value into the physical one; an enumeration's unknown number stays a number."""
+        match self.kind:
+            case "flag":
+                return bool(raw)
+            case "enum":
+                return self.enum.names.get(raw, int(raw)) if self.enum is not None else int(raw)
+            case "bytes":
+                return bytes(raw)
+            case "text":
+                return bytes(raw).rstrip(b"\0").decode("latin-1")
+            case "float":
+                return float(raw) if not self.scaled else float(raw) * self.scale + self.bias
+            case _:
+                if not self.scaled:
+                    return int(raw)
+                value = raw / self._divisor if self._divisor else raw * self.scale
+                return float(value + self.bias)
+
+    def check_raw(self, raw: Any, where: str, index: int) -> None:
+        """Raise FieldError if a received raw value is outside the limits or not finite."""
+        match self.kind:
+            case "enum":
+                if self.enum is not None:
+                    self.enum.number(int(raw), where, index=index)
+            case "float":
+                value = self.to_physical(raw)
+                if not isinstance(value, float) or not math.isfinite(value):
+                    raise FieldError(f"{where}: {value!r} is not a finite number", index=index)
+                self._check_float(value, where, index)
+            case "integer" | "bits":
+                low, high = self.raw_limits
+                if not low <= raw <= high:
+                    raise self._outside(self.to_physical(raw), where, index)
+            case _:
+                pass
+
+    def _outside(self, value: object, where: str, index: int) -> FieldError:
+        low, high = self.physical_limits
+        return FieldError(f"{where}: {value!r} is outside {limits_text(low, high, self.unit)}", index=index)
+
+    def _check_float(self, value: float, where: str, index: int) -> None:
+        low, high = self.physical_limits
+        if self.slot.type == "f32":
+            low, high = min(low, to_f32(low)), max(high, to_f32(high))
+        if not low <= value <= high:
+            raise self._outside(value, where, index)
+
+    def _bytes_to_raw(self, value: Value, where: str, index: int) -> bytes:
+        if not isinstance(value, (bytes, bytearray)):
+            raise FieldError(f"{where}: {value!r} is not bytes", index=index)
+        if len(value) != self.size:
+            raise FieldError(f"{where}: {len(value)} bytes, must be {self.size}", index=index)
+        return bytes(value)
+
+    def _text_to_raw(self, value: Value, where: str, index: int) -> bytes:
+        if not isinstance(value, str) or not value.isascii():
+            raise FieldError(f"{where}: {value!r} is not ASCII text", index=index)
+        if len(value) > self.size:
+            raise FieldError(f"{where}: {len(value)} characters, at most {self.size}", index=index)
+        return value.encode("ascii").ljust(self.size, b"\0")
+
+    def _enum_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
+        low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+        if not check and isinstance(value, int) and low <= value <= high:
+            return int(value)
+        if self.enum is None:
+            raise FieldError(f"{where}: has no enumeration", index=index)
+        return self.enum.number(value, where, index=index)
+
+    def _float_to_raw(self, value: Value, where: str, *, check: bool, saturate: bool, index: int) -> float:
+        number = float(number_of(value, where, index=index))
+        if math.isfinite(number):
+            if saturate:
+                low, high = self.physical_limits
+                number = min(max(number, low), high)
+            elif check:
+                self._check_float(number, where, index)
+        raw = (number - self.bias) / self.scale if self.scaled else number
+        if self.slot.type == "f32" and math.isfinite(raw) and abs(raw) > F32_MAX:
+            raise self._outside(value, where, index)
+        return raw
+
+    def _integer_to_raw(self, value: Value, where: str, *, check: bool, saturate: bool, index: int) -> int:
+        number = number_of(int(value) if isinstance(value, bool) else value, where, index=index)
+        low, high = self.raw_limits
+        raw: int | float = number
+        if self.scaled:
+            raw = (number - self.bias) / self.scale
+        if saturate:
+            raw = low if math.isnan(raw) else min(max(raw, low), high)
+        if not math.isfinite(raw):
+            raise self._outside(value, where, index)
+        whole = round(raw)
+        if not self.scaled and whole != raw and not saturate:
+            raise FieldError(f"{where}: {value!r} is not a whole number", index=index)
+        if not check:
+            low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+        if not low <= whole <= high:
+            raise self._outside(value, where, index)
+        return whole
+
+
+@dataclass(frozen=True)
+class Row:
+    """A telecommand or telemetry row: its identity, its layout, and the codec between values and bytes."""
+
+    kind: RowKind
+    id: int
+    """Identifier on the wire."""
+    name: str
+    size: int
+    """Bytes of data."""
+    fields: tuple[Field, ...]
+    """All fields in wire order, unused ones included."""
+    slots: tuple[Slot, ...]
+    doc: str = ""
+    provenance: str = "ours"
+    source: str = ""
+
+    @cached_property
+    def named_fields(self) -> Mapping[str, Field]:
+        """The fields that carry values, by name, in wire order."""
+        return {field.name: field for field in self.fields if field.name}
+
+    @cached_property
+    def layout(self) -> Any:
+        """The construct declaration of the row's bytes, slot by slot."""
+        members = [
+            slot.key / (construct.Bytes(slot.size) if slot.type == "bytes" else _CONSTRUCTS[slot.type])
+            for slot in self.slots
+        ]
+        return construct.Struct(*members)
+
+    def encode(
+        self, values: Mapping[str, Value] | None = None, *, check: bool = True, saturate: bool = False
+    ) -> bytes:
+        """Turn physical values into the row's bytes.
+
+        Parameters
+        ----------
+        values:
+            Value of each field by name. Telemetry fills what is missing with the default or zero; a telecommand
+            needs every field that has no default.
+        check:
+            Refuse what is outside the limits. Without it only what the type cannot hold is refused (for tests
+            that send bad values on purpose).
+        saturate:
+            Clip numbers to the limits instead of refusing them, as the unit does with telemetry.
+
+        Raises
+        ------
+        FieldError
+            Names row.field, the value and what is allowed.
+        """
+        given = {} if values is None else values
+        unknown = given.keys() - self.named_fields.keys()
+        if unknown:
+            known = ", ".join(self.named_fields) or "none"
+            raise FieldError(f"{self.name}.{min(unknown)}: no such field (fields: {known})")
+        raw: dict[str, Any] = {
+            slot.key: bytes(slot.size) if slot.type == "bytes" else 0 for slot in self.slots
+        }
+        for index, (name, item) in enumerate(self.named_fields.items()):
+            where = f"{self.name}.{name}"
+            value = given.get(name)
+            if value is None:
+                if self.kind == "telecommand" and item.default is None:
+                    raise FieldError(f"{where}: no value given", index=index)
+                value = item.empty
+            number = item.to_raw(value, where, check=check, saturate=saturate, index=index)
+            if item.width:
+                raw[item.slot.key] |= int(number) << item.shift
+            else:
+                raw[item.slot.key] = number
+        return bytes(self.layout.build(raw))
+
+    def decode(self, data: bytes, *, check: bool | None = None) -> dict[str, Value]:
+        """Turn the row's bytes into physical values by name.
+
+        `check` refuses values outside the limits with FieldError; by default that is done for telecommands (the
+        device guards itself) and not for telemetry (the OBC wants to see what came). A wrong length always
+        raises LengthError.
+        """
+        if len(data) != self.size:
+            raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {self.size}")
+        strict = self.kind == "telecommand" if check is None else check
+        raw = self.layout.parse(data)
+        values: dict[str, Value] = {}
+        for index, (name, item) in enumerate(self.named_fields.items()):
+            number = raw[item.slot.key]
+            if item.width:
+                number = (number >> item.shift) & (2**item.width - 1)
+            if strict:
+                item.check_raw(number, f"{self.name}.{name}", index)
+            values[name] = item.to_physical(number)
+        return values
+
+    def example(self) -> dict[str, Value]:
+        """Return values that the row accepts: defaults, else zeros moved into the limits."""
+        return {name: self._example_of(item) for name, item in self.named_fields.items()}
+
+    @staticmethod
+    def _example_of(item: Field) -> Value:
+        if item.kind == "float" and item.default is None:
+            low, high = item.physical_limits
+            return min(max(0.0, low), high)
+        return item.empty

@@ -1,0 +1,151 @@
+"""Values of the interface definition: enumerations, limits and device parameters, checked in one place."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Final
+
+from protocol.errors import ProtocolError
+from protocol.messages import ErrorCode
+
+Value = bool | int | float | str | bytes
+"""A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw bytes."""
+
+INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
+    {
+        f"{sign}{bits}": (0, 2**bits - 1) if sign == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        for sign in "ui"
+        for bits in (8, 16, 32, 64)
+    }
+)
+"""Least and greatest raw value of each integer type."""
+
+F32_MAX: Final = 3.4028234663852886e38
+"""Greatest finite single-precision number."""
+
+
+class IcdError(ProtocolError):
+    """An interface definition that does not hold together; the text names file, row and field."""
+
+
+class MessageError(ProtocolError):
+    """A message or value against the interface definition; `code` is the published error code."""
+
+    code: ErrorCode = ErrorCode.INVALID_PARAMETER
+
+    def __init__(self, text: str, *, index: int = 0) -> None:
+        super().__init__(text)
+        self.index = index
+        """Position of the refused field in its row, for the acknowledge telemetry."""
+
+
+class LengthError(MessageError):
+    """Data whose length is not the row's size."""
+
+    code = ErrorCode.INVALID_LENGTH
+
+
+class FieldError(MessageError):
+    """A value outside its type, limits or enumeration; the text starts with row.field."""
+
+
+@dataclass(frozen=True)
+class EnumDefinition:
+    """Names for numbers."""
+
+    name: str
+    doc: str
+    values: Mapping[str, int]
+    """Number of each name."""
+
+    @cached_property
+    def names(self) -> Mapping[int, str]:
+        """Name of each number."""
+        return MappingProxyType({number: name for name, number in self.values.items()})
+
+    def number(self, value: Value, where: str, *, index: int = 0) -> int:
+        """Return the number of a name, or of a number that has a name; raise FieldError otherwise."""
+        if isinstance(value, str):
+            if value in self.values:
+                return self.values[value]
+        elif isinstance(value, (int, float)) and not isinstance(value, bool) and value in self.names:
+            return int(value)
+        allowed = ", ".join(f"{name} ({number})" for name, number in self.values.items())
+        raise FieldError(f"{where}: {value!r} is not one of {allowed}", index=index)
+
+
+def to_f32(value: float) -> float:
+    """Round a number to single precision; too large a number becomes infinite."""
+    if math.isfinite(value) and abs(value) > F32_MAX:
+        return math.copysign(math.inf, value)
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+def number_of(value: Value, where: str, *, index: int = 0) -> int | float:
+    """Return the value if it is a number; raise FieldError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise FieldError(f"{where}: {value!r} is not a number", index=index)
+    return value
+
+
+def limits_text(minimum: float | None, maximum: float | None, unit: str) -> str:
+    """Write limits for an error message, as in `0.1 to 20 Hz`."""
+    low = "any" if minimum is None else f"{minimum:g}"
+    high = "any" if maximum is None else f"{maximum:g}"
+    return f"{low} to {high} {unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the device, the same on the bus, in the device and in the object dictionary."""
+
+    id: int
+    """Identifier in set_parameter and select_parameter, 1 to 254."""
+    name: str
+    type: str
+    """Wire type: u8 … i32, f32, f64, bool or enum8."""
+    unit: str
+    minimum: float
+    maximum: float
+    default: bool | int | float | str
+    doc: str
+    enum: EnumDefinition | None = field(default=None)
+
+    def check(self, value: Value) -> bool | int | float | str:
+        """Return the value in the parameter's own type, or raise FieldError naming the limits.
+
+        Numbers stand for switches (0, 1) and for members of enumerations, as set_parameter sends them.
+        """
+        if self.enum is not None:
+            return self.enum.names[self.enum.number(value, self.name)]
+        if self.type == "bool":
+            if isinstance(value, (bool, int, float)) and value in (0, 1):
+                return bool(value)
+            raise FieldError(f"{self.name}: {value!r} is not on or off (1 or 0)")
+        number = number_of(value, self.name)
+        if self.type in INTEGER_RANGES:
+            if not math.isfinite(number) or number != int(number):
+                raise FieldError(f"{self.name}: {number!r} is not a whole number")
+            number = int(number)
+            low, high = self.minimum, self.maximum
+        else:
+            number = float(number)
+            single = self.type == "f32"
+            low = min(self.minimum, to_f32(self.minimum)) if single else self.minimum
+            high = max(self.maximum, to_f32(self.maximum)) if single else self.maximum
+        if not low <= number <= high:
+            limits = limits_text(self.minimum, self.maximum, self.unit)
+            raise FieldError(f"{self.name}: {number:g} is outside {limits}")
+        return number
+
+    def to_number(self, value: Value) -> float:
+        """Return the checked value as the number that set_parameter and telemetry `parameter` carry."""
+        checked = self.check(value)
+        if isinstance(checked, str):
+            return float(self.enum.values[checked]) if self.enum is not None else math.nan
+        return float(checked)
