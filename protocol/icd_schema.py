@@ -108,3 +108,5 @@ class FileModel(_Model):
     telecommand: list[RowModel] = []
     telemetry: list[RowModel] = []
     parameter: list[ParameterModel] = []
+    canopen: dict[str, object] | None = None
+    """The CANopen mapping, read by `protocol.canopen`; no part of the rows."""
