@@ -1,0 +1,143 @@
+"""Attitudes as the bench compares them: quaternions (x, y, z, w) from ICRS into the sensor frame, in plain Python.
+
+The bench holds its own few lines of quaternion algebra so that the unit under test and its judge share no numerics.
+Conventions (roll, sensor axes, scalar last) are those of the interface definition's attitude rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from hil_tests.errors import BenchError
+
+ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
+_NORM_TOLERANCE: Final = 0.02
+"""How far a quaternion given as an attitude may be from unit length; four 1e-4 steps are well within."""
+
+
+class Quaternion(NamedTuple):
+    """A rotation ICRS → sensor, scalar last."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+@dataclass(frozen=True)
+class AttitudeError:
+    """How a measured attitude differs from the truth, in arcseconds, none of them negative.
+
+    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rest of the turn about the
+    boresight, `total_arcsec` the angle of the whole rotation.
+    """
+
+    cross_boresight_arcsec: float
+    roll_arcsec: float
+    total_arcsec: float
+
+
+def unit(values: Sequence[float]) -> Quaternion:
+    """Return `values` as a unit quaternion.
+
+    Raises
+    ------
+    BenchError
+        Not four numbers, not finite, or not near unit length.
+    """
+    if len(values) != 4:
+        raise BenchError(f"a quaternion has four parts (x, y, z, w), {len(values)} given")
+    length = math.sqrt(math.fsum(v * v for v in values))
+    if not math.isfinite(length) or abs(length - 1.0) > _NORM_TOLERANCE:
+        raise BenchError(f"not an attitude quaternion: its length is {length:.6g}, not 1")
+    x, y, z, w = (v / length for v in values)
+    return Quaternion(x, y, z, w)
+
+
+def from_vector_part(x: float, y: float, z: float) -> Quaternion:
+    """Return the quaternion of which only the vector part is sent; its scalar is taken as not negative."""
+    return unit((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
+
+
+def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:
+    """Return the attitude with this boresight and roll.
+
+    Roll is the angle by which celestial north is turned counter-clockwise in the image from image up; rows of the
+    matrix are x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e, z = b, with n and e the unit vectors
+    to north and east at the boresight b.
+    """
+    ra, dec, roll = (math.radians(v) for v in (ra_deg, dec_deg, roll_deg))
+    boresight = (math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec))
+    north = (-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec))
+    east = (-math.sin(ra), math.cos(ra), 0.0)
+    sine, cosine = math.sin(roll), math.cos(roll)
+    row_x = tuple(-sine * n - cosine * e for n, e in zip(north, east, strict=True))
+    row_y = tuple(-cosine * n + sine * e for n, e in zip(north, east, strict=True))
+    return _from_rows(row_x, row_y, boresight)
+
+
+def _from_rows(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> Quaternion:
+    """Turn a rotation matrix, given by rows, into a quaternion; the largest part is computed first."""
+    trace = x[0] + y[1] + z[2]
+    squares = (
+        1.0 + x[0] - y[1] - z[2],
+        1.0 - x[0] + y[1] - z[2],
+        1.0 - x[0] - y[1] + z[2],
+        1.0 + trace,
+    )
+    largest = squares.index(max(squares))
+    twice = 2.0 * math.sqrt(squares[largest])
+    xy, xz, yz = y[0] + x[1], z[0] + x[2], z[1] + y[2]
+    wx, wy, wz = z[1] - y[2], x[2] - z[0], y[0] - x[1]
+    quarter = twice / 4.0
+    parts = (
+        (quarter, xy / twice, xz / twice, wx / twice),
+        (xy / twice, quarter, yz / twice, wy / twice),
+        (xz / twice, yz / twice, quarter, wz / twice),
+        (wx / twice, wy / twice, wz / twice, quarter),
+    )[largest]
+    return unit(parts)
+
+
+def boresight(q: Quaternion) -> tuple[float, float, float]:
+    """Return the sensor's +z axis in ICRS."""
+    return (
+        2.0 * (q.x * q.z - q.w * q.y),
+        2.0 * (q.y * q.z + q.w * q.x),
+        1.0 - 2.0 * (q.x * q.x + q.y * q.y),
+    )
+
+
+def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
+    """Compare two attitudes; a quaternion and its negative are one attitude."""
+    # rotation from the true into the measured sensor frame: measured * conjugate(truth)
+    a, b = measured, truth
+    x = -a.w * b.x + a.x * b.w - a.y * b.z + a.z * b.y
+    y = -a.w * b.y + a.x * b.z + a.y * b.w - a.z * b.x
+    z = -a.w * b.z - a.x * b.y + a.y * b.x + a.z * b.w
+    w = a.w * b.w + a.x * b.x + a.y * b.y + a.z * b.z
+    cross = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
+    total = 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+    roll = 2.0 * math.atan2(abs(z), abs(w))
+    return AttitudeError(cross * ARCSEC_PER_RAD, roll * ARCSEC_PER_RAD, total * ARCSEC_PER_RAD)
+
+
+def interpolate(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
+    """Return the attitude at `fraction` of the shortest turn from `first` to `second` (slerp)."""
+    dot = math.fsum(p * q for p, q in zip(first, second, strict=True))
+    target = second if dot >= 0.0 else Quaternion(*(-v for v in second))
+    angle = math.acos(min(1.0, abs(dot)))
+    if angle < 1e-9:
+        return second if fraction >= 0.5 else first
+    sine = math.sin(angle)
+    a, b = math.sin((1.0 - fraction) * angle) / sine, math.sin(fraction * angle) / sine
+    return unit([a * p + b * q for p, q in zip(first, target, strict=True)])
+
+
+def wrapped_difference(value: float, expected: float, turn: float = 360.0) -> float:
+    """Return the absolute difference of two angles, at most half a turn."""
+    difference = math.fmod(abs(value - expected), turn)
+    return min(difference, turn - difference)

@@ -1,0 +1,99 @@
+"""Logs of every byte on the wire, with time stamps: readable for a serial line, candump's format for CAN."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from protocol.can_framing import CanFrame, format_candump
+
+
+class WireLog(ABC):
+    """A text log of what a link sends and receives, written line by line as it happens.
+
+    Parameters
+    ----------
+    path : Path
+        File to write; an existing one is replaced.
+    now : callable
+        Seconds since 1970-01-01 UTC.
+    """
+
+    def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:
+        self._now = now
+        self._file = path.open("w", encoding="utf-8", buffering=1)
+
+    @abstractmethod
+    def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:
+        """Return one line without its end."""
+
+    def sent(self, item: bytes | CanFrame) -> None:
+        """Log an item at the moment that it is handed to the transport."""
+        self._write("TX", item)
+
+    def received(self, item: bytes | CanFrame) -> None:
+        """Log an item at the moment that the transport hands it over."""
+        self._write("RX", item)
+
+    def note(self, text: str) -> None:
+        """Write a comment line, where the format has such a thing."""
+        line = self._comment(self._now(), text)
+        if line is not None and not self._file.closed:
+            self._file.write(line + "\n")
+
+    def _comment(self, time_s: float, text: str) -> str | None:  # noqa: ARG002 -- no comments by default
+        """Return a comment line, None where the format has none."""
+        return None
+
+    def _write(self, direction: str, item: bytes | CanFrame) -> None:
+        if not self._file.closed:
+            self._file.write(self._line(self._now(), direction, item) + "\n")
+
+    def close(self) -> None:
+        """Close the file; what comes later is not logged."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class SerialLog(WireLog):
+    """A readable log of a serial line: time, direction, bytes in hexadecimal.
+
+    One line for each piece handed to or by the port, for example `(1760000000.123456) TX 1F 7F 80 1F FF`. Lines that
+    start with `#` are notes.
+    """
+
+    def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:
+        super().__init__(path, now=now)
+        self._file.write("# (seconds since 1970-01-01 UTC) TX = to the device, RX = from the device\n")
+
+    def _comment(self, time_s: float, text: str) -> str:
+        return f"# ({time_s:.6f}) {text}"
+
+    def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:
+        data = item.data if isinstance(item, CanFrame) else item
+        return f"({time_s:.6f}) {direction} {data.hex(' ').upper()}"
+
+
+class CandumpLog(WireLog):
+    """A CAN log as `candump -L` writes it, so that can-utils, tshark and others read it."""
+
+    def __init__(self, path: Path, channel: str = "vcan0", *, now: Callable[[], float] = time.time) -> None:
+        super().__init__(path, now=now)
+        self._channel = channel
+
+    def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:  # noqa: ARG002 -- not in the format
+        frame = item if isinstance(item, CanFrame) else CanFrame(0, item)
+        return format_candump(
+            CanFrame(frame.id, frame.data, frame.extended, frame.remote, time_s), self._channel
+        )
