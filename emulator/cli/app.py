@@ -16,7 +16,10 @@ from starid.errors import StaridError
 EXIT_BAD_INPUT: Final = 2
 """Exit status for input that is refused; 1 says that all worked and that the result is not good."""
 
-COMMANDS: Final[dict[str, str]] = {}
+COMMANDS: Final[dict[str, str]] = {
+    "features": "features",
+    "database": "database",
+}
 """Sub-command → module under `emulator.cli`: its `command` function, or its `group` of sub-commands.
 
 These modules import at the top only what is quick; numerics come in inside the function.

@@ -1,0 +1,124 @@
+"""`starhil database`: build feature databases and look at them."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emulator.cli.frame_options import frame_catalog, frame_parameters
+
+group = typer.Typer(help="Feature databases of the LSI and RSI algorithms.", no_args_is_help=True)
+
+
+@group.command("build")
+def build(
+    overlap: Annotated[float, typer.Option(help="Overlap of neighbouring frames in percent, such as 99.5.")],
+    geometry: Annotated[
+        str, typer.Option(help="planar (the thesis) or spherical (a real camera).")
+    ] = "planar",
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="File to write; without it nothing is kept.")
+    ] = None,
+    kappa: Annotated[
+        float | None, typer.Option(help="Brightness limit κ; default 11.5 planar, 5.0 spherical.")
+    ] = None,
+    direction: Annotated[
+        str | None, typer.Option(help="Side of the limit kept; default faintest planar, brightest spherical.")
+    ] = None,
+    band: Annotated[
+        str | None, typer.Option(help="Magnitude: hp or v; default hp planar, v spherical.")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Frame width, degrees; default 40 planar, 42 spherical.")
+    ] = None,
+    full_field: Annotated[
+        bool, typer.Option("--full-field", help="Square frames instead of circles; not invariant to roll.")
+    ] = False,
+    epoch: Annotated[
+        float | None,
+        typer.Option(help="Epoch of the positions, Julian year; default 1991.25 planar, 2026 spherical."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object, and no progress bar.")
+    ] = False,
+) -> None:
+    """Build a feature database; the overlap is given in percent."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from starid.database import build_database
+    from starid.database_file import save_database
+
+    planar = geometry == "planar"
+    parameters = frame_parameters(
+        geometry,
+        fov=fov,
+        kappa=kappa if kappa is not None else (11.5 if planar else 5.0),
+        direction=direction or ("faintest" if planar else "brightest"),
+        band=band or ("hp" if planar else "v"),
+        full_field=full_field,
+        overlap_percent=overlap,
+    )
+    catalog = frame_catalog(geometry, epoch)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeRemainingColumn(),
+    )
+    start = time.perf_counter()
+    with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:
+        task = bar.add_task("frames")
+        database = build_database(
+            catalog, parameters, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    seconds = time.perf_counter() - start
+    result: dict[str, object] = {
+        "cells": database.cells,
+        "bytes_features": database.bytes_features,
+        "seconds": round(seconds, 3),
+    }
+    if output is not None:
+        result["bytes_file"] = save_database(database, output)
+        result["file"] = str(output)
+    _print(result, as_json=as_json)
+
+
+@group.command("info")
+def info(
+    file: Annotated[Path, typer.Argument(help="Database file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Check a database file as a whole and tell what it was made with."""
+    import dataclasses
+
+    from starid.database_file import load_database
+
+    database = load_database(file)
+    _print(
+        {
+            "file": str(file),
+            "cells": database.cells,
+            "bytes_features": database.bytes_features,
+            "stars": int(database.sky.stars.shape[0]),
+            "catalog": database.catalog_identity,
+            **dataclasses.asdict(database.parameters),
+            "minimum": database.minimum.tolist(),
+            "maximum": database.maximum.tolist(),
+        },
+        as_json=as_json,
+    )
+
+
+def _print(values: dict[str, object], *, as_json: bool) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(values) + "\n")
+        return
+    width = max(len(key) for key in values)
+    for key, value in values.items():
+        sys.stdout.write(f"{key:<{width}}  {value}\n")

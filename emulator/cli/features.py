@@ -1,0 +1,88 @@
+"""`starhil features`: the feature vector of one frame of the catalogue."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated, Final
+
+import typer
+
+from emulator.cli.frame_options import frame_catalog, frame_parameters
+from emulator.errors import EmulatorError
+
+_KEYS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
+
+
+def command(
+    ra_corner: Annotated[
+        float | None, typer.Option(help="Right ascension of the frame's lower-left corner, degrees (planar).")
+    ] = None,
+    dec_corner: Annotated[
+        float | None, typer.Option(help="Declination of the frame's lower-left corner, degrees (planar).")
+    ] = None,
+    ra: Annotated[float | None, typer.Option(help="Right ascension of the frame's centre, degrees.")] = None,
+    dec: Annotated[float | None, typer.Option(help="Declination of the frame's centre, degrees.")] = None,
+    kappa: Annotated[float, typer.Option(help="Brightness limit κ, magnitudes.")] = 11.5,
+    direction: Annotated[
+        str,
+        typer.Option(
+            help="Side of the limit that is kept: faintest (a ≥ κ, the thesis) or brightest (a ≤ κ)."
+        ),
+    ] = "faintest",
+    geometry: Annotated[
+        str,
+        typer.Option(
+            help="planar (degrees of the flat RA–Dec plane) or spherical (pixels of a 937-pixel camera)."
+        ),
+    ] = "planar",
+    fov: Annotated[
+        float | None,
+        typer.Option(help="Frame width, degrees; default 40 planar (as published), 42 spherical."),
+    ] = None,
+    band: Annotated[str, typer.Option(help="Magnitude used as brightness: hp or v.")] = "hp",
+    full_field: Annotated[
+        bool, typer.Option("--full-field", help="Take the square frame instead of its inscribed circle.")
+    ] = False,
+    epoch: Annotated[
+        float | None,
+        typer.Option(help="Epoch of the positions, Julian year; default 1991.25 planar, 2026 spherical."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of one frame of the catalogue."""
+    from starid.database import sky_of
+
+    parameters = frame_parameters(
+        geometry, fov=fov, kappa=kappa, direction=direction, band=band, full_field=full_field
+    )
+    half = 0.5 * parameters.fov_deg
+    if (
+        ra_corner is not None
+        and dec_corner is not None
+        and ra is None
+        and dec is None
+        and geometry == "planar"
+    ):
+        centre = (ra_corner + half, dec_corner + half)
+    elif ra is not None and dec is not None and ra_corner is None and dec_corner is None:
+        centre = (ra, dec)
+    else:
+        raise EmulatorError(
+            "features: give --ra and --dec of the centre, or (planar) --ra-corner and --dec-corner"
+        )
+    if not -90.0 <= centre[1] <= 90.0:
+        raise EmulatorError(
+            f"features: the frame's centre is at declination {centre[1]}°; −90 to 90 is needed"
+        )
+    vector = sky_of(frame_catalog(geometry, epoch), parameters).features(centre[0] % 360.0, centre[1])
+    values = (vector.n, vector.A, vector.r, vector.sigma_A, vector.sigma_r, vector.theta_deg)
+    if as_json:
+        result = {key: round(value, 6) for key, value in zip(_KEYS, values, strict=True)}
+        sys.stdout.write(json.dumps(result) + "\n")
+        return
+    unit = "px" if geometry == "spherical" else "°"
+    sys.stdout.write(
+        f"n        {vector.n}\nA        {vector.A:.2f} mag\nr        {vector.r:.2f} {unit}\n"
+        f"sigma_A  {vector.sigma_A:.2f} mag\nsigma_r  {vector.sigma_r:.2f} {unit}\ntheta    {vector.theta_deg:.2f}°\n"
+    )

@@ -1,0 +1,64 @@
+"""What `features` and `database` share: from options to the parameters of frames, and the catalogue they belong to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, cast
+
+from emulator.errors import EmulatorError
+
+if TYPE_CHECKING:
+    from starid.catalog import Band, StarCatalog
+    from starid.database import DatabaseParameters
+    from starid.frame_sky import Direction
+
+PLANAR_EPOCH: Final = 1991.25
+"""The catalogue's own epoch: the published numbers know no proper motion."""
+
+SPHERICAL_EPOCH: Final = 2026.0
+
+_PLANAR_FOV_DEG: Final = 40.0
+_SPHERICAL_FOV_DEG: Final = 42.0
+
+
+def choice(name: str, value: str, allowed: tuple[str, ...]) -> str:
+    """Return `value`, or refuse it and name what is allowed."""
+    if value not in allowed:
+        raise EmulatorError(f"--{name} {value}: one of {', '.join(allowed)} is needed")
+    return value
+
+
+def frame_parameters(
+    geometry: str,
+    *,
+    fov: float | None,
+    kappa: float,
+    direction: str,
+    band: str,
+    full_field: bool,
+    overlap_percent: float = 99.0,
+) -> DatabaseParameters:
+    """Parameters of frames from command-line options; `overlap_percent` is in percent."""
+    from starid.camera import Camera
+    from starid.database import DatabaseParameters
+
+    side = cast("Direction", choice("direction", direction, ("faintest", "brightest")))
+    magnitude = cast("Band", choice("band", band, ("hp", "v")))
+    if not 1.0 < overlap_percent < 100.0:
+        raise EmulatorError(
+            f"--overlap {overlap_percent}: percent are needed, above 1 and below 100, such as 99.5"
+        )
+    overlap = overlap_percent / 100.0
+    if choice("geometry", geometry, ("planar", "spherical")) == "planar":
+        width = _PLANAR_FOV_DEG if fov is None else fov
+        return DatabaseParameters("planar", overlap, width, kappa, side, magnitude, full_field)
+    camera = Camera.from_fov(_SPHERICAL_FOV_DEG if fov is None else fov)
+    return DatabaseParameters.for_camera(
+        camera, overlap=overlap, kappa=kappa, direction=side, band=magnitude, full_field=full_field
+    )
+
+
+def frame_catalog(geometry: str, epoch: float | None) -> StarCatalog:
+    """Catalogue at the epoch asked for, or at the geometry's own."""
+    from starid.catalog import load_catalog
+
+    return load_catalog(epoch=epoch or (PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH))

@@ -1,0 +1,202 @@
+"""The grid of frames that a feature database is made of: a flat one as the thesis has it, and one on the sphere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+from starid.jit import compiled
+
+Geometry = Literal["planar", "spherical"]
+
+DICTIONARY_SIDE: Final = 3
+"""Cells along one side of a dictionary."""
+
+DICTIONARY_SIZE: Final = DICTIONARY_SIDE * DICTIONARY_SIDE
+"""Cells in a dictionary: the nearest one and its neighbours."""
+
+_FULL_TURN: Final = 360.0
+_PLANAR_DECLINATION_SPAN: Final = 140.0
+_ROUNDING: Final = 1e-9
+
+
+class GridError(StaridError):
+    """A grid that cannot be laid out."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGrid:
+    """Frame centres in rows of constant declination; cells count row by row, from the south, from 0.
+
+    Attributes
+    ----------
+    geometry
+        "planar": the flat (α, δ) plane of the thesis, as many columns in every row. "spherical": rows half a step
+        off the poles and as many columns as keep the cells alike in area, at least three.
+    step_deg
+        Distance of two cells, φ·(1 − p), degrees.
+    first_ra_deg
+        Right ascension of the centre of column 0, degrees.
+    row_dec_deg, row_ra_step_deg
+        Declination of each row and distance of its columns, degrees, (rows,).
+    row_columns, row_start
+        Number of columns (rows,), and the first cell of each row (rows + 1,).
+    """
+
+    geometry: Geometry
+    step_deg: float
+    first_ra_deg: float
+    row_dec_deg: NDArray[np.float64]
+    row_ra_step_deg: NDArray[np.float64]
+    row_columns: NDArray[np.int64]
+    row_start: NDArray[np.int64]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return int(self.row_columns.size)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells N."""
+        return int(self.row_start[-1])
+
+    def row_and_column(self, cell: int) -> tuple[int, int]:
+        """Row and column of a cell, both from 0."""
+        row = int(cell_row(self.row_start, cell))
+        return row, cell - int(self.row_start[row])
+
+    def centre(self, cell: int) -> tuple[float, float]:
+        """Right ascension (0 … 360) and declination of a cell's centre, degrees."""
+        if not 0 <= cell < self.cells:
+            raise GridError(f"grid: cell {cell} does not exist; there are {self.cells}, counted from 0")
+        row, column = self.row_and_column(cell)
+        return (
+            (self.first_ra_deg + column * float(self.row_ra_step_deg[row])) % _FULL_TURN,
+            float(self.row_dec_deg[row]),
+        )
+
+    def dictionary(self, cell: int) -> NDArray[np.int64]:
+        """Cells of the 3×3 neighbourhood, (9,), row by row: the dictionary T of eq. 2.30 in terms of cells.
+
+        Right ascension wraps. At the first and the last row the block is moved inwards as a whole, so that it has
+        nine different cells always; on the sphere the three columns of a row are those nearest in right ascension.
+        """
+        cells = np.empty(DICTIONARY_SIZE, dtype=np.int64)
+        turns = np.empty(DICTIONARY_SIZE)
+        dictionary_cells(
+            self.row_start, self.row_columns, self.row_ra_step_deg, self.first_ra_deg, cell, cells, turns
+        )
+        return cells
+
+
+@compiled
+def cell_row(row_start: NDArray[np.int64], cell: int) -> int:
+    """Row of a cell, by bisection."""
+    low = 0
+    high = row_start.size - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if row_start[middle] <= cell:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@compiled
+def dictionary_cells(
+    row_start: NDArray[np.int64],
+    row_columns: NDArray[np.int64],
+    row_ra_step: NDArray[np.float64],
+    first_ra: float,
+    cell: int,
+    cells: NDArray[np.int64],
+    right_ascension: NDArray[np.float64],
+) -> int:
+    """Write the nine cells and their right ascensions (degrees, not wrapped); return the first of the three rows."""
+    row = cell_row(row_start, cell)
+    centre = (cell - row_start[row]) * row_ra_step[row]
+    first_row = min(max(row - 1, 0), row_columns.size - 3)
+    for i in range(3):
+        r = first_row + i
+        columns = row_columns[r]
+        middle = round(centre / row_ra_step[r])
+        for j in range(3):
+            column = middle - 1 + j
+            cells[3 * i + j] = row_start[r] + column % columns
+            right_ascension[3 * i + j] = first_ra + column * row_ra_step[r]
+    return first_row
+
+
+def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
+    """Lay out the grid for a frame width φ and an overlap ratio p.
+
+    The planar grid is the one that the published database sizes belong to: step 40°·(1 − p), 360°/step columns whose
+    lower-left corner starts at α = 0°, and ⌈140°/step⌉ rows whose corner starts at δ = −90°.
+
+    Parameters
+    ----------
+    geometry
+        "planar" or "spherical".
+    fov_deg
+        Width φ of a frame, degrees; 40° for the published planar numbers.
+    overlap
+        Overlap ratio p, 0 ≤ p < 1.
+
+    Raises
+    ------
+    GridError
+        If the values are out of range or leave fewer than three rows or columns.
+    """
+    if not (math.isfinite(overlap) and 0.0 <= overlap < 1.0):
+        raise GridError(
+            f"grid: overlap ratio {overlap} is not in [0, 1); 0.995 means that frames overlap by 99.5 %"
+        )
+    if not (math.isfinite(fov_deg) and 0.0 < fov_deg <= 120.0):
+        raise GridError(f"grid: a frame {fov_deg}° wide is not possible; give more than 0° and at most 120°")
+    step = fov_deg * (1.0 - overlap)
+    if geometry == "planar":
+        columns = math.ceil(_FULL_TURN / step - _ROUNDING * _FULL_TURN)
+        rows = math.ceil(_PLANAR_DECLINATION_SPAN / step - _ROUNDING * _PLANAR_DECLINATION_SPAN)
+        dec = -90.0 + step * np.arange(rows) + 0.5 * fov_deg
+        row_columns = np.full(rows, columns, dtype=np.int64)
+        ra_step = np.full(rows, step, dtype=np.float64)
+        first_ra = 0.5 * fov_deg
+    elif geometry == "spherical":
+        rows = math.ceil(180.0 / step)
+        dec = -90.0 + (np.arange(rows) + 0.5) * (180.0 / rows)
+        row_columns = np.maximum(np.rint(_FULL_TURN * np.cos(np.radians(dec)) / step), 3).astype(np.int64)
+        ra_step = np.asarray(_FULL_TURN / row_columns, dtype=np.float64)
+        first_ra = 0.0
+    else:
+        raise GridError(f"grid: geometry {geometry!r} is unknown; one of planar, spherical is needed")
+    if rows < DICTIONARY_SIDE or int(row_columns.min()) < DICTIONARY_SIDE:
+        raise GridError(f"grid: overlap {overlap} leaves {rows} rows of frames; at least three are needed")
+    row_dec = np.asarray(dec, dtype=np.float64)
+    row_start = np.concatenate([[0], np.cumsum(row_columns)]).astype(np.int64)
+    return FrameGrid(geometry, step, first_ra, row_dec, ra_step, row_columns, row_start)
+
+
+def nominal_cells(fov_deg: float, overlap: float) -> float:
+    """Nominal number of feature vectors N = 2π² / (φ_x·φ_y·(1 − p)²), eq. 2.23, with φ_x = φ_y = `fov_deg`."""
+    fov = math.radians(fov_deg)
+    return 2.0 * math.pi**2 / (fov * (1.0 - overlap)) ** 2
+
+
+def circle_intrusion(radius: float) -> float:
+    """How far neighbouring circles must overlap to leave no gap, in the unit of the radius.
+
+    Diagonal neighbours touch when 2·(2r − x)² = 4r², eq. 2.24, so that x = (2 − √2)·r, eq. 2.25.
+    """
+    return (2.0 - math.sqrt(2.0)) * radius
+
+
+def minimum_overlap() -> float:
+    """Least overlap ratio that loses no star: p = x/φ, eq. 2.26, with r = φ/2 gives p_min = 0.2929, eq. 2.27."""
+    return circle_intrusion(0.5)
