@@ -1,0 +1,43 @@
+"""`starhil hub`: a CAN bus over TCP that several processes share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")] = 29536,
+    log: Annotated[Path | None, typer.Option(help="Write all frames to this file as a candump log.")] = None,
+) -> None:
+    """Serve a CAN bus over TCP (socketcand text protocol) where the kernel has no CAN.
+
+    python-can joins with interface socketcand, host, port and channel vcan0; starhil with --can socketcand:HOST:PORT/vcan0.
+    Ends with SIGINT or SIGTERM.
+    """
+    import asyncio
+    import signal
+
+    from protocol.hub import DEFAULT_BUS, CanHub
+
+    async def serve() -> None:
+        hub = CanHub(host, port, log=log)
+        await hub.start()
+        print(f"ready can=socketcand:{hub.host}:{hub.port}/{DEFAULT_BUS}", flush=True)
+        ended = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, ended.set)
+        await ended.wait()
+        await hub.close()
+        counters = hub.statistics
+        print(
+            f"frames={counters.frames} delivered={counters.delivered} dropped={counters.dropped} "
+            f"errors={counters.errors}",
+            flush=True,
+        )
+
+    asyncio.run(serve())

@@ -1,0 +1,271 @@
+"""A CAN bus over TCP for machines whose kernel has none: an asyncio server of the socketcand text protocol.
+
+Each client opens a bus by name and sees every frame that the other clients of that bus send, in order and without
+loss. A client that does not read is given up to `BACKLOG_LIMIT` bytes; further frames are dropped for that client
+alone, and counted. Malformed commands are answered by an error and change nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, TextIO, cast
+
+from protocol.can_framing import CanFrame
+from protocol.candump import format_candump
+from protocol.errors import ProtocolError
+from protocol.socketcand import CommandError, CommandSplitter, format_identifier, parse_send
+
+DEFAULT_HOST: Final = "127.0.0.1"
+DEFAULT_PORT: Final = 29536
+DEFAULT_BUS: Final = "vcan0"
+
+BACKLOG_LIMIT: Final = 4 * 1024 * 1024
+"""Bytes that wait for one slow client at most; about 70 000 frames."""
+
+SETTLE_S: Final = 0.1
+"""How long frames are held back from a client that has just entered raw mode.
+
+python-can's client takes the answer to `< rawmode >` for broken if a frame follows it in the same read.
+"""
+
+FLUSH_LOG_S: Final = 0.5
+"""Longest time that a logged frame stays in memory."""
+
+
+@dataclass(slots=True)
+class HubStatistics:
+    """Counters since the start."""
+
+    clients: int = 0
+    """Clients connected now."""
+    frames: int = 0
+    """Frames received from clients."""
+    delivered: int = 0
+    """Frames handed to clients."""
+    dropped: int = 0
+    """Frames not handed to a client because it does not read."""
+    errors: int = 0
+    """Malformed or unknown commands."""
+
+
+class _Client(asyncio.Protocol):
+    """One connection."""
+
+    def __init__(self, hub: CanHub) -> None:
+        self._hub = hub
+        self._splitter = CommandSplitter()
+        self._transport: asyncio.Transport | None = None
+        self._held: list[bytes] | None = None
+        self._settle: asyncio.TimerHandle | None = None
+        self.bus: str | None = None
+        self.raw = False
+        self.remote = False
+        self.outbox: list[bytes] = []
+        """Frames gathered while one read of another client is worked off."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self._transport.write(b"< hi >")
+        self._hub.join(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (given by asyncio)
+        self._transport = None
+        if self._settle is not None:
+            self._settle.cancel()
+        self._hub.leave(self)
+
+    def data_received(self, data: bytes) -> None:
+        if self._held is not None:
+            self._release()
+        frames: list[tuple[CanFrame, bytes]] = []
+        for command in self._splitter.feed(data):
+            if command is not None and command.startswith(b"send "):
+                try:
+                    self._need_bus()
+                    frames.append(parse_send(command))
+                except ProtocolError as error:
+                    self._refuse(str(error))
+            else:
+                if frames:
+                    self._hub.distribute(self, frames)
+                    frames = []
+                self._command(command)
+        if frames:
+            self._hub.distribute(self, frames)
+
+    def close(self) -> None:
+        """Drop the connection, whatever is still waiting."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def deliver(self) -> tuple[int, int]:
+        """Hand over the gathered frames; return how many were delivered and how many dropped."""
+        count = len(self.outbox)
+        if self._transport is None or self._backlog() > BACKLOG_LIMIT:
+            self.outbox.clear()
+            return 0, count
+        if self._held is not None:
+            self._held += self.outbox
+        else:
+            self._transport.write(b"".join(self.outbox))
+        self.outbox.clear()
+        return count, 0
+
+    def _backlog(self) -> int:
+        held = sum(map(len, self._held)) if self._held else 0
+        return held + (self._transport.get_write_buffer_size() if self._transport is not None else 0)
+
+    def _answer(self, text: str) -> None:
+        if self._transport is not None and self._backlog() <= BACKLOG_LIMIT:
+            self._transport.write(f"< {text} >".encode())
+
+    def _refuse(self, text: str) -> None:
+        self._hub.statistics.errors += 1
+        self._answer(f"error {text}")
+
+    def _need_bus(self) -> None:
+        if self.bus is None:
+            raise CommandError("no bus is open; send < open NAME > first")
+
+    def _command(self, command: bytes | None) -> None:
+        match command.split() if command is not None else []:
+            case [b"open", name] if self.bus is None and name.isascii():
+                self.bus = name.decode()
+                self._answer("ok")
+            case [b"rawmode"] if self.bus is not None:
+                self._answer("ok")
+                if not self.raw:
+                    self.raw = True
+                    self._hold()
+            case [b"remote"] if self.bus is not None:
+                self.remote = True
+                self._answer("ok")
+            case [b"echo"]:
+                self._answer("echo")
+            case [b"open", _]:
+                self._refuse("a bus is open already")
+            case [b"rawmode"] | [b"remote"]:
+                self._refuse("no bus is open; send < open NAME > first")
+            case []:
+                self._refuse("malformed command")
+            case _:
+                self._refuse("unknown command")
+
+    def _hold(self) -> None:
+        if not self.remote:
+            self._held = []
+            self._settle = asyncio.get_running_loop().call_later(SETTLE_S, self._release)
+
+    def _release(self) -> None:
+        held, self._held = self._held, None
+        if self._settle is not None:
+            self._settle.cancel()
+            self._settle = None
+        if held and self._transport is not None:
+            self._transport.write(b"".join(held))
+
+
+class CanHub:
+    """The server: `await start()`, then clients come to `host:port` until `await close()`.
+
+    Parameters
+    ----------
+    host, port:
+        Address to listen at; port 0 takes a free one, which `port` then tells.
+    log:
+        File that gets every frame as a candump log.
+    now:
+        Clock of the frames' time stamps (s since 1970).
+    """
+
+    def __init__(
+        self,
+        host: str = DEFAULT_HOST,
+        port: int = DEFAULT_PORT,
+        *,
+        log: Path | None = None,
+        now: Callable[[], float] = time.time,
+    ) -> None:
+        self.host: Final = host
+        self.port = port
+        self.statistics: Final = HubStatistics()
+        self._log_path = log
+        self._log: TextIO | None = None
+        self._now = now
+        self._server: asyncio.Server | None = None
+        self._clients: list[_Client] = []
+        self._flusher: asyncio.TimerHandle | None = None
+
+    async def start(self) -> None:
+        """Listen. Raises ProtocolError if the address or the log cannot be had."""
+        loop = asyncio.get_running_loop()
+        try:
+            self._server = await loop.create_server(lambda: _Client(self), self.host, self.port)
+        except OSError as error:
+            raise ProtocolError(
+                f"CAN hub: cannot listen at {self.host}:{self.port}: {error.strerror}; choose another --port"
+            ) from None
+        self.port = self._server.sockets[0].getsockname()[1]
+        if self._log_path is not None:
+            try:
+                self._log = self._log_path.open("w", encoding="ascii")
+            except OSError as error:
+                await self.close()
+                raise ProtocolError(f"CAN hub: cannot write {self._log_path}: {error.strerror}") from None
+            self._flush_log()
+
+    async def close(self) -> None:
+        """Stop listening and drop all clients."""
+        if self._flusher is not None:
+            self._flusher.cancel()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        for client in tuple(self._clients):
+            client.close()
+        while self._clients:
+            await asyncio.sleep(0)
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+
+    def join(self, client: _Client) -> None:
+        """Take in a new client."""
+        self._clients.append(client)
+        self.statistics.clients += 1
+
+    def leave(self, client: _Client) -> None:
+        """Let go of a client."""
+        self._clients.remove(client)
+        self.statistics.clients -= 1
+
+    def distribute(self, sender: _Client, frames: list[tuple[CanFrame, bytes]]) -> None:
+        """Hand frames to every other client of the sender's bus."""
+        seconds = self._now()
+        stamp = f"{seconds:.6f}".encode()
+        lines = [
+            (b"< frame %b %b %b >" % (format_identifier(frame), stamp, digits), frame.remote)
+            for frame, digits in frames
+        ]
+        self.statistics.frames += len(lines)
+        plain = [line for line, remote in lines if not remote]
+        for client in self._clients:
+            if client is sender or not client.raw or client.bus != sender.bus:
+                continue
+            client.outbox = [line for line, _ in lines] if client.remote else list(plain)
+            delivered, dropped = client.deliver()
+            self.statistics.delivered += delivered
+            self.statistics.dropped += dropped
+        if self._log is not None:
+            bus = sender.bus or DEFAULT_BUS
+            for frame, _ in frames:
+                self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
+
+    def _flush_log(self) -> None:
+        if self._log is not None:
+            self._log.flush()
+            self._flusher = asyncio.get_running_loop().call_later(FLUSH_LOG_S, self._flush_log)
