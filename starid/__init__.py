@@ -1,1 +1,36 @@
-"""Star catalogue, camera, detection, identification and attitude: the numerics of a star tracker."""
+"""Star catalogue, camera, detection, identification and attitude: the numerics of a star tracker.
+
+The names of the public interface stand here and are imported from their modules on first use, so that
+``import starid`` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from starid.attitude import Attitude as Attitude
+    from starid.camera import Camera as Camera
+    from starid.catalog import StarCatalog as StarCatalog
+    from starid.catalog import load_catalog as load_catalog
+
+_HOMES: Final = {
+    "Attitude": "starid.attitude",
+    "Camera": "starid.camera",
+    "StarCatalog": "starid.catalog",
+    "load_catalog": "starid.catalog",
+}
+"""Public name → module that holds it."""
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'starid' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

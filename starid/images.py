@@ -1,0 +1,134 @@
+"""Image files into arrays: PNG, TIFF and JPEG, grey, 8 or 16 bit, checked to be whole."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG: Final = b"\xff\xd8\xff"
+_TIFFS: Final = (b"II*\x00", b"MM\x00*")
+_CHUNK_FRAME: Final = 12
+_GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
+"""Weights of blue, green and red in the luma of ITU-R BT.601."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """A grey image.
+
+    Attributes
+    ----------
+    pixels : ndarray (height, width) of uint8 or uint16
+        Row 0 is the top.
+    bits : int
+        Bits a pixel of the file, 8 or 16.
+    """
+
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    bits: int
+
+
+def load_image(path: str | Path, *, allow_colour: bool = False) -> Image:
+    """Read a grey PNG, TIFF or JPEG of 8 or 16 bits.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    allow_colour : bool
+        Turn a colour image into grey (luma of BT.601, alpha dropped) instead of refusing it.
+
+    Raises
+    ------
+    StaridError
+        The file is missing, not such an image, truncated, in colour, of another depth, or every pixel has
+        the same value.
+    """
+    source = Path(path)
+    try:
+        content = source.read_bytes()
+    except FileNotFoundError:
+        raise StaridError(f"image {source}: no such file; give a PNG, TIFF or JPEG") from None
+    except OSError as error:
+        raise StaridError(
+            f"image {source}: cannot be read ({error.strerror}); give a readable file"
+        ) from None
+    _check_whole(source, content)
+    pixels = _decode(source, content)
+    if pixels.ndim == 3:
+        if not allow_colour:
+            raise StaridError(
+                f"image {source}: has {pixels.shape[2]} channels; a star sensor's frame is grey, "
+                "convert it or allow colour"
+            )
+        grey = np.rint(pixels[:, :, :3] @ _GREY_WEIGHTS)
+        pixels = grey.astype(pixels.dtype)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise StaridError(f"image {source}: pixels of type {pixels.dtype}; 8 or 16 bit whole numbers needed")
+    bits = 8 * pixels.dtype.itemsize
+    low, high = int(pixels.min()), int(pixels.max())
+    if low == high:
+        look = {0: "all black", 2**bits - 1: "all white"}.get(low, "without any contrast")
+        raise StaridError(f"image {source}: {look}, every pixel is {low}; give a frame that shows stars")
+    return Image(pixels=np.ascontiguousarray(pixels), bits=bits)
+
+
+def _check_whole(source: Path, content: bytes) -> None:
+    """Refuse what is no PNG, TIFF or JPEG, and PNG or JPEG files that break off."""
+    if content.startswith(_PNG):
+        whole = _png_is_whole(content)
+    elif content.startswith(_JPEG):
+        whole = content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
+    elif content.startswith(_TIFFS):
+        whole = True
+    else:
+        what = "is empty" if not content else "is no PNG, TIFF or JPEG"
+        raise StaridError(f"image {source}: {what}; give a grey image of 8 or 16 bit")
+    if not whole:
+        raise _truncated(source)
+
+
+def _truncated(source: Path) -> StaridError:
+    return StaridError(f"image {source}: truncated or damaged; write or fetch the file again")
+
+
+def _png_is_whole(content: bytes) -> bool:
+    """Walk the chunks: every checksum right, and the end chunk there."""
+    at = len(_PNG)
+    while at + _CHUNK_FRAME <= len(content):
+        size = int.from_bytes(content[at : at + 4], "big")
+        end = at + _CHUNK_FRAME + size
+        if end > len(content):
+            return False
+        body = content[at + 4 : end - 4]
+        if zlib.crc32(body) != int.from_bytes(content[end - 4 : end], "big"):
+            return False
+        if body[:4] == b"IEND":
+            return True
+        at = end
+    return False
+
+
+def _decode(source: Path, content: bytes) -> NDArray[Any]:
+    """Pixels (height, width) or (height, width, channels) as they are stored."""
+    import cv2
+
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise StaridError(f"image {source}: cannot be decoded ({error.err}); convert it to PNG") from None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if pixels is None or pixels.size == 0:
+        raise _truncated(source)
+    return np.asarray(pixels)
