@@ -14,12 +14,18 @@ if TYPE_CHECKING:
     from starid.camera import Camera as Camera
     from starid.catalog import StarCatalog as StarCatalog
     from starid.catalog import load_catalog as load_catalog
+    from starid.identifier import Identifier as Identifier
+    from starid.interface import make_identifier as make_identifier
+    from starid.solution import Solution as Solution
 
 _HOMES: Final = {
     "Attitude": "starid.attitude",
     "Camera": "starid.camera",
+    "Identifier": "starid.identifier",
+    "Solution": "starid.solution",
     "StarCatalog": "starid.catalog",
     "load_catalog": "starid.catalog",
+    "make_identifier": "starid.interface",
 }
 """Public name → module that holds it."""
 

@@ -1,0 +1,109 @@
+"""One interface for every identification algorithm, and the one place that makes them by name."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, Final, Protocol, cast, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import StarCatalog
+from starid.errors import StaridError
+from starid.solution import Solution
+
+ALGORITHMS: Final[dict[str, tuple[str, str]]] = {
+    "geometric": ("starid.identifier", "Identifier"),
+    "lsi": ("starid.lsi_identifier", "LsiIdentifier"),
+    "rsi": ("starid.rsi_identifier", "RsiIdentifier"),
+}
+"""Name of an algorithm → module and class; modules are imported when they are asked for."""
+
+
+@runtime_checkable
+class StarIdentifier(Protocol):
+    """What identifies stars: detections in, verified attitude out."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the positions belong to."""
+        ...
+
+    @property
+    def catalog(self) -> StarCatalog:
+        """The catalogue that `Solution.catalog_index` counts in."""
+        ...
+
+    def identify(
+        self,
+        xy_px: NDArray[np.float64],
+        flux: NDArray[np.float64],
+        xy_sigma_px: NDArray[np.float64] | None = None,
+    ) -> Solution:
+        """Lost in space: attitude without any knowledge of it.
+
+        Parameters
+        ----------
+        xy_px : array (n, 2)
+            Positions, pixels.
+        flux : array (n,)
+            Brightness in any linear unit.
+        xy_sigma_px : array (n,), optional
+            One-sigma error of each position per axis, pixels; estimated from the residuals when not given.
+        """
+        ...
+
+    def track(
+        self,
+        xy_px: NDArray[np.float64],
+        flux: NDArray[np.float64],
+        predicted: Attitude | NDArray[np.float64],
+        xy_sigma_px: NDArray[np.float64] | None = None,
+        *,
+        window_px: float | None = None,
+    ) -> Solution:
+        """Attitude near a predicted one; invalid, with the reason, where it does not hold.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `identify`.
+        predicted : Attitude or array (4,)
+            Attitude expected, or its scalar-last quaternion.
+        window_px : float, optional
+            Largest distance of a star from where the prediction puts it, pixels.
+        """
+        ...
+
+
+def make_identifier(
+    algorithm: str = "geometric",
+    camera: Camera = DEFAULT_CAMERA,
+    catalog: StarCatalog | None = None,
+    **options: Any,
+) -> StarIdentifier:
+    """Identifier by name: "geometric", "lsi" or "rsi".
+
+    Parameters
+    ----------
+    algorithm : str
+        One of `ALGORITHMS`.
+    camera : Camera
+        What the detections were taken with.
+    catalog : StarCatalog, optional
+        Default: the one that `load_catalog()` gives.
+    **options
+        Keywords of the algorithm's own class.
+
+    Raises
+    ------
+    StaridError
+        No such algorithm.
+    """
+    if algorithm not in ALGORITHMS:
+        raise StaridError(f"algorithm: {algorithm!r} given, one of {', '.join(ALGORITHMS)} needed")
+    module, name = ALGORITHMS[algorithm]
+    factory = getattr(importlib.import_module(module), name)
+    return cast("StarIdentifier", factory(camera, catalog, **options))

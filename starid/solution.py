@@ -1,0 +1,132 @@
+"""The answer of an identification: attitude, matched stars, uncertainty, and why it is valid or not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from typing import Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.attitude import ARCSEC_PER_RAD, Attitude
+from starid.camera import Camera
+from starid.errors import StaridError
+
+Mode = Literal["lost_in_space", "tracking"]
+
+_NO_INDEX: Final = np.empty(0, dtype=np.int64)
+_NO_HIP: Final = np.empty(0, dtype=np.int32)
+
+
+class Reason(StrEnum):
+    """Why a solution is what it is; `OK` exactly when it is valid."""
+
+    OK = "ok"
+    TOO_FEW_STARS = "too_few_stars"
+    NO_MATCH = "no_match"
+    AMBIGUOUS = "ambiguous"
+    RESIDUAL = "residual"
+    PREDICTION_LOST = "prediction_lost"
+    BAD_INPUT = "bad_input"
+
+
+def _nan(*shape: int) -> NDArray[np.float64]:
+    return np.full(shape, math.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What an identifier found in one set of detections.
+
+    Attributes
+    ----------
+    valid : bool
+        The attitude passed its verification. Nothing else in here may be flown on when it is False.
+    reason : Reason
+        `ok`, or why there is no attitude.
+    quaternion_xyzw : ndarray (4,)
+        Scalar-last, rotates ICRS into the sensor frame; NaN when invalid.
+    detection_index, catalog_index : ndarray (m,) int64
+        Matched pairs: row of the detections given, row of the identifier's `StarCatalog` (the brightest
+        member where several catalogue stars are seen as one).
+    hip : ndarray (m,) int32
+        Hipparcos numbers of the matched catalogue stars.
+    covariance : ndarray (3, 3)
+        Of the rotation vector e in the sensor frame, rad²: measured attitude = ``truth.rotated(e)``.
+    rms_px : float
+        Root mean square distance between matched detections and their predicted positions, pixels.
+    sigma_px : float
+        Centroid noise per axis that the covariance rests on (estimated, or the scaled mean of what was
+        given), pixels.
+    probability_false : float
+        Upper bound on the probability that as good an agreement would have come about by chance anywhere
+        in the search that led to it.
+    elapsed : float
+        Seconds spent.
+    mode : {"lost_in_space", "tracking"}
+        How it was found.
+    rate_rad_s : ndarray (3,) or None
+        Body rate in the sensor frame where a tracker knows it.
+    camera : Camera or None
+        The camera as refined on the stars, where the field of view was not known exactly.
+    """
+
+    valid: bool
+    reason: Reason
+    quaternion_xyzw: NDArray[np.float64] = field(default_factory=lambda: _nan(4))
+    detection_index: NDArray[np.int64] = field(default_factory=_NO_INDEX.copy)
+    catalog_index: NDArray[np.int64] = field(default_factory=_NO_INDEX.copy)
+    hip: NDArray[np.int32] = field(default_factory=_NO_HIP.copy)
+    covariance: NDArray[np.float64] = field(default_factory=lambda: _nan(3, 3))
+    rms_px: float = math.nan
+    sigma_px: float = math.nan
+    probability_false: float = 1.0
+    elapsed: float = 0.0
+    mode: Mode = "lost_in_space"
+    rate_rad_s: NDArray[np.float64] | None = None
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        if self.valid != (self.reason is Reason.OK):
+            raise StaridError(f"solution: valid is {self.valid} but the reason is {self.reason.value!r}")
+
+    @classmethod
+    def invalid(cls, reason: Reason, *, mode: Mode = "lost_in_space", elapsed: float = 0.0) -> Self:
+        """Answer without an attitude, and why."""
+        return cls(valid=False, reason=reason, mode=mode, elapsed=elapsed)
+
+    @cached_property
+    def attitude(self) -> Attitude:
+        """The attitude of a valid solution.
+
+        Raises
+        ------
+        StaridError
+            The solution is invalid.
+        """
+        if not self.valid:
+            raise StaridError(f"solution: no attitude, since it is invalid ({self.reason.value})")
+        return Attitude(self.quaternion_xyzw)
+
+    @property
+    def matches(self) -> NDArray[np.int64]:
+        """Matched pairs (m, 2): row of the detections, Hipparcos number."""
+        return np.column_stack([self.detection_index, self.hip.astype(np.int64)])
+
+    @property
+    def star_count(self) -> int:
+        """Number of matched stars."""
+        return int(self.detection_index.size)
+
+    @property
+    def cross_boresight_sigma_arcsec(self) -> float:
+        """One-sigma error of the boresight per axis, arcseconds."""
+        return math.sqrt(0.5 * float(self.covariance[0, 0] + self.covariance[1, 1])) * ARCSEC_PER_RAD
+
+    @property
+    def roll_sigma_arcsec(self) -> float:
+        """One-sigma error of the roll, arcseconds."""
+        return math.sqrt(float(self.covariance[2, 2])) * ARCSEC_PER_RAD
