@@ -40,7 +40,7 @@ def cache_dir() -> Path:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "starhil"
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file in the same folder, then move it onto `path` in one step.
 
     Parameters

@@ -1,42 +1,27 @@
-"""Image files into arrays: PNG, TIFF and JPEG, grey, 8 or 16 bit, checked to be whole."""
+"""Image files: PNG, TIFF and JPEG of 8 or 16 bit, read only if grey and whole, written whole."""
 
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.cache import write_atomically
 from starid.errors import StaridError
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 _TIFFS: Final = (b"II*\x00", b"MM\x00*")
+_SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _CHUNK_FRAME: Final = 12
 _GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in the luma of ITU-R BT.601."""
 
 
-@dataclass(frozen=True)
-class Image:
-    """A grey image.
-
-    Attributes
-    ----------
-    pixels : ndarray (height, width) of uint8 or uint16
-        Row 0 is the top.
-    bits : int
-        Bits a pixel of the file, 8 or 16.
-    """
-
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
-    bits: int
-
-
-def load_image(path: str | Path, *, allow_colour: bool = False) -> Image:
+def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Read a grey PNG, TIFF or JPEG of 8 or 16 bits.
 
     Parameters
@@ -45,6 +30,11 @@ def load_image(path: str | Path, *, allow_colour: bool = False) -> Image:
         The file.
     allow_colour : bool
         Turn a colour image into grey (luma of BT.601, alpha dropped) instead of refusing it.
+
+    Returns
+    -------
+    ndarray (height, width) of uint8 or uint16
+        Row 0 is the top.
 
     Raises
     ------
@@ -73,12 +63,49 @@ def load_image(path: str | Path, *, allow_colour: bool = False) -> Image:
         pixels = grey.astype(pixels.dtype)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise StaridError(f"image {source}: pixels of type {pixels.dtype}; 8 or 16 bit whole numbers needed")
-    bits = 8 * pixels.dtype.itemsize
     low, high = int(pixels.min()), int(pixels.max())
     if low == high:
-        look = {0: "all black", 2**bits - 1: "all white"}.get(low, "without any contrast")
+        look = {0: "all black", 256**pixels.dtype.itemsize - 1: "all white"}.get(low, "without any contrast")
         raise StaridError(f"image {source}: {look}, every pixel is {low}; give a frame that shows stars")
-    return Image(pixels=np.ascontiguousarray(pixels), bits=bits)
+    return np.ascontiguousarray(pixels)
+
+
+def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write a grey or colour image, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy).
+    image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
+        Colour in the order blue, green, red.
+
+    Raises
+    ------
+    StaridError
+        The suffix is none of these, or the file cannot be written.
+    """
+    import cv2
+
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise StaridError(f"image {target}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
+        raise StaridError(
+            f"image {target}: JPEG holds 8 bits a pixel, this frame has 16; write a PNG or TIFF"
+        )
+    done, packed = cv2.imencode(suffix, image)
+    if not done:
+        raise StaridError(
+            f"image {target}: shape {image.shape} of {image.dtype} cannot be written as {suffix}"
+        )
+    try:
+        write_atomically(target, lambda part: part.write_bytes(packed.tobytes()))
+    except OSError as error:
+        raise StaridError(
+            f"image {target}: cannot be written ({error.strerror}); choose another place"
+        ) from None
 
 
 def _check_whole(source: Path, content: bytes) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import starid
 from starid.errors import StaridError
-from starid.images import load_image
+from starid.image_io import read_image, write_image
 
 RNG = np.random.default_rng(8)
 GREY8 = RNG.integers(0, 255, (60, 80), dtype=np.uint8)
@@ -27,22 +27,22 @@ def written(folder: Path, name: str, pixels: np.ndarray) -> Path:
 def test_lossless_formats_come_back_exactly(
     tmp_path: Path, suffix: str, pixels: np.ndarray, bits: int
 ) -> None:
-    image = load_image(written(tmp_path, f"a.{suffix}", pixels))
-    np.testing.assert_array_equal(image.pixels, pixels)
-    assert image.bits == bits
-    assert image.pixels.dtype == pixels.dtype
+    image = read_image(written(tmp_path, f"a.{suffix}", pixels))
+    np.testing.assert_array_equal(image, pixels)
+    assert 8 * image.itemsize == bits
+    assert image.dtype == pixels.dtype
 
 
 def test_jpeg_comes_back_nearly(tmp_path: Path) -> None:
     smooth = cv2.GaussianBlur(GREY8, (0, 0), 3)
-    image = load_image(written(tmp_path, "a.jpg", smooth))
-    assert np.abs(image.pixels.astype(int) - smooth).max() <= 8
+    image = read_image(written(tmp_path, "a.jpg", smooth))
+    assert np.abs(image.astype(int) - smooth).max() <= 8
 
 
 def test_jpeg_with_a_tail_is_whole(tmp_path: Path) -> None:
     path = written(tmp_path, "a.jpg", GREY8)
     path.write_bytes(path.read_bytes() + b"appended by a camera")
-    assert load_image(path).pixels.shape == (60, 80)
+    assert read_image(path).shape == (60, 80)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "jpg"])
@@ -54,7 +54,7 @@ def test_truncated_files_are_refused(
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(StaridError, match=rf"a\.{suffix}: truncated or damaged"):
-        load_image(path)
+        read_image(path)
     assert capfd.readouterr().err == "", "the decoder's own complaints stay out of the way"
 
 
@@ -64,7 +64,7 @@ def test_png_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with pytest.raises(StaridError, match="damaged"):
-        load_image(path)
+        read_image(path)
 
 
 @pytest.mark.parametrize(
@@ -84,31 +84,50 @@ def test_images_that_are_no_frames_are_refused(
     tmp_path: Path, name: str, pixels: np.ndarray, words: str
 ) -> None:
     with pytest.raises(StaridError, match=words) as caught:
-        load_image(written(tmp_path, name, pixels))
+        read_image(written(tmp_path, name, pixels))
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_colour_becomes_luma_when_allowed(tmp_path: Path) -> None:
     blue, green, red = GREY8, GREY8.T.reshape(GREY8.shape), 255 - GREY8
-    image = load_image(written(tmp_path, "c.png", np.dstack([blue, green, red])), allow_colour=True)
+    image = read_image(written(tmp_path, "c.png", np.dstack([blue, green, red])), allow_colour=True)
     expected = 0.114 * blue + 0.587 * green + 0.299 * red
-    np.testing.assert_allclose(image.pixels, expected, atol=0.5001)
-    assert image.bits == 8
+    np.testing.assert_allclose(image, expected, atol=0.5001)
+    assert image.dtype == np.uint8
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"GIF89a" + b"\x00" * 50])
 def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(StaridError, match=r"PNG, TIFF or JPEG|is empty"):
-        load_image(tmp_path / "a.png")
+        read_image(tmp_path / "a.png")
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StaridError, match="no such file"):
-        load_image(tmp_path / "nothing.png")
+        read_image(tmp_path / "nothing.png")
     with pytest.raises(StaridError, match="cannot be read"):
-        load_image(tmp_path)
+        read_image(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tiff", "sub/folder/a.PNG"])
+@pytest.mark.parametrize("pixels", [GREY8, GREY16])
+def test_what_is_written_is_read_back(tmp_path: Path, name: str, pixels: np.ndarray) -> None:
+    write_image(tmp_path / name, pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / name), pixels)
+    assert [p.name for p in (tmp_path / name).parent.iterdir()] == [Path(name).name]
+
+
+def test_images_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StaridError, match=r"suffix '\.bmp'"):
+        write_image(tmp_path / "a.bmp", GREY8)
+    with pytest.raises(StaridError, match="JPEG holds 8 bits"):
+        write_image(tmp_path / "a.jpg", GREY16)
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StaridError, match="cannot be written"):
+        write_image(tmp_path / "file" / "a.png", GREY8)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 def test_public_names_are_reached_from_the_package() -> None:
