@@ -37,7 +37,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from hil_tests.errors import ScriptError, near_matches
+from hil_tests.errors import BenchError, ScriptError, near_matches
 from hil_tests.expect import (
     AttitudeCheck,
     Expectation,
@@ -49,6 +49,7 @@ from hil_tests.expect import (
     read_stated_attitude,
     show,
 )
+from hil_tests.raw_exchange import parse_frame, pattern
 from hil_tests.script_model import (
     LINKS,
     SIGNALS,
@@ -117,7 +118,7 @@ class _Checker:
         timeout_s = defaults.number("timeout_s", 1.0, minimum=0.001)
         retries = defaults.count("retries", 0, minimum=0)
         keep_going = defaults.flag("keep_going", default=False)
-        link = defaults.choice("link", LINKS) if defaults.has("link") else None
+        link = self._link(defaults)
         defaults.finish()
         tables = reader.sub_tables("step")
         reader.finish()
@@ -165,7 +166,7 @@ class _Checker:
             expect=expect,
             attitude=attitude,
             capture=capture,
-            link=reader.choice("link", LINKS) if reader.has("link") else None,
+            link=action.link if isinstance(action, Send) else self._link(reader),
             repeat=reader.count("repeat", 1),
             every_s=action.every_s
             if isinstance(action, Sample)
@@ -180,6 +181,10 @@ class _Checker:
         return step
 
     # --- parts of a step ---
+
+    @staticmethod
+    def _link(reader: TableReader) -> str | None:
+        return reader.choice("link", LINKS) if reader.has("link") else None
 
     def _answer_row(self, action: Action) -> Row | None:
         """Return the row that the action's answer is laid out by, None if it has no values."""
@@ -349,10 +354,27 @@ class _Checker:
         return DownloadImage(file, size, method), f"download image {file}"
 
     def send(self, reader: TableReader) -> tuple[Action, str]:
-        """Read bytes or frames that are sent as they stand."""
+        """Read bytes or frames that are sent as they stand; their form tells the link."""
         data = reader.texts("send")
         answer = reader.texts("answer") if reader.has("answer") else None
-        return Send(data, answer, reader.number("listen_s", 0.3, minimum=0.0)), "send as it stands"
+        kinds = set()
+        try:
+            for text in data:
+                kinds.add("can" if "#" in text else "serial")
+                if "#" in text:
+                    parse_frame(text)
+                else:
+                    bytes.fromhex(text)
+            for text in answer or ():
+                pattern(text)
+        except (BenchError, ValueError) as error:
+            reader.fail(f"'send' or 'answer': {error}")
+        if len(kinds) != 1:
+            reader.fail(
+                "'send' takes bytes in hexadecimal or CAN frames as cansend writes them, not both or none"
+            )
+        listen_s = reader.number("listen_s", 0.3, minimum=0.0)
+        return Send(kinds.pop(), data, answer, listen_s), "send as it stands"
 
     def wait(self, reader: TableReader) -> tuple[Action, str]:
         """Read a pause."""

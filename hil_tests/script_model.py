@@ -89,6 +89,8 @@ class DownloadImage:
 class Send:
     """Send bytes or CAN frames as they stand, and look at what comes back."""
 
+    link: str
+    """`serial` or `can`, by the form of what is sent."""
     data: tuple[str, ...]
     """Bytes in hexadecimal (serial), or frames as `cansend` writes them (CAN)."""
     answer: tuple[str, ...] | None

@@ -1,0 +1,158 @@
+"""A bench set up: the unit under test, the clients on its links, their logs, and the emulator if the bench started it."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from hil_tests.client import DEFAULT_TIMEOUT_S, ObcClient
+from hil_tests.emulator_process import EmulatorProcess
+from hil_tests.errors import BenchError
+from hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
+from hil_tests.wire_log import CandumpLog, SerialLog, WireLog
+from protocol.icd import InterfaceDefinition
+
+SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
+
+
+@dataclass(frozen=True)
+class LinkOptions:
+    """How the unit is reached and how the clients behave.
+
+    Attributes
+    ----------
+    serial, can : str or None
+        Port and channel; None where the link is not used. With an emulator that the bench started, `auto` takes what
+        its ready line says.
+    """
+
+    serial: str | None = None
+    can: str | None = None
+    dialect: str = "b"
+    baud: int = DEFAULT_BAUD
+    host_address: int = DEFAULT_HOST_ADDRESS
+    device_address: int = DEFAULT_DEVICE_ADDRESS
+    timeout_s: float = DEFAULT_TIMEOUT_S
+    retries: int = 0
+
+
+class Bench:
+    """Clients on one unit; a context manager that opens them at need and closes all.
+
+    Parameters
+    ----------
+    options : LinkOptions
+        The links.
+    icd : InterfaceDefinition
+        Names and layouts.
+    emulator : EmulatorProcess, optional
+        A process that is not yet started; the bench starts and ends it.
+    log_folder : Path, optional
+        Where `serial.log` and `can.log` are written.
+    """
+
+    def __init__(
+        self,
+        options: LinkOptions,
+        icd: InterfaceDefinition,
+        *,
+        emulator: EmulatorProcess | None = None,
+        log_folder: Path | None = None,
+    ) -> None:
+        self.options = options
+        self.icd = icd
+        self.emulator = emulator
+        self.log_folder = log_folder
+        self.logs: list[WireLog] = []
+        self._log_of: dict[str, WireLog] = {}
+        self._clients: dict[str, ObcClient] = {}
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links in use: `serial`, `can` or both."""
+        return tuple(name for name in ("serial", "can") if getattr(self.options, name) is not None)
+
+    def client(self, link: str) -> ObcClient:
+        """Return the client on a link, opened at the first call."""
+        if link not in self.links:
+            raise BenchError(f"this bench has no {link} link; it has {' and '.join(self.links)}")
+        if link not in self._clients:
+            self._clients[link] = self._open(link)
+        return self._clients[link]
+
+    def _open(self, link: str) -> ObcClient:
+        options = self.options
+        spec = self._spec(link)
+        common = {"icd": self.icd, "timeout_s": options.timeout_s, "retries": options.retries}
+        log = self._log(link)
+        if link == "serial":
+            return ObcClient.open(serial=spec, dialect=options.dialect, baud=options.baud, log=log, **common)  # type: ignore[arg-type]
+        return ObcClient.open(
+            can=spec,
+            host_address=options.host_address,
+            device_address=options.device_address,
+            log=log,
+            **common,  # type: ignore[arg-type]
+        )
+
+    def _spec(self, link: str) -> str:
+        spec = str(getattr(self.options, link))
+        if self.emulator is None or spec != "auto":
+            return spec
+        if link not in self.emulator.ready:
+            raise BenchError(
+                f"the emulator did not open a {link} link; its ready line has {self.emulator.ready}"
+            )
+        return self.emulator.ready[link]
+
+    def _log(self, link: str) -> WireLog | None:
+        if self.log_folder is None:
+            return None
+        if link not in self._log_of:
+            path = self.log_folder / f"{link}.log"
+            self._log_of[link] = SerialLog(path) if link == "serial" else CandumpLog(path)
+            self.logs.append(self._log_of[link])
+        return self._log_of[link]
+
+    def close_clients(self) -> None:
+        """Close all clients; the next use opens them anew."""
+        clients, self._clients = list(self._clients.values()), {}
+        for client in clients:
+            client.close()
+
+    def restart(self, how: str) -> None:
+        """End the emulator by SIGTERM (`term`) or SIGKILL (`kill`) and start it again.
+
+        Raises
+        ------
+        BenchError
+            The bench has not started the unit, so it cannot restart it.
+        """
+        if self.emulator is None:
+            raise BenchError("only an emulator that the bench started can be restarted: use --start")
+        self.close_clients()
+        self.emulator.restart(SIGNAL_NUMBERS[how])
+
+    def __enter__(self) -> Self:
+        if self.log_folder is not None:
+            self.log_folder.mkdir(parents=True, exist_ok=True)
+        if self.emulator is not None:
+            self.emulator.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close_clients()
+        finally:
+            for log in self.logs:
+                log.close()
+            if self.emulator is not None and self.emulator.running:
+                if kind is None:
+                    self.emulator.stop()
+                else:
+                    self.emulator.kill()

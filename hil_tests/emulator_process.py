@@ -1,0 +1,261 @@
+"""The emulator as a process of its own: started, waited for until its ready line, ended, and its end checked."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self
+
+from hil_tests.errors import EmulatorProcessError
+
+STARHIL: Final = "from emulator.cli.app import main; main()"
+"""What the command `starhil` does, for a Python whose script folder is not known."""
+READY_WITHIN_S: Final = 60.0
+"""A first start may have to compile and to read the star catalogue; a warm one takes about 3 s."""
+STOP_WITHIN_S: Final = 15.0
+SHOWN_LINES: Final = 5
+"""Lines of the emulator's own output that an error message carries."""
+
+
+def emulator_command(
+    *,
+    profile: str | None = None,
+    serial: str = "auto",
+    can: str = "off",
+    seed: int | None = None,
+    settings: Sequence[str] = (),
+    state_dir: Path | None = None,
+    truth_log: Path | None = None,
+    extra: Sequence[str] = (),
+) -> list[str]:
+    """Return the command line that starts the emulator with this very Python."""
+    command = [sys.executable, "-c", STARHIL, "run"]
+    if profile is not None:
+        command.append(profile)
+    command += ["--serial", serial, "--can", can]
+    if seed is not None:
+        command += ["--seed", str(seed)]
+    for setting in settings:
+        command += ["--set", setting]
+    if state_dir is not None:
+        command += ["--state-dir", str(state_dir)]
+    if truth_log is not None:
+        command += ["--truth-log", str(truth_log)]
+    return [*command, *extra]
+
+
+def parse_ready_line(line: str) -> dict[str, str]:
+    """Return the words `key=value` of a ready line.
+
+    Raises
+    ------
+    EmulatorProcessError
+        Not a ready line.
+    """
+    words = line.split()
+    if not words or words[0] != "ready":
+        raise EmulatorProcessError(f"not a ready line: {line.strip()!r}")
+    return dict(word.split("=", 1) for word in words[1:] if "=" in word)
+
+
+class EmulatorProcess:
+    """A running emulator.
+
+    Parameters
+    ----------
+    command : sequence of str
+        As `emulator_command` makes it.
+    ready_within_s : float
+        How long the ready line may take.
+    environment : mapping, optional
+        Additions to the environment.
+
+    Attributes
+    ----------
+    ready : dict
+        The ready line by key: serial, can, control, seed …
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        ready_within_s: float = READY_WITHIN_S,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self.command = list(command)
+        self.ready: dict[str, str] = {}
+        self.errors: list[str] = []
+        self._ready_within_s = ready_within_s
+        self._environment = {**os.environ, **(environment or {})}
+        self._process: subprocess.Popen[str] | None = None
+        self._lines: queue.Queue[str | None] = queue.Queue()
+        self._readers: list[threading.Thread] = []
+
+    def start(self) -> Self:
+        """Start the process and wait for its ready line.
+
+        Raises
+        ------
+        EmulatorProcessError
+            It ended, or said nothing in time; carries its last words.
+        """
+        begin = time.monotonic()
+        self._lines = queue.Queue()
+        self.errors = []
+        try:
+            process = subprocess.Popen(  # noqa: S603 -- our own command line
+                self.command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=self._environment,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise EmulatorProcessError(f"{self.command[0]}: cannot be started: {error.strerror}") from None
+        self._process = process
+        self._readers = [
+            threading.Thread(target=self._read_output, args=(process.stdout,), daemon=True),
+            threading.Thread(target=self._read_errors, args=(process.stderr,), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+        try:
+            self.ready = self._wait_for_ready(begin + self._ready_within_s)
+        except EmulatorProcessError:
+            self.kill()
+            raise
+        return self
+
+    def _wait_for_ready(self, deadline: float) -> dict[str, str]:
+        while True:
+            try:
+                line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                text = f"the emulator was not ready within {self._ready_within_s:g} s{self._last_words()}"
+                raise EmulatorProcessError(text) from None
+            if line is None:
+                status = self.process.wait()
+                raise EmulatorProcessError(
+                    f"the emulator ended with status {status} before it was ready{self._last_words()}"
+                )
+            if line.startswith("ready"):
+                return parse_ready_line(line)
+
+    def _read_output(self, stream: IO[str]) -> None:
+        for line in stream:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def _read_errors(self, stream: IO[str]) -> None:
+        self.errors.extend(line.rstrip() for line in stream)
+
+    def _last_words(self) -> str:
+        for reader in self._readers:
+            reader.join(timeout=0.5)
+        return ": " + " | ".join(self.errors[-SHOWN_LINES:]) if self.errors else ""
+
+    @property
+    def process(self) -> subprocess.Popen[str]:
+        """The process itself.
+
+        Raises
+        ------
+        EmulatorProcessError
+            It was not started.
+        """
+        if self._process is None:
+            raise EmulatorProcessError("the emulator has not been started")
+        return self._process
+
+    @property
+    def running(self) -> bool:
+        """Whether the process lives."""
+        return self._process is not None and self._process.poll() is None
+
+    def stop(self) -> None:
+        """End the process by SIGTERM and check that it ends with status 0.
+
+        Raises
+        ------
+        EmulatorProcessError
+            It had ended before, did not end, or ended with another status.
+        """
+        process = self.process
+        if process.poll() is not None:
+            self.kill()
+            raise EmulatorProcessError(
+                f"the emulator had ended by itself with status {process.returncode}{self._last_words()}"
+            )
+        process.terminate()
+        try:
+            status = process.wait(timeout=STOP_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise EmulatorProcessError(f"the emulator did not end within {STOP_WITHIN_S:g} s") from None
+        words = self._last_words()
+        self.kill()
+        if status != 0:
+            raise EmulatorProcessError(f"the emulator ended with status {status}{words}")
+
+    def kill(self) -> None:
+        """End the process and its workers at once (SIGKILL), and gather what is left of them."""
+        process = self.process
+        with contextlib.suppress(ProcessLookupError):  # the whole group has ended
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        for reader in self._readers:
+            reader.join(timeout=1.0)
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+    def restart(self, number: signal.Signals = signal.SIGTERM) -> None:
+        """End the process by SIGTERM or SIGKILL and start it again with the same command."""
+        if number is signal.SIGKILL:
+            self.kill()
+        else:
+            self.stop()
+        self.start()
+
+    def memory_bytes(self) -> int:
+        """Return the resident memory of the process and its workers, in bytes (shared pages counted in each)."""
+        group = self.process.pid
+        total = 0
+        for folder in Path("/proc").iterdir():
+            if folder.name.isdigit():
+                total += _resident(folder, group)
+        return total
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.stop()
+        else:
+            self.kill()
+
+
+def _resident(folder: Path, group: int) -> int:
+    """Return the resident bytes of a process of the group, 0 for any other."""
+    try:
+        fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    if int(fields[2]) != group:
+        return 0
+    return int(fields[21]) * os.sysconf("SC_PAGE_SIZE")

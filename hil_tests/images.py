@@ -1,0 +1,243 @@
+"""Image download as an OBC does it: frame by frame with checksums, or by bursts with hole maps."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from hil_tests.errors import BadReplyError, BenchError, NackError
+from protocol.messages import ErrorCode
+from protocol.values import Value
+
+if TYPE_CHECKING:
+    from hil_tests.client import AsyncObcClient
+
+FRAME_SIZE: Final = 128
+"""Bytes of an image frame."""
+FRAME_ATTEMPTS: Final = 3
+"""How often a frame with a wrong checksum is read before the download is given up."""
+POLL_S: Final = 0.04
+"""Time between two looks at a state, as public flight software polls."""
+
+PACKET_DATA: Final = 20
+"""Bytes of the file in one burst packet."""
+BLOCK_SIZE: Final = 1024 * PACKET_DATA
+"""Bytes of the largest block: one packet for each bit of the hole map."""
+MAP_PART: Final = 128
+"""Packets that one part of the hole map stands for."""
+BURST_ROUNDS: Final = 20
+"""How often the missing packets of a block are asked for."""
+BURST_SILENCE_S: Final = 0.5
+"""Silence that ends a burst."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """A downloaded grey picture of 8 bits a pixel.
+
+    Attributes
+    ----------
+    pixels : bytes
+        `width * height` bytes, row by row from the top.
+    bytes_received : int
+        Payload that crossed the link, repeats included.
+    repeats : int
+        Frames or bursts that had to be asked for again.
+    seconds : float
+        Duration of the download, capture not included.
+    """
+
+    pixels: bytes
+    width: int
+    height: int
+    bytes_received: int
+    repeats: int
+    seconds: float
+
+
+async def save_image(client: AsyncObcClient, size: str, *, within_s: float) -> None:
+    """Have an image taken and wait until it is stored."""
+    await client.command("save_image", camera="star", image_size=size)
+    deadline = time.monotonic() + within_s
+    while True:
+        state = await client.telemetry("image_status")
+        if state["status"] in ("checksum_error", "storage_error"):
+            raise BenchError(f"save_image: the device reports {state['status']!r}")
+        if state["percent"] == 100 and state["status"] == "ok":
+            return
+        if time.monotonic() > deadline:
+            raise BenchError(
+                f"save_image: not done within {within_s:g} s ({state['percent']!r} %, {state['status']!r})"
+            )
+        await asyncio.sleep(POLL_S)
+
+
+async def download_by_frames(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
+    """Save an image and download it in frames of 128 bytes (init, read, advance), each with its checksum.
+
+    Raises
+    ------
+    BadReplyError
+        A frame keeps a wrong number or checksum.
+    """
+    edge = int(size.removeprefix("size_"))
+    await save_image(client, size, within_s=within_s)
+    begin = time.monotonic()
+    await _when_not_busy(client, "init_image_download", within_s, {"image_size": size})
+    pixels = bytearray()
+    repeats = 0
+    for number in range(edge * edge // FRAME_SIZE):
+        if number > 0:
+            await _when_not_busy(client, "advance_image_download", within_s, {"next_frame": number})
+        data, attempts = await _read_frame(client, number)
+        pixels += data
+        repeats += attempts - 1
+    received = len(pixels) + repeats * FRAME_SIZE
+    return Image(bytes(pixels), edge, edge, received, repeats, time.monotonic() - begin)
+
+
+async def _read_frame(client: AsyncObcClient, number: int) -> tuple[bytes, int]:
+    """Read the loaded frame and its checksum; return it and how often it was read."""
+    problem = ""
+    for attempt in range(1, FRAME_ATTEMPTS + 1):
+        data = (await client.read("image_frame"))["data"]
+        info = await client.telemetry("image_frame_info")
+        if not isinstance(data, bytes):
+            raise BadReplyError("image_frame.data: not bytes")
+        if info["frame"] != number:
+            problem = f"the device has loaded frame {info['frame']!r}"
+        elif info["checksum"] != sum(data) % 256:
+            problem = f"checksum {info['checksum']!r}, the bytes give {sum(data) % 256}"
+        else:
+            return data, attempt
+    raise BadReplyError(f"image frame {number}: {problem}")
+
+
+async def _when_not_busy(
+    client: AsyncObcClient, name: str, within_s: float, values: Mapping[str, Value]
+) -> None:
+    """Send a telecommand, again while the device says busy."""
+    deadline = time.monotonic() + within_s
+    while True:
+        try:
+            await client.command(name, values)
+        except NackError as error:
+            if error.code != ErrorCode.BUSY or time.monotonic() > deadline:
+                raise
+            await asyncio.sleep(POLL_S)
+        else:
+            return
+
+
+# --- bursts ---
+
+
+async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
+    """Save an image and download its file by bursts: blocks of up to 1024 numbered packets, holes asked for again."""
+    await save_image(client, size, within_s=within_s)
+    begin = time.monotonic()
+    data = bytearray()
+    repeats = 0
+    while True:
+        block, rounds = await _download_block(client, len(data), within_s)
+        data += block
+        repeats += rounds - 1
+        if len(block) < BLOCK_SIZE:
+            break
+    pixels, width, height = decode_bmp(bytes(data))
+    return Image(pixels, width, height, len(data), repeats, time.monotonic() - begin)
+
+
+async def _download_block(client: AsyncObcClient, offset: int, within_s: float) -> tuple[bytes, int]:
+    """Load one block of the file and gather its packets; return it and the number of bursts."""
+    await _when_not_busy(
+        client,
+        "load_file_block",
+        within_s,
+        {"file_type": "bmp", "file_counter": 0, "offset": offset, "length": BLOCK_SIZE},
+    )
+    deadline = time.monotonic() + within_s
+    state = await client.telemetry("file_block")
+    while not state["ready"]:
+        if state["parameter_error"]:
+            return b"", 1
+        if time.monotonic() > deadline:
+            raise BenchError(f"load_file_block: offset {offset} not ready within {within_s:g} s")
+        await asyncio.sleep(POLL_S)
+        state = await client.telemetry("file_block")
+    length, checksum = int(state["length"]), int(state["checksum"])
+    count = -(-length // PACKET_DATA)
+    packets: dict[int, bytes] = {}
+    for round_number in range(1, BURST_ROUNDS + 1):
+        await client.command("start_burst", ignore_hole_map=round_number == 1)
+        await _gather(client, packets, count)
+        if len(packets) == count:
+            block = b"".join(packets[number] for number in range(count))[:length]
+            if crc16(block) == checksum:
+                return block, round_number
+            packets.clear()
+        await _send_hole_map(client, packets)
+    raise BadReplyError(
+        f"file block at {offset}: {count - len(packets)} of {count} packets missing or wrong after {BURST_ROUNDS} bursts"
+    )
+
+
+async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int) -> None:
+    """Take burst packets until all are there or the line is silent."""
+    while len(packets) < count:
+        try:
+            async with asyncio.timeout(BURST_SILENCE_S):
+                packet = await client.bursts.get()
+        except TimeoutError:
+            return
+        number = int.from_bytes(packet[:2], "little")
+        if number < count:
+            packets[number] = packet[2:]
+
+
+async def _send_hole_map(client: AsyncObcClient, packets: dict[int, bytes]) -> None:
+    """Tell the device which packets have arrived."""
+    bits = sum(1 << number for number in packets)
+    whole = bits.to_bytes(BLOCK_SIZE // PACKET_DATA // 8, "little")
+    for part in range(len(whole) * 8 // MAP_PART):
+        piece = whole[part * MAP_PART // 8 : (part + 1) * MAP_PART // 8]
+        await client.command(f"set_hole_map_{part + 1}", map=piece)
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF; "123456789" gives 0x29B1."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1
+            crc &= 0xFFFF
+    return crc
+
+
+def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
+    """Return pixels (row by row from the top), width and height of an uncompressed grey BMP file of 8 bits a pixel.
+
+    Raises
+    ------
+    BadReplyError
+        Not such a file, or cut short.
+    """
+    if len(data) < 54 or data[:2] != b"BM":
+        raise BadReplyError(f"the downloaded file of {len(data)} bytes is no BMP picture")
+    (start,) = struct.unpack_from("<I", data, 10)
+    width, signed_height, _planes, depth, compression = struct.unpack_from("<iiHHI", data, 18)
+    height = abs(signed_height)
+    stride = (width + 3) // 4 * 4
+    if depth != 8 or compression != 0 or width < 1 or height < 1 or len(data) < start + stride * height:
+        raise BadReplyError(
+            f"the downloaded BMP picture ({width}x{height}, {depth} bits) is cut short or not 8-bit grey"
+        )
+    rows = [data[start + row * stride : start + row * stride + width] for row in range(height)]
+    if signed_height > 0:
+        rows.reverse()
+    return b"".join(rows), width, height

@@ -1,0 +1,88 @@
+"""Sending bytes or CAN frames as they stand, and comparing what comes back with a pattern."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import Final
+
+from hil_tests.client import ObcClient
+from hil_tests.errors import BenchError
+from hil_tests.links import CanLink, SerialLink
+from protocol.can_framing import CanFrame
+from protocol.errors import ProtocolError
+
+_FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8})")
+_BYTES: Final = re.compile(r"(?:[0-9A-F]{2}|\.\.)*")
+
+
+def parse_frame(text: str) -> CanFrame:
+    """Read a frame as `cansend` takes it: `07360104#0001020304050601`, `123#R`.
+
+    Raises
+    ------
+    BenchError
+        Not such a text.
+    """
+    compact = text.replace(" ", "")
+    match = _FRAME.fullmatch(compact)
+    if match is None or ".." in compact:
+        raise BenchError(f"not a CAN frame as cansend takes it: {text!r}")
+    identifier, data = match.groups()
+    try:
+        if data == "R":
+            return CanFrame(int(identifier, 16), b"", len(identifier) == 8, remote=True)
+        return CanFrame(int(identifier, 16), bytes.fromhex(data), len(identifier) == 8)
+    except ProtocolError as error:
+        raise BenchError(f"{text!r}: {error}") from None
+
+
+def format_frame(frame: CanFrame) -> str:
+    """Write a frame as `cansend` takes it."""
+    identifier = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    return f"{identifier}#{'R' if frame.remote else frame.data.hex().upper()}"
+
+
+def pattern(text: str) -> str:
+    """Return the pattern of an answer without blanks, in capitals; `..` stands for any byte.
+
+    Raises
+    ------
+    BenchError
+        Not hexadecimal bytes or a frame.
+    """
+    compact = text.replace(" ", "").upper()
+    if _BYTES.fullmatch(compact) is None and _FRAME.fullmatch(compact) is None:
+        raise BenchError(f"not bytes in hexadecimal or a CAN frame: {text!r}")
+    return compact
+
+
+def matches(expected: str, seen: str) -> bool:
+    """Compare a text of hexadecimal bytes or a frame with a pattern, in which `..` stands for any byte."""
+    return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
+
+
+def send_and_listen(client: ObcClient, data: tuple[str, ...], listen_s: float) -> tuple[str, ...]:
+    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames."""
+    return client.run(_send_and_listen(client, data, listen_s))
+
+
+async def _send_and_listen(client: ObcClient, data: tuple[str, ...], listen_s: float) -> tuple[str, ...]:
+    link = client.core.link
+    seen: list[bytes | CanFrame] = []
+    before, link.on_raw = link.on_raw, seen.append
+    try:
+        if isinstance(link, SerialLink):
+            for text in data:
+                link.send(bytes.fromhex(text))
+        elif isinstance(link, CanLink):
+            for text in data:
+                link.send(parse_frame(text))
+        else:
+            raise BenchError(f"{link.description}: cannot send as it stands")
+        await asyncio.sleep(listen_s)
+    finally:
+        link.on_raw = before
+    if isinstance(link, SerialLink):
+        return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
+    return tuple(format_frame(item) for item in seen if isinstance(item, CanFrame))

@@ -1,0 +1,181 @@
+"""What became of a session's steps: as data, as lines on a terminal, as JSON and as a JUnit file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree as ET
+
+from hil_tests.expect import show
+from protocol.values import Value
+
+PASSED: Final = "passed"
+FAILED: Final = "failed"
+SKIPPED: Final = "skipped"
+SHOWN_VALUES: Final = 6
+"""Values of a row that the one line of a step shows."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What became of one step on one link.
+
+    Attributes
+    ----------
+    status : str
+        `passed`, `failed` or `skipped`.
+    detail : str
+        What was seen, or what is wrong.
+    seconds : float
+        Duration of the step, repeats and waits included.
+    latency_s : float or None
+        Greatest latency of its transactions.
+    values : mapping
+        The last telemetry read.
+    figures : mapping
+        Numbers that the step itself worked out, such as the attitude error.
+    """
+
+    number: int
+    name: str
+    link: str
+    status: str
+    detail: str
+    seconds: float
+    latency_s: float | None = None
+    values: Mapping[str, Value] = field(default_factory=dict)
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as JSON takes it."""
+        values = {
+            key: value.hex() if isinstance(value, bytes) else value for key, value in self.values.items()
+        }
+        return {
+            "step": self.number,
+            "name": self.name,
+            "link": self.link,
+            "status": self.status,
+            "detail": self.detail,
+            "seconds": round(self.seconds, 6),
+            "latency_ms": None if self.latency_s is None else round(self.latency_s * 1e3, 3),
+            "values": values,
+            "figures": dict(self.figures),
+        }
+
+
+@dataclass(frozen=True)
+class SessionResult:
+    """What became of a whole session."""
+
+    title: str
+    results: tuple[StepResult, ...]
+    seconds: float
+
+    def count(self, status: str) -> int:
+        """Return how many steps ended with a status."""
+        return sum(result.status == status for result in self.results)
+
+    @property
+    def passed(self) -> bool:
+        """Whether no step failed and at least one passed."""
+        return self.count(FAILED) == 0 and self.count(PASSED) > 0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the whole as JSON takes it."""
+        return {
+            "title": self.title,
+            "passed": self.passed,
+            "steps": len(self.results),
+            "failed": self.count(FAILED),
+            "skipped": self.count(SKIPPED),
+            "seconds": round(self.seconds, 3),
+            "results": [result.to_json() for result in self.results],
+        }
+
+
+def summarize(values: Mapping[str, Value]) -> str:
+    """Return the first values of a row as `name=value` words."""
+    words = [f"{name}={show(value)}" for name, value in list(values.items())[:SHOWN_VALUES]]
+    return " ".join([*words, "…"] if len(values) > SHOWN_VALUES else words)
+
+
+@dataclass(frozen=True)
+class TestCase:
+    """One case of a JUnit file."""
+
+    __test__ = False  # pytest is not to collect it
+
+    suite: str
+    name: str
+    status: str
+    detail: str
+    seconds: float
+    output: str = ""
+
+
+def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float) -> None:
+    """Write a JUnit XML file, whole or not at all."""
+    counts = {
+        "tests": len(cases),
+        "failures": sum(case.status == FAILED for case in cases),
+        "errors": 0,
+        "skipped": sum(case.status == SKIPPED for case in cases),
+    }
+    attributes = {
+        "name": name,
+        "time": f"{seconds:.3f}",
+        **{key: str(value) for key, value in counts.items()},
+    }
+    root = ET.Element("testsuites", attributes)
+    suite = ET.SubElement(root, "testsuite", attributes)
+    for case in cases:
+        item = ET.SubElement(
+            suite,
+            "testcase",
+            {"classname": case.suite, "name": _printable(case.name), "time": f"{case.seconds:.6f}"},
+        )
+        if case.status == FAILED:
+            failure = ET.SubElement(item, "failure", {"message": _printable(case.detail)})
+            failure.text = _printable(case.detail)
+        elif case.status == SKIPPED:
+            ET.SubElement(item, "skipped", {"message": _printable(case.detail)})
+        if case.output:
+            ET.SubElement(item, "system-out").text = _printable(case.output)
+    ET.indent(root)
+    partial = path.with_name(path.name + ".part")
+    ET.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
+    partial.replace(path)
+
+
+def _printable(text: str) -> str:
+    """Replace what XML 1.0 cannot carry."""
+    return "".join(ch if ch in "\t\n" or ord(ch) >= 0x20 else "\N{REPLACEMENT CHARACTER}" for ch in text)
+
+
+def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
+    """Return a session's steps as JUnit cases."""
+    return [
+        TestCase(
+            suite,
+            f"step {item.number}: {item.name} [{item.link}]"
+            if item.link
+            else f"step {item.number}: {item.name}",
+            item.status,
+            item.detail,
+            item.seconds,
+            "\n".join(f"{name} = {show(value)}" for name, value in item.values.items()),
+        )
+        for item in result.results
+    ]
+
+
+def percentile(values: Sequence[float], part: float) -> float:
+    """Return the value below which `part` (0 to 1) of the values lie (nearest rank); NaN for none."""
+    if not values:
+        return math.nan
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, max(0, math.ceil(part * len(ordered)) - 1))]

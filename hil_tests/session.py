@@ -1,0 +1,422 @@
+"""Running a session script on a bench: step by step, over each link, with every result reported as it comes."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from hil_tests.bench import Bench
+from hil_tests.client import ObcClient, Reading
+from hil_tests.errors import BenchError, NackError
+from hil_tests.expect import resolve, show
+from hil_tests.png import write_png
+from hil_tests.raw_exchange import matches, pattern, send_and_listen
+from hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, percentile, summarize
+from hil_tests.script_model import (
+    Command,
+    DownloadImage,
+    GetParameter,
+    Listen,
+    Read,
+    Restart,
+    Sample,
+    Script,
+    Send,
+    SetParameter,
+    Step,
+    Wait,
+)
+from hil_tests.truth_file import TruthFile
+from protocol.errors import ProtocolError
+from protocol.values import Value
+
+MS_PER_S: Final = 1e3
+
+
+@dataclass
+class Outcome:
+    """What one try of an action gave.
+
+    Attributes
+    ----------
+    problem : str or None
+        What is wrong; None if nothing is.
+    detail : str
+        What was seen.
+    values : mapping
+        Telemetry read.
+    figures : dict
+        Numbers worked out.
+    latency_s : float or None
+        Greatest latency.
+    """
+
+    problem: str | None = None
+    detail: str = ""
+    values: Mapping[str, Value] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+    latency_s: float | None = None
+
+
+class SessionRunner:
+    """Runs one script on one bench.
+
+    Parameters
+    ----------
+    script : Script
+        Checked by `load_script`.
+    bench : Bench
+        Set up, its emulator started if it has one.
+    folder : Path
+        Where CSV and picture files go.
+    on_result : callable
+        Called with each result as it comes.
+    truth_path : Path, optional
+        File of true attitudes in place of the one that the script names.
+    """
+
+    def __init__(
+        self,
+        script: Script,
+        bench: Bench,
+        folder: Path,
+        *,
+        on_result: Callable[[StepResult], None] = lambda _result: None,
+        truth_path: Path | None = None,
+    ) -> None:
+        self._script = script
+        self._bench = bench
+        self._folder = folder
+        self._on_result = on_result
+        self._captured: dict[str, Value] = {}
+        path = truth_path
+        if path is None and script.truth.file is not None:
+            path = folder / script.truth.file
+        self._truth_file = None if path is None else TruthFile(path)
+
+    def run(self) -> SessionResult:
+        """Run all steps; after a failed one the rest is skipped unless the script says `keep_going`."""
+        begin = time.monotonic()
+        results: list[StepResult] = []
+        failed = False
+        for step in self._script.steps:
+            for link in self._links_of(step):
+                if failed and not self._script.keep_going:
+                    result = StepResult(step.number, step.name, link, SKIPPED, "an earlier step failed", 0.0)
+                else:
+                    result = self._step(step, link)
+                failed = failed or result.status == FAILED
+                results.append(result)
+                self._on_result(result)
+        return SessionResult(self._script.title, tuple(results), time.monotonic() - begin)
+
+    def _links_of(self, step: Step) -> tuple[str, ...]:
+        if isinstance(step.action, Wait | Restart):
+            return ("",)
+        wanted = step.link or self._script.link
+        if wanted == "both":
+            return self._bench.links
+        return (wanted or self._bench.links[0],)
+
+    # --- one step ---
+
+    def _step(self, step: Step, link: str) -> StepResult:
+        begin = time.monotonic()
+        if link and link not in self._bench.links:
+            detail = f"needs a {link} link, the session has {' and '.join(self._bench.links)}"
+            return StepResult(step.number, step.name, link, SKIPPED, detail, 0.0)
+        for log in self._bench.logs:
+            log.note(f"step {step.number}: {step.name}")
+        outcome = Outcome()
+        for turn in range(step.repeat):
+            if turn:
+                time.sleep(step.every_s)
+            outcome = self._until_good(step, link)
+            if outcome.problem is not None:
+                if step.repeat > 1:
+                    outcome.problem = f"time {turn + 1} of {step.repeat}: {outcome.problem}"
+                break
+        return StepResult(
+            step.number,
+            step.name,
+            link,
+            PASSED if outcome.problem is None else FAILED,
+            outcome.detail if outcome.problem is None else outcome.problem,
+            time.monotonic() - begin,
+            outcome.latency_s,
+            outcome.values,
+            outcome.figures,
+        )
+
+    def _until_good(self, step: Step, link: str) -> Outcome:
+        """Try an action once, or until its expectations hold or its time is over."""
+        deadline = None if step.within_s is None else time.monotonic() + step.within_s
+        while True:
+            outcome = self._try(step, link)
+            if outcome.problem is None:
+                return outcome
+            if deadline is None:
+                return outcome
+            if time.monotonic() >= deadline:
+                outcome.problem = f"not within {step.within_s:g} s: {outcome.problem}"
+                return outcome
+            time.sleep(min(step.every_s, max(0.0, deadline - time.monotonic())))
+
+    def _try(self, step: Step, link: str) -> Outcome:
+        try:
+            outcome = self._act(step, link)
+        except (BenchError, ProtocolError) as error:
+            return Outcome(problem=str(error))
+        limit = step.max_latency_s
+        if outcome.problem is None and limit is not None and (outcome.latency_s or 0.0) > limit:
+            seen = (outcome.latency_s or 0.0) * MS_PER_S
+            outcome.problem = f"latency {seen:.1f} ms, expected at most {limit * MS_PER_S:g} ms"
+        if outcome.problem is None:
+            self._captured.update({name: outcome.values[key] for name, key in step.capture.items()})
+        return outcome
+
+    def _act(self, step: Step, link: str) -> Outcome:
+        action = step.action
+        if isinstance(action, Wait):
+            time.sleep(action.seconds)
+            return Outcome()
+        if isinstance(action, Restart):
+            self._bench.restart(action.signal)
+            return Outcome(detail="ready again")
+        client = self._bench.client(link)
+        match action:
+            case Command():
+                return self._command(step, action, client)
+            case Read():
+                return self._read(step, action, client)
+            case Listen():
+                return self._listen(step, action, client)
+            case Sample():
+                return self._sample(step, action, client)
+            case SetParameter():
+                return self._set_parameter(step, action, client)
+            case GetParameter():
+                return self._judge(step, client.run(client.core.read_parameter(action.parameter.name)))
+            case DownloadImage():
+                return self._download(action, client)
+            case Send():
+                return self._send(action, client)
+
+    # --- actions ---
+
+    def _command(self, step: Step, action: Command, client: ObcClient) -> Outcome:
+        row = action.row
+        if action.raw is None:
+            variables = self._variables()
+            values = {name: _fitting(resolve(value, variables)) for name, value in action.values.items()}
+            data = row.encode(values, check=action.refused is None)
+        else:
+            data = action.raw
+        return self._refusable(
+            lambda: (
+                client.run(
+                    client.core.command_raw(row.name, data, timeout_s=step.timeout_s, retries=step.retries)
+                ).latency_s
+            ),
+            action.refused,
+        )
+
+    def _set_parameter(self, step: Step, action: SetParameter, client: ObcClient) -> Outcome:
+        parameter = action.parameter
+        value = resolve(action.value, self._variables())
+        number = (
+            float(value)
+            if action.refused is not None and not isinstance(value, str)
+            else parameter.to_number(value)
+        )
+        row = client.icd.telecommands["set_parameter"]
+        data = row.encode({"parameter": parameter.id, "value": number}, check=False)
+        outcome = self._refusable(
+            lambda: (
+                client.run(
+                    client.core.command_raw(row.name, data, timeout_s=step.timeout_s, retries=step.retries)
+                ).latency_s
+            ),
+            action.refused,
+        )
+        if outcome.problem is None and action.refused is None:
+            seen = client.get_parameter(parameter.name)
+            wanted = parameter.check(value)
+            if seen != wanted and not (
+                isinstance(seen, float) and abs(seen - float(wanted)) <= 1e-6 * abs(seen)
+            ):
+                outcome.problem = f"{parameter.name} reads back as {show(seen)}, expected {show(wanted)}"
+            outcome.detail = f"{parameter.name}={show(seen)}"
+        return outcome
+
+    @staticmethod
+    def _refusable(act: Callable[[], float], refused: str | None) -> Outcome:
+        """Send a request that must be accepted, or refused with the code that `refused` names."""
+        try:
+            latency = act()
+        except NackError as error:
+            if refused is None:
+                raise
+            if error.code_name != refused:
+                return Outcome(problem=f"refused with {error.code} ({error.code_name}), expected {refused}")
+            return Outcome(detail=f"refused with {error.code} ({refused}), as expected")
+        if refused is not None:
+            return Outcome(problem=f"accepted, expected to be refused with {refused}")
+        return Outcome(detail="accepted", latency_s=latency)
+
+    def _read(self, step: Step, action: Read, client: ObcClient) -> Outcome:
+        readings: list[Reading] = []
+
+        def ask() -> float:
+            reading = client.read(action.row.name, timeout_s=step.timeout_s, retries=step.retries)
+            readings.append(reading)
+            return reading.latency_s
+
+        outcome = self._refusable(ask, action.refused)
+        if outcome.problem is not None or not readings:
+            return outcome
+        return self._judge(step, readings[0])
+
+    def _listen(self, step: Step, action: Listen, client: ObcClient) -> Outcome:
+        outcome = Outcome()
+        begin = time.monotonic()
+        for _ in range(action.count):
+            reading = client.wait_unsolicited(
+                action.row.name, timeout_s=step.timeout_s or self._script.timeout_s
+            )
+            outcome = self._judge(step, reading)
+            if outcome.problem is not None:
+                return outcome
+        outcome.latency_s = None
+        outcome.figures["rate_hz"] = action.count / max(time.monotonic() - begin, 1e-9)
+        return outcome
+
+    def _sample(self, step: Step, action: Sample, client: ObcClient) -> Outcome:
+        path = self._folder / action.file
+        fields = list(action.row.named_fields)
+        latencies: list[float] = []
+        crosses: list[float] = []
+        problems: list[str] = []
+        count = 0
+        last = Outcome()
+        begin = time.monotonic()
+        with path.open("w", newline="", encoding="utf-8", buffering=1) as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["obc_time_s", "latency_ms", *fields])
+            while time.monotonic() - begin < action.for_s or count == 0:
+                reading = client.read(action.row.name, timeout_s=step.timeout_s, retries=step.retries)
+                values = [_cell(reading[name]) for name in fields]
+                writer.writerow(
+                    [f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}", *values]
+                )
+                count += 1
+                latencies.append(reading.latency_s)
+                last = self._judge(step, reading)
+                if last.problem is not None:
+                    problems.append(last.problem)
+                crosses += [last.figures[key] for key in ("cross_boresight_arcsec",) if key in last.figures]
+                time.sleep(max(0.0, begin + count * action.every_s - time.monotonic()))
+        good = 1.0 - len(problems) / count
+        figures = {
+            "samples": float(count),
+            "good": good,
+            "latency_p50_ms": percentile(latencies, 0.5) * MS_PER_S,
+            "latency_p99_ms": percentile(latencies, 0.99) * MS_PER_S,
+        }
+        if crosses:
+            figures["cross_boresight_median_arcsec"] = percentile(crosses, 0.5)
+            figures["cross_boresight_max_arcsec"] = max(crosses)
+        detail = f"{count} samples in {action.file}, " + " ".join(f"{k}={v:.4g}" for k, v in figures.items())
+        problem = None
+        if good < action.at_least:
+            problem = f"{len(problems)} of {count} samples not as expected; the last one: {problems[-1]}"
+        return Outcome(problem, detail, last.values, figures, max(latencies))
+
+    def _download(self, action: DownloadImage, client: ObcClient) -> Outcome:
+        image = client.download_image(action.size, method=action.method)
+        write_png(self._folder / action.file, image.pixels, image.width, image.height)
+        figures = {
+            "seconds": image.seconds,
+            "bytes": float(image.bytes_received),
+            "repeats": float(image.repeats),
+        }
+        levels = sorted(set(image.pixels))
+        detail = f"{image.width}x{image.height} in {image.seconds:.2f} s → {action.file}"
+        problem = None if len(levels) > 1 else f"{detail}: the picture is blank (all pixels {levels[0]})"
+        return Outcome(problem, detail, {}, figures)
+
+    @staticmethod
+    def _send(action: Send, client: ObcClient) -> Outcome:
+        seen = send_and_listen(client, action.data, action.listen_s)
+        shown = ", ".join(text for text in seen if text) or "nothing"
+        if action.answer is None:
+            return Outcome(detail=f"came back: {shown}")
+        wanted = [pattern(text) for text in action.answer]
+        if client.core.link.name == "serial":
+            wanted = ["".join(wanted)]
+        if len(seen) == len(wanted) and all(matches(a, b) for a, b in zip(wanted, seen, strict=True)):
+            return Outcome(detail=f"came back: {shown}, as expected")
+        return Outcome(problem=f"came back: {shown}, expected {', '.join(filter(None, wanted)) or 'nothing'}")
+
+    # --- judging ---
+
+    def _judge(self, step: Step, reading: Reading) -> Outcome:
+        outcome = Outcome(
+            detail=summarize(reading.values), values=reading.values, latency_s=reading.latency_s or None
+        )
+        variables = self._variables()
+        problems = [
+            text
+            for expectation in step.expect
+            if (text := expectation.mismatch(reading[expectation.field], variables)) is not None
+        ]
+        if step.expect and not problems:
+            outcome.detail = " ".join(f"{item.field}={show(reading[item.field])}" for item in step.expect)
+        if step.attitude is not None and not problems:
+            problems += self._judge_attitude(step, reading, outcome)
+        if problems:
+            outcome.problem = "; ".join(problems)
+        return outcome
+
+    def _judge_attitude(self, step: Step, reading: Reading, outcome: Outcome) -> list[str]:
+        check = step.attitude
+        if check is None:
+            return []
+        truth = check.truth or self._script.truth.attitude
+        if truth is None:
+            if self._truth_file is None:
+                raise BenchError(f"step {step.number}: no truth to compare the attitude with")
+            if "time_of_exposure" not in reading.values:
+                raise BenchError(f"step {step.number}: {reading.name} carries no time; read precise_attitude")
+            truth = self._truth_file.at(float(reading["time_of_exposure"]))
+        error, problem = check.judge(reading.values, truth)
+        if error is not None:
+            outcome.figures.update(
+                cross_boresight_arcsec=error.cross_boresight_arcsec,
+                roll_arcsec=error.roll_arcsec,
+                total_arcsec=error.total_arcsec,
+            )
+            outcome.detail += f" error: {error.cross_boresight_arcsec:.1f} arcsec cross, {error.roll_arcsec:.1f} arcsec roll"
+        return [] if problem is None else [problem]
+
+    def _variables(self) -> dict[str, Value]:
+        now = time.time()
+        return {**self._captured, "now": now, "now_s": int(now), "now_ms": int(now % 1.0 * MS_PER_S)}
+
+
+def _fitting(value: Value) -> Value:
+    """Return a whole number given as a float as an integer, as captured values may be."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _cell(value: Value) -> str:
+    """Return a value as it stands in a CSV file, with all its digits."""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, float):
+        return repr(value)
+    return value.hex() if isinstance(value, bytes) else str(value)

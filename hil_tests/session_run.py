@@ -1,0 +1,165 @@
+"""A session from the file to the exit: script checked, bench set up, steps shown as they come, reports written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from rich.console import Console
+from rich.text import Text
+
+from hil_tests.bench import Bench, LinkOptions
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.errors import BenchError, ScriptError, near_matches
+from hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, junit_cases, write_junit
+from hil_tests.script import load_script
+from hil_tests.script_model import Script
+from hil_tests.session import MS_PER_S, SessionRunner
+from protocol.icd import load_icd
+from protocol.serial_framing import Dialect
+
+SCRIPT_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "sessions"
+DEFAULT_FOLDER: Final = Path("out") / "session"
+STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
+
+
+@dataclass(frozen=True)
+class SessionRequest:
+    """What a user asks for; see `starhil session --help`."""
+
+    script: Path
+    options: LinkOptions
+    start: bool = False
+    profile: str | None = None
+    folder: Path | None = None
+    junit: Path | None = None
+    truth: Path | None = None
+    keep_going: bool = False
+    quiet: bool = False
+
+
+def find_script(path: Path) -> Path:
+    """Return the script file; a bare name is looked up among those that come along.
+
+    Raises
+    ------
+    ScriptError
+        There is none; offers near names.
+    """
+    if path.is_file():
+        return path
+    shipped = {item.stem: item for item in sorted(SCRIPT_FOLDER.glob("*.toml"))}
+    if str(path) in shipped:
+        return shipped[str(path)]
+    raise ScriptError(
+        f"{path}: no such session script{near_matches(path.stem, shipped)} (shipped: {', '.join(shipped)})"
+    )
+
+
+def run_session(request: SessionRequest) -> SessionResult:
+    """Run a session and return its result.
+
+    Raises
+    ------
+    BenchError
+        The script, a port, or the emulator's start is refused.
+    """
+    icd = load_icd()
+    path = find_script(request.script)
+    script = load_script(path, icd)
+    if request.keep_going:
+        script = replace(script, keep_going=True)
+    options = _options(request, script)
+    folder = request.folder or DEFAULT_FOLDER / path.stem
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BenchError(f"{folder}: the log folder cannot be made: {error.strerror}") from None
+    show = _printer(quiet=request.quiet)
+    if not request.quiet:
+        Console(highlight=False).print(Text(script.title, style="bold"))
+    with ExitStack() as stack:
+        emulator = None
+        if request.start:
+            state = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-session-")))
+            emulator = _emulator(request, script, options, folder, state)
+        bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+        result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
+    if request.junit is not None:
+        try:
+            write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
+        except OSError as error:
+            raise BenchError(f"{request.junit}: cannot be written: {error.strerror}") from None
+    if not request.quiet:
+        _print_summary(result, folder)
+    return result
+
+
+def _options(request: SessionRequest, script: Script) -> LinkOptions:
+    options = request.options
+    if options.dialect not in list(Dialect):
+        raise BenchError(f"--dialect {options.dialect}: must be a, b or c")
+    if options.serial is None and options.can is None:
+        if not request.start:
+            raise BenchError("no link given: use --serial DEV, --can CHANNEL, both, or --start")
+        wanted = {None: ("serial",), "both": ("serial", "can")}.get(script.link, (script.link,))
+        options = replace(
+            options,
+            serial="auto" if "serial" in wanted else None,
+            can="auto" if "can" in wanted else None,
+        )
+    if not request.start and "auto" in (options.serial, options.can):
+        raise BenchError("'auto' needs --start: without it name the port or channel")
+    return replace(options, timeout_s=script.timeout_s, retries=script.retries)
+
+
+def _emulator(
+    request: SessionRequest, script: Script, options: LinkOptions, folder: Path, state: Path
+) -> EmulatorProcess:
+    """Prepare an emulator for the session, with a parameter store of its own that is empty at first."""
+    wish = script.emulator
+    truth_log = None
+    if script.truth.file is not None and request.truth is None:
+        truth_log = folder / script.truth.file
+        truth_log.unlink(missing_ok=True)
+    return EmulatorProcess(
+        emulator_command(
+            profile=request.profile or wish.profile,
+            serial=options.serial or "off",
+            can=options.can or "off",
+            seed=wish.seed,
+            settings=wish.settings,
+            state_dir=state,
+            truth_log=truth_log,
+        )
+    )
+
+
+def _printer(*, quiet: bool) -> Callable[[StepResult], None]:
+    console = Console(highlight=False)
+
+    def show(result: StepResult) -> None:
+        mark, style = STYLES[result.status]
+        line = Text(f"{mark} ", style=style)
+        line.append(f"{result.number:3d}  ", style="dim")
+        line.append(result.name)
+        if result.link:
+            line.append(f"  [{result.link}]", style="dim")
+        if result.latency_s is not None:
+            line.append(f"  {result.latency_s * MS_PER_S:.1f} ms", style="cyan")
+        if result.detail:
+            line.append(f"  {result.detail}", style="red" if result.status == FAILED else "dim")
+        console.print(line, soft_wrap=True)
+
+    return (lambda _result: None) if quiet else show
+
+
+def _print_summary(result: SessionResult, folder: Path) -> None:
+    console = Console(highlight=False)
+    counts = ", ".join(f"{result.count(status)} {status}" for status in (PASSED, FAILED, SKIPPED))
+    style = "green" if result.passed else "bold red"
+    console.print(Text(f"{counts} in {result.seconds:.1f} s; logs in {folder}", style=style), soft_wrap=True)

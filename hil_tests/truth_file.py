@@ -1,0 +1,78 @@
+"""The file of true attitudes that an emulator writes (`starhil run --truth-log`), read while it grows."""
+
+from __future__ import annotations
+
+import bisect
+import csv
+from pathlib import Path
+from typing import Final
+
+from hil_tests.attitude import Quaternion, interpolate, unit
+from hil_tests.errors import BenchError
+
+TIME_COLUMN: Final = "time_of_exposure_s"
+QUATERNION_COLUMNS: Final = ("true_qx", "true_qy", "true_qz", "true_qw")
+SLACK_S: Final = 0.0005
+"""A time that lies this little outside the file still counts: telemetry rounds."""
+
+
+class TruthFile:
+    """True attitudes over device time.
+
+    Parameters
+    ----------
+    path : Path
+        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four of the quaternion.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._times: list[float] = []
+        self._attitudes: list[Quaternion] = []
+
+    def at(self, time_s: float) -> Quaternion:
+        """Return the attitude at a device time, between two rows by the shortest turn.
+
+        Raises
+        ------
+        BenchError
+            The file cannot be read, lacks a column, or does not cover the time.
+        """
+        if not self._covers(time_s):
+            self._read()
+        if not self._covers(time_s):
+            span = f"{self._times[0]:.3f} to {self._times[-1]:.3f} s" if self._times else "nothing"
+            raise BenchError(f"{self._path}: has no truth for the time {time_s:.3f} s; it covers {span}")
+        after = bisect.bisect_left(self._times, time_s)
+        if after == 0:
+            return self._attitudes[0]
+        if after == len(self._times):
+            return self._attitudes[-1]
+        begin, end = self._times[after - 1], self._times[after]
+        return interpolate(
+            self._attitudes[after - 1], self._attitudes[after], (time_s - begin) / (end - begin)
+        )
+
+    def _covers(self, time_s: float) -> bool:
+        return bool(self._times) and self._times[0] - SLACK_S <= time_s <= self._times[-1] + SLACK_S
+
+    def _read(self) -> None:
+        try:
+            with self._path.open(newline="", encoding="utf-8") as stream:
+                rows = list(csv.DictReader(stream))
+        except OSError as error:
+            raise BenchError(f"{self._path}: the truth cannot be read: {error.strerror}") from None
+        if not rows:
+            return
+        missing = [name for name in (TIME_COLUMN, *QUATERNION_COLUMNS) if name not in rows[0]]
+        if missing:
+            raise BenchError(f"{self._path}: no column {', '.join(missing)} in its first line")
+        pairs: dict[float, Quaternion] = {}
+        for row in rows:
+            try:
+                values = [float(row[name]) for name in QUATERNION_COLUMNS]
+                pairs[float(row[TIME_COLUMN])] = unit(values)
+            except (TypeError, ValueError):
+                continue  # the last line is still being written
+        self._times = sorted(pairs)
+        self._attitudes = [pairs[time_s] for time_s in self._times]
