@@ -1,0 +1,69 @@
+"""What communication_status and acknowledge tell: what came in over the links, and what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from protocol.messages import ErrorCode, FaultKind, LinkFault
+
+_FLAG_OF_FAULT: Final[dict[FaultKind, str]] = {
+    FaultKind.UART_PROTOCOL: "uart_protocol_error",
+    FaultKind.UART_OVERLONG: "uart_protocol_error",
+    FaultKind.UART_INCOMPLETE: "uart_incomplete",
+    FaultKind.CAN_SEQUENCE: "can_telecommand_error",
+    FaultKind.CAN_INCOMPLETE: "can_telecommand_error",
+    FaultKind.CAN_LENGTH: "can_telecommand_error",
+    FaultKind.CAN_TYPE: "can_telecommand_error",
+    FaultKind.CAN_OVERLONG: "can_telecommand_error",
+}
+
+
+@dataclass
+class Counters:
+    """Counters and flags of the links since the last clear or reset."""
+
+    telecommands: int = 0
+    telemetry: int = 0
+    flags: set[str] = field(default_factory=set)
+    """Names of the bits of communication_status that are set."""
+    faults: dict[FaultKind, int] = field(default_factory=dict)
+    """How often each kind of fault was seen, for the log and the control channel."""
+
+    def fault(self, fault: LinkFault) -> None:
+        """Count input that made no message."""
+        self.faults[fault.kind] = self.faults.get(fault.kind, 0) + 1
+        self.flags.add(_FLAG_OF_FAULT[fault.kind])
+
+    def overrun(self) -> None:
+        """Note a telecommand that came before the last one was done."""
+        self.flags.add("telecommand_overrun")
+
+    def clear(self) -> None:
+        """Set everything to zero."""
+        self.telecommands = self.telemetry = 0
+        self.flags.clear()
+        self.faults.clear()
+
+
+@dataclass
+class Acknowledge:
+    """What became of the last telecommand."""
+
+    last_telecommand: int = 0
+    processed: bool = True
+    error: ErrorCode = ErrorCode.OK
+    parameter_index: int = 0
+
+    def begin(self, identifier: int) -> None:
+        """Note that a telecommand came in."""
+        self.last_telecommand = identifier
+        self.processed = False
+        self.error = ErrorCode.OK
+        self.parameter_index = 0
+
+    def end(self, error: ErrorCode = ErrorCode.OK, parameter_index: int = 0) -> None:
+        """Note that it is done, and how."""
+        self.processed = True
+        self.error = error
+        self.parameter_index = parameter_index

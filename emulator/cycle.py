@@ -1,0 +1,403 @@
+"""The frame cycle: when the sensor exposes, what it asks of the pipeline, and when a result becomes known.
+
+A frame begins on a grid of the update period, exposes, is read out, detected and identified; the times of these steps are
+those of the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On the other clocks a
+result that the machine has not ready in time is published when it comes, and flagged.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from emulator.clock import NANOSECONDS, DeviceTime
+from emulator.frames import ZERO, Failure, FrameRequest, FrameResult, Quaternion, SolverSettings, Triple
+from emulator.imager import Answer, Imager
+from emulator.modes import Mode
+from emulator.parameters import Parameters
+from emulator.profile import TimingConfig
+from emulator.scheduler import Event, Scheduler
+from emulator.truth import FixedTruth, TruthSource, TruthState
+from starid.attitude import Attitude, propagate
+
+MAX_PENDING: Final = 2
+"""Frames in the pipeline above which the next exposure is left out."""
+
+HISTORY: Final = 10
+RATE_SPAN_S: Final = 2.0
+"""Time back to which attitudes count for the rate, seconds; the last two always count."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A frame as published.
+
+    Attributes
+    ----------
+    counter
+        Frames published since start-up, this one included.
+    mid_ns
+        Run time of the middle of the exposure, nanoseconds.
+    mid_unix_ns
+        The same on the device's clock as it stood when the frame was published.
+    published_ns
+        Run time at which it was published, nanoseconds.
+    mode
+        Mode of the device when the frame was exposed.
+    truth
+        What the sensor looked at in the middle of the exposure.
+    result
+        What the pipeline made of it.
+    valid, reason
+        As the device reports it, after its own checks.
+    rate_rad_s, rate_valid
+        Body rate estimated from the stars, sensor frame, radians a second.
+    capture_s, detect_s, identify_s
+        Modelled times of the steps.
+    late
+        The machine took longer than the model, or a frame was left out before it.
+    """
+
+    counter: int
+    mid_ns: int
+    mid_unix_ns: int
+    published_ns: int
+    mode: Mode
+    truth: TruthState
+    result: FrameResult
+    valid: bool
+    reason: str
+    rate_rad_s: Triple = ZERO
+    rate_valid: bool = False
+    capture_s: float = 0.0
+    detect_s: float = 0.0
+    identify_s: float = 0.0
+    period_s: float = 0.0
+    late: bool = False
+
+    @property
+    def latency_s(self) -> float:
+        """From the middle of the exposure to the result being known, seconds of run time."""
+        return (self.published_ns - self.mid_ns) / NANOSECONDS
+
+
+class RateEstimator:
+    """Body rate from the attitudes of the last valid frames."""
+
+    def __init__(self) -> None:
+        self._fixes: deque[tuple[int, Attitude]] = deque(maxlen=HISTORY)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._fixes.clear()
+
+    @property
+    def last(self) -> tuple[int, Attitude] | None:
+        """The last valid attitude and its time, or None."""
+        return self._fixes[-1] if self._fixes else None
+
+    def add(self, mid_ns: int, attitude: Attitude) -> None:
+        """Take in a valid attitude."""
+        self._fixes.append((mid_ns, attitude))
+
+    def rate(self, window: int) -> Triple | None:
+        """Least-squares rate, radians a second, over the last `window` fixes; None from fewer than two."""
+        if len(self._fixes) < 2:
+            return None
+        newest_ns, newest = self._fixes[-1]
+        recent = [
+            (ns, attitude)
+            for n, (ns, attitude) in enumerate(reversed(self._fixes))
+            if n < 2 or (n < window and (newest_ns - ns) <= RATE_SPAN_S * NANOSECONDS)
+        ]
+        times = np.array([(ns - newest_ns) / NANOSECONDS for ns, _ in recent])
+        turns = np.array([attitude.error_to(newest).rotation_vector_rad for _, attitude in recent])
+        times -= times.mean()
+        x, y, z = (times @ turns / (times @ times)).tolist()
+        return (x, y, z)
+
+
+@dataclass
+class _Frame:
+    """A frame on its way."""
+
+    index: int
+    start_ns: int
+    mid_ns: int
+    mode: Mode
+    truth: TruthState
+    exposure_s: float
+    period_s: float
+    tracking: bool
+    result: FrameResult | None = None
+    failure: str = ""
+    waiting: bool = False
+    """Its time of publication has passed without a result."""
+    finished_ns: int | None = None
+    """When its result became known."""
+
+
+class FrameCycle:
+    """Exposes frame after frame while it runs.
+
+    Parameters
+    ----------
+    publish
+        Called with each measurement in its turn.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        imager: Imager,
+        parameters: Parameters,
+        timing: TimingConfig,
+        time: DeviceTime,
+        publish: Callable[[Measurement], None],
+        rate_window: int,
+    ) -> None:
+        self._scheduler = scheduler
+        self._imager = imager
+        self._parameters = parameters
+        self._timing = timing
+        self._time = time
+        self._now_ns = time.clock.now_ns
+        self._publish = publish
+        self._rate_window = rate_window
+        self._rates = RateEstimator()
+        self._next: Event | None = None
+        self._generation = 0
+        self._in_flight: deque[_Frame] = deque()
+        self._late = False
+        self._grid_ns = 0
+        self.truth: TruthSource = FixedTruth(Attitude.identity())
+        self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
+        self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
+        self.after_exposure: Callable[[], None] | None = None
+        """Called once when the next frame has gone to the pipeline."""
+        self.index = 0
+        """Number of the next frame of the run; never goes back, so that no two frames share their noise."""
+        self.published = 0
+        self.left_out = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether frames are being exposed."""
+        return self._next is not None
+
+    def start(self) -> None:
+        """Begin to expose, now."""
+        if not self.running:
+            self._grid_ns = self._now_ns()
+            self._next = self._scheduler.at(self._grid_ns, self._begin)
+
+    def stop(self) -> None:
+        """Stop; frames on their way are dropped."""
+        if self._next is not None:
+            self._next.cancel()
+            self._next = None
+        self._generation += 1
+        self._in_flight.clear()
+        self._late = False
+
+    def reset(self) -> None:
+        """Stop and forget all attitudes, as a restart of the device does."""
+        self.stop()
+        self._rates.clear()
+        self.published = self.left_out = 0
+
+    def retime(self) -> None:
+        """Take a new update rate into use at once."""
+        if self._next is not None:
+            self._next.cancel()
+            start_ns = max(self._now_ns(), min(self._next.due_ns, self._grid_ns + self._period_ns()))
+            self._next = self._scheduler.at(start_ns, self._begin)
+
+    def has_fix(self, within_s: float) -> bool:
+        """Whether there is an attitude to track from that is not older than `within_s`."""
+        last = self._rates.last
+        return last is not None and self._now_ns() - last[0] <= within_s * NANOSECONDS
+
+    def _exposure_s(self) -> float:
+        return float(self._parameters["exposure"]) / 1000.0
+
+    def _period_ns(self) -> int:
+        """Time from exposure to exposure; no shorter than one takes."""
+        shortest = self._exposure_s() + float(self._parameters["delay_time"]) / 1000.0
+        return round(max(1.0 / float(self._parameters["update_rate"]), shortest) * NANOSECONDS)
+
+    def _begin(self, due_ns: int) -> None:
+        """Open the shutter, and plan the next opening on the grid."""
+        self._grid_ns = due_ns
+        period_ns = self._period_ns()
+        now_ns = self._now_ns()
+        missed = max(0, (now_ns - due_ns) // period_ns)
+        self.left_out += missed
+        self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._begin)
+        exposure_s = self._exposure_s()
+        start_ns = due_ns + int(self._parameters["delay_time"]) * 1_000_000
+        end_ns = start_ns + round(exposure_s * NANOSECONDS)
+        mode, generation = self.mode(), self._generation
+        mid_ns = start_ns + round(exposure_s * NANOSECONDS / 2)
+
+        def close(close_ns: int) -> None:
+            if generation == self._generation:
+                self._end(close_ns, start_ns, mid_ns, mode, exposure_s, period_ns / NANOSECONDS)
+
+        self._scheduler.at(end_ns, close)
+
+    def _end(
+        self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
+    ) -> None:
+        """Close the shutter: what was seen goes to the pipeline."""
+        truth = self.truth.state(mid_ns / NANOSECONDS)
+        predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
+        frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
+        request = self.request(truth, exposure_s, predicted)
+        self._in_flight.append(frame)
+        if self._imager.pending >= MAX_PENDING:
+            self._late = True
+            self.left_out += 1
+            frame.result = FrameResult(request.index, reason="processing_error")
+            self._finish(frame, end_ns)
+            return
+        timing = self._timing
+        identify_s = timing.identify_tracking_s if frame.tracking else timing.identify_lost_s
+        ready_ns = end_ns + round((timing.readout_s + timing.detect_s + identify_s) * NANOSECONDS)
+        generation = self._generation
+
+        def arrived(answer: Answer) -> None:
+            if generation == self._generation:
+                self._arrived(frame, answer)
+
+        def ready(due_ns: int) -> None:
+            if generation == self._generation:
+                self._ready(frame, due_ns)
+
+        self._imager.submit(request, arrived)
+        self._scheduler.at(ready_ns, ready)
+        if self.after_exposure is not None:
+            then, self.after_exposure = self.after_exposure, None
+            then()
+
+    def request(
+        self, truth: TruthState, exposure_s: float, predicted: Attitude | None, *, solve: bool = True
+    ) -> FrameRequest:
+        """Make the request for the next frame of the run."""
+        index = self.index
+        self.index += 1
+        parameters = self._parameters
+        chosen: dict[str, Any] = {name: parameters[name] for name in _SETTINGS}
+        settings = SolverSettings(**chosen)
+        x, y, z = truth.rate_rad_s.tolist()
+        return FrameRequest(
+            index=index,
+            attitude_xyzw=as_quaternion(truth.attitude),
+            rate_rad_s=(x, y, z),
+            exposure_s=exposure_s,
+            gain=float(parameters["analog_gain"]),
+            solve=solve,
+            predicted_xyzw=None if predicted is None else as_quaternion(predicted),
+            settings=settings,
+            faults=self.faults(index),
+        )
+
+    def _predict(self, mid_ns: int) -> Attitude | None:
+        """Where the sensor is expected to look; None until a rate is known, which takes two fixes."""
+        last = self._rates.last
+        rate = self._rates.rate(self._rate_window)
+        if last is None or rate is None:
+            return None
+        if not self._parameters["prediction_enable"]:
+            return last[1]
+        return propagate(last[1], np.array(rate), (mid_ns - last[0]) / NANOSECONDS)
+
+    def _arrived(self, frame: _Frame, answer: Answer) -> None:
+        if isinstance(answer, FrameResult):
+            frame.result = answer
+        else:
+            frame.failure = answer.text if isinstance(answer, Failure) else "unexpected answer"
+            frame.result = FrameResult(frame.index, reason="processing_error")
+        if frame.waiting:
+            self._late = True
+            self._ready(frame, self._now_ns())
+
+    def _ready(self, frame: _Frame, due_ns: int) -> None:
+        """Publish when the modelled detection of all stars is done, or wait for the result."""
+        if frame.result is None:
+            frame.waiting = True
+            return
+        extra_ns = round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
+        if extra_ns > 0 and not frame.waiting:
+            generation = self._generation
+
+            def finish(finish_ns: int) -> None:
+                if generation == self._generation:
+                    self._finish(frame, finish_ns)
+
+            self._scheduler.at(due_ns + extra_ns, finish)
+        else:
+            self._finish(frame, due_ns)
+
+    def _finish(self, frame: _Frame, known_ns: int) -> None:
+        """Publish a frame, after those that were exposed before it."""
+        frame.finished_ns = known_ns
+        while self._in_flight and self._in_flight[0].finished_ns is not None:
+            first = self._in_flight.popleft()
+            self._publish_frame(first, max(known_ns, first.finished_ns or 0))
+
+    def _publish_frame(self, frame: _Frame, published_ns: int) -> None:
+        result = frame.result or FrameResult(frame.index)
+        timing = self._timing
+        detect_s = timing.detect_s + timing.detect_per_star_s * result.detected
+        identify_s = timing.identify_tracking_s if frame.tracking else timing.identify_lost_s
+        valid, reason, rate = self._judge(frame, result, detect_s + identify_s)
+        self.published += 1
+        late, self._late = self._late, False
+        self._publish(
+            Measurement(
+                counter=self.published,
+                mid_ns=frame.mid_ns,
+                mid_unix_ns=self._time.unix_ns(frame.mid_ns),
+                published_ns=published_ns,
+                mode=frame.mode,
+                truth=frame.truth,
+                result=result,
+                valid=valid,
+                reason=reason,
+                rate_rad_s=rate or ZERO,
+                rate_valid=rate is not None and valid,
+                capture_s=frame.exposure_s + timing.readout_s,
+                detect_s=detect_s,
+                identify_s=identify_s,
+                period_s=frame.period_s,
+                late=late,
+            )
+        )
+
+    def _judge(
+        self, frame: _Frame, result: FrameResult, processing_s: float
+    ) -> tuple[bool, str, Triple | None]:
+        """Return whether the device stands by a result, why not, and the rate."""
+        if not result.valid:
+            return False, result.reason, None
+        self._rates.add(frame.mid_ns, Attitude(np.array(result.quaternion_xyzw)))
+        rate = result.rate_rad_s or self._rates.rate(self._rate_window)
+        if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):
+            return False, "timeout", rate
+        if rate is not None and np.linalg.norm(rate) > np.radians(float(self._parameters["max_rate"])):
+            return False, "rate_too_high", rate
+        return True, "ok", rate
+
+
+_SETTINGS: Final = tuple(SolverSettings.__dataclass_fields__)
+
+
+def as_quaternion(attitude: Attitude) -> Quaternion:
+    """Return the quaternion of an attitude as plain numbers."""
+    x, y, z, w = attitude.quaternion_xyzw.tolist()
+    return (x, y, z, w)

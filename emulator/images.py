@@ -1,0 +1,215 @@
+"""Images that the device keeps for download: capture, storage, and the frame and file that are being sent.
+
+An image is stored whole or not at all: the one before it stays until the new one is complete, and a download holds the image
+with which it began.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from emulator.clock import NANOSECONDS
+from emulator.cycle import FrameCycle
+from emulator.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
+from emulator.imager import Answer, Imager
+from emulator.scheduler import Scheduler
+
+FRAME_BYTES: Final = 128
+"""Bytes of one frame of a download."""
+
+STORE_S: Final = 0.1
+"""Time that the device takes to store an image, seconds."""
+
+PALETTE: Final = b"".join(bytes((n, n, n, 0)) for n in range(256))
+BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
+
+
+@dataclass(frozen=True)
+class StoredImage:
+    """A square 8-bit image: its edge in pixels, its rows from the top, and the frame that it shows."""
+
+    edge: int
+    pixels: bytes
+    frame: int
+    number: int
+    """Number of the image since start-up, modulo 256: the file's counter."""
+
+    def binned(self, edge: int) -> StoredImage:
+        """Return the image made smaller by averaging squares of pixels."""
+        if edge == self.edge:
+            return self
+        step = self.edge // edge
+        grid = np.frombuffer(self.pixels, dtype=np.uint8).reshape(edge, step, edge, step)
+        means = (grid.sum(axis=(1, 3), dtype=np.uint32) + step * step // 2) // (step * step)
+        return StoredImage(edge, means.astype(np.uint8).tobytes(), self.frame, self.number)
+
+    def bmp(self) -> bytes:
+        """Return the image as a grey BMP file."""
+        offset = BMP_HEAD.size + len(PALETTE)
+        size = offset + len(self.pixels)
+        head = BMP_HEAD.pack(
+            b"BM",
+            size,
+            0,
+            0,
+            offset,
+            40,
+            self.edge,
+            -self.edge,
+            1,
+            8,
+            0,
+            len(self.pixels),
+            2835,
+            2835,
+            256,
+            0,
+        )
+        return head + PALETTE + self.pixels
+
+
+class ImageStore:
+    """What is being captured, what is stored and what is being downloaded.
+
+    Parameters
+    ----------
+    single_frame
+        Makes the request for one frame that is not solved, at a run time of mid-exposure.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        imager: Imager,
+        cycle: FrameCycle,
+        now_ns: Callable[[], int],
+        single_frame: Callable[[int], FrameRequest],
+        exposure_s: Callable[[], float],
+    ) -> None:
+        self._scheduler = scheduler
+        self._imager = imager
+        self._cycle = cycle
+        self._now_ns = now_ns
+        self._single_frame = single_frame
+        self._exposure_s = exposure_s
+        self._generation = 0
+        self._count = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all, as a restart of the device does."""
+        self._generation += 1
+        self._cycle.after_exposure = None
+        self.stored: StoredImage | None = None
+        self.percent = 0
+        self.status = "ok"
+        self.busy = False
+        self.download: StoredImage | None = None
+        self.frame = 0
+
+    def save(self, edge: int) -> None:
+        """Capture the next frame and store it; in standby one frame is exposed for it."""
+        self.busy = True
+        self.percent = 0
+        self.status = "waiting_sensor"
+        if self._cycle.running:
+            self._cycle.after_exposure = lambda: self._fetch(edge)
+            return
+        start_ns, exposure_ns = self._now_ns(), round(self._exposure_s() * NANOSECONDS)
+        generation = self._generation
+
+        def expose(_due_ns: int) -> None:
+            if generation == self._generation:
+                self._imager.submit(self._single_frame(start_ns + exposure_ns // 2), lambda _answer: None)
+                self._fetch(edge)
+
+        self._scheduler.at(start_ns + exposure_ns, expose)
+
+    def _fetch(self, edge: int) -> None:
+        """Ask for the frame just exposed; it is stored when it has come and the storing time is over."""
+        self.percent, self.status = 50, "waiting_frame"
+        self._ask(edge, self._store)
+
+    def _store(self, image: StoredImage | None) -> None:
+        self.busy = False
+        if image is None:
+            self.percent, self.status = 0, "storage_error"
+            return
+        self.stored = image
+        self.percent, self.status = 100, "ok"
+
+    def open_stored(self, edge: int) -> bool:
+        """Open the stored image for download in a size not above its own; False if there is none such."""
+        if self.stored is None or edge > self.stored.edge:
+            return False
+        self.download = self.stored.binned(edge)
+        self.frame = 0
+        return True
+
+    def open_last(self, edge: int, done: Callable[[bool], None]) -> None:
+        """Open the last frame that the sensor made; `done` tells whether there was one."""
+        self.busy = True
+        self.download = None
+
+        def take(image: StoredImage | None) -> None:
+            self.busy = False
+            self.download, self.frame = image, 0
+            done(image is not None)
+
+        self._ask(edge, take)
+
+    def _ask(self, edge: int, take: Callable[[StoredImage | None], None]) -> None:
+        """Fetch an image from the pipeline; it is taken in after the storing time, however fast it came."""
+        generation = self._generation
+        due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
+        answers: list[Answer] = []
+        waiting: list[bool] = []
+
+        def finish() -> None:
+            answer = answers[0]
+            if not isinstance(answer, ImageResult) or answer.frame < 0:
+                take(None)
+                return
+            self._count = (self._count + 1) % 256
+            take(StoredImage(answer.edge, answer.pixels, answer.frame, self._count))
+
+        def arrived(answer: Answer) -> None:
+            answers.append(answer)
+            if waiting and generation == self._generation:
+                finish()
+
+        def due(_due_ns: int) -> None:
+            if generation != self._generation:
+                return
+            if answers:
+                finish()
+            else:
+                waiting.append(True)
+
+        self._imager.submit(ImageRequest(edge), arrived)
+        self._scheduler.at(due_ns, due)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of the open download; 0 if none is open."""
+        return 0 if self.download is None else len(self.download.pixels) // FRAME_BYTES
+
+    def frame_bytes(self) -> bytes:
+        """Return the loaded frame of the open download."""
+        if self.download is None:
+            return bytes(FRAME_BYTES)
+        start = self.frame * FRAME_BYTES
+        return self.download.pixels[start : start + FRAME_BYTES]
+
+
+def edge_of(size_name: str) -> int:
+    """Edge in pixels of a size by its name in the interface definition, e.g. `size_512`."""
+    edge = int(size_name.removeprefix("size_"))
+    if edge not in IMAGE_EDGES:
+        raise ValueError(f"{size_name} is no image size")
+    return edge

@@ -1,0 +1,142 @@
+"""The mode machine: which modes there are, what leads from one to the other, and what is refused.
+
+::
+
+    boot ──(pipeline warm, boot time over)──► standby ◄──command── error
+                                              │    ▲
+                                       command│    │command
+                                              ▼    │
+                     lost_in_space ──(attitude found)──► tracking
+                           ▲                               │
+                           └───(tracking lost, command)────┘
+
+A telecommand may ask for standby, lost_in_space and tracking. Tracking needs an attitude to start from: one that was found
+in this run and is not older than `Modes.prediction_limit_s`. Boot is entered by a reset and error by a fault only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+
+class Mode(StrEnum):
+    """Modes of the device, by the names of the interface definition."""
+
+    BOOT = "boot"
+    STANDBY = "standby"
+    LOST_IN_SPACE = "lost_in_space"
+    TRACKING = "tracking"
+    ERROR = "error"
+
+    @property
+    def makes_frames(self) -> bool:
+        """Whether the sensor exposes and solves in this mode."""
+        return self in {Mode.LOST_IN_SPACE, Mode.TRACKING}
+
+
+COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
+    Mode.BOOT: frozenset(),
+    Mode.STANDBY: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
+    Mode.LOST_IN_SPACE: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
+    Mode.TRACKING: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
+    Mode.ERROR: frozenset({Mode.STANDBY}),
+}
+"""Mode → modes that a telecommand may ask for from there."""
+
+
+class Cause(StrEnum):
+    """Why the mode changed."""
+
+    RESET = "reset"
+    BOOTED = "booted"
+    COMMAND = "command"
+    ATTITUDE_FOUND = "attitude_found"
+    TRACKING_LOST = "tracking_lost"
+    TRACKING_DISABLED = "tracking_disabled"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One change of mode."""
+
+    before: Mode
+    after: Mode
+    cause: Cause
+
+
+class Modes:
+    """The present mode, and the rules by which it changes.
+
+    Parameters
+    ----------
+    on_change
+        Called after each change.
+    """
+
+    def __init__(self, on_change: Callable[[Transition], None] | None = None) -> None:
+        self.mode = Mode.BOOT
+        self.error = ""
+        """Why the device is in error; empty in any other mode."""
+        self._on_change = on_change
+
+    def allows(self, wanted: Mode, *, has_attitude: bool) -> bool:
+        """Whether a telecommand may ask for a mode now.
+
+        Parameters
+        ----------
+        wanted
+            The mode asked for.
+        has_attitude
+            An attitude stands ready from which tracking can start.
+        """
+        return wanted in COMMANDED[self.mode] and (wanted is not Mode.TRACKING or has_attitude)
+
+    def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
+        """Change the mode by telecommand; return False, and change nothing, where that is not allowed."""
+        if not self.allows(wanted, has_attitude=has_attitude):
+            return False
+        self._enter(wanted, Cause.COMMAND)
+        return True
+
+    def reset(self) -> None:
+        """Begin to boot."""
+        self._enter(Mode.BOOT, Cause.RESET)
+
+    def booted(self) -> None:
+        """End booting, unless a fault came first."""
+        if self.mode is Mode.BOOT:
+            self._enter(Mode.STANDBY, Cause.BOOTED)
+
+    def fail(self, why: str) -> None:
+        """Enter the error mode."""
+        self._enter(Mode.ERROR, Cause.FAULT)
+        self.error = why
+
+    def solved(self, *, valid: bool, tracked: bool, tracking_enabled: bool) -> None:
+        """Change the mode by the result of a frame.
+
+        Parameters
+        ----------
+        valid
+            The frame gave an attitude.
+        tracked
+            The frame was solved from a prediction, not lost in space.
+        tracking_enabled
+            The configuration lets the device track.
+        """
+        if self.mode is Mode.LOST_IN_SPACE and valid and tracking_enabled:
+            self._enter(Mode.TRACKING, Cause.ATTITUDE_FOUND)
+        elif self.mode is Mode.TRACKING and not valid and tracked:
+            self._enter(Mode.LOST_IN_SPACE, Cause.TRACKING_LOST)
+        elif self.mode is Mode.TRACKING and not tracking_enabled:
+            self._enter(Mode.LOST_IN_SPACE, Cause.TRACKING_DISABLED)
+
+    def _enter(self, after: Mode, cause: Cause) -> None:
+        before, self.mode = self.mode, after
+        self.error = ""
+        if self._on_change is not None and before is not after:
+            self._on_change(Transition(before, after, cause))

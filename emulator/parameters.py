@@ -1,0 +1,134 @@
+"""The device's parameters: values by the names of the interface definition, checked, saved and restored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
+
+from emulator.errors import EmulatorError
+from protocol.icd import InterfaceDefinition
+from protocol.values import FieldError, MessageError, Parameter, Value
+
+ParameterValue = bool | int | float | str
+
+ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
+"""Pairs of which the first must not exceed the second."""
+
+
+class Parameters(Mapping[str, ParameterValue]):
+    """All parameters, always each within its limits.
+
+    Parameters
+    ----------
+    icd
+        Where names, types and limits come from.
+    defaults
+        Defaults of this device where they differ from the definition's.
+
+    Raises
+    ------
+    EmulatorError
+        A default names no parameter or is outside its limits.
+    """
+
+    def __init__(self, icd: InterfaceDefinition, defaults: Mapping[str, Value] | None = None) -> None:
+        self._definitions = icd.parameters
+        self._defaults: dict[str, ParameterValue] = {name: p.default for name, p in icd.parameters.items()}
+        self._stored: dict[str, ParameterValue] = {}
+        self._observers: list[Callable[[frozenset[str]], None]] = []
+        try:
+            self._defaults.update(self._checked(self._defaults, defaults or {}))
+        except MessageError as error:
+            raise EmulatorError(f"parameters.{error}") from None
+        self._values = dict(self._defaults)
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def number(self, name: str) -> float:
+        """Return a parameter as the number that the bus carries."""
+        return self._definitions[name].to_number(self._values[name])
+
+    def definition(self, name: str) -> Parameter:
+        """Return type, unit, limits and description of a parameter."""
+        return self._definitions[name]
+
+    def default(self, name: str) -> ParameterValue:
+        """Return the default of a parameter in this device."""
+        return self._defaults[name]
+
+    def observe(self, observer: Callable[[frozenset[str]], None]) -> None:
+        """Call `observer` with the names of what changed, after each change."""
+        self._observers.append(observer)
+
+    def set(self, changes: Mapping[str, Value]) -> None:
+        """Set some parameters: all of them, or none.
+
+        Raises
+        ------
+        MessageError
+            A value is outside its limits, or two contradict each other; nothing is changed.
+        """
+        self._take(self._checked(self._values, changes))
+
+    def set_defaults(self) -> None:
+        """Set all parameters to their defaults."""
+        self._take(self._defaults)
+
+    def adopt_defaults(self, defaults: Mapping[str, Value]) -> None:
+        """Make values the defaults that come from elsewhere (the camera's constants), where none was set before."""
+        checked = self._checked(self._defaults, defaults)
+        follow = {
+            name: value for name, value in checked.items() if self._values[name] == self._defaults[name]
+        }
+        self._defaults.update(checked)
+        self._take(follow)
+
+    def take_stored(self, stored: Mapping[str, object]) -> list[str]:
+        """Take values from a store; return the names that are unknown or no longer allowed, which are passed over."""
+        refused: list[str] = []
+        taken: dict[str, ParameterValue] = dict(self._values)
+        for name, value in stored.items():
+            if name not in self._definitions or not isinstance(value, (bool, int, float, str)):
+                refused.append(name)
+                continue
+            try:
+                taken |= self._checked(taken, {name: value})
+            except MessageError:
+                refused.append(name)
+        self._stored = {name: taken[name] for name in stored if name in taken and name not in refused}
+        self._take(taken)
+        return refused
+
+    def mark_stored(self) -> dict[str, ParameterValue]:
+        """Return all values as they are to be stored, and remember them as the stored ones."""
+        self._stored = dict(self._values)
+        return dict(self._values)
+
+    @property
+    def differ_from_store(self) -> bool:
+        """Whether a restart would bring other values."""
+        return {**self._defaults, **self._stored} != self._values
+
+    def _checked(
+        self, base: Mapping[str, ParameterValue], changes: Mapping[str, Value]
+    ) -> dict[str, ParameterValue]:
+        checked = {name: self._definitions[name].check(value) for name, value in changes.items()}
+        result = {**base, **checked}
+        for low, high in ORDERED:
+            if float(result[low]) > float(result[high]):
+                raise FieldError(f"{low}: {result[low]} is above {high} {result[high]}")
+        return checked
+
+    def _take(self, values: Mapping[str, ParameterValue]) -> None:
+        changed = frozenset(name for name, value in values.items() if self._values[name] != value)
+        self._values.update(values)
+        if changed:
+            for observer in self._observers:
+                observer(changed)

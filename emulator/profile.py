@@ -1,0 +1,328 @@
+"""Device profiles: TOML files that say which camera, sensor, truth, links and parameters a run has.
+
+A profile may name another one that it builds on (`extends = "cubestar"` or a path beside it); its own keys win. Every key is
+checked; a wrong one is named with its file, its place and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, Field, ValidationError
+
+from emulator.errors import EmulatorError
+from emulator.truth_config import FixedConfig, Strict, TruthConfig
+
+DEFAULT_PROFILE: Final = "cubestar"
+MAX_DEPTH: Final = 8
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+
+
+class RunConfig(Strict):
+    """How a run goes."""
+
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
+    clock: str = "real"
+    """`real`, `scaled:FACTOR` or `stepped`."""
+    algorithm: Literal["geometric", "lsi", "rsi"] = "geometric"
+    worker: Literal["process", "thread"] = "process"
+    """Where frames are made and solved."""
+    state_dir: str = ""
+    """Folder of what survives a restart; empty: kept until the process ends."""
+    start_unix_s: NotNegative = 1_767_225_600.0
+    """The device's clock at run time zero, until it is set: 2026-01-01."""
+
+
+class CatalogConfig(Strict):
+    """Which stars there are."""
+
+    path: str = ""
+    """Hipparcos file of one's own; empty: the installed catalogue."""
+    epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] = 2026.0
+    """Julian year to which the stars are moved."""
+
+
+class CameraConfig(Strict):
+    """The optics and pixel array that make the picture."""
+
+    width: Annotated[int, Field(ge=64, le=4096)] = 937
+    height: Annotated[int, Field(ge=64, le=4096)] = 937
+    fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
+    focal_px: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
+    centre_px: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
+    distortion: Annotated[list[float], Field(max_length=5)] = []
+    """Brown–Conrady k1, k2, p1, p2, k3."""
+
+    def values(self) -> dict[str, Any]:
+        """Keys as the camera of `starid` reads them."""
+        given = self.model_dump(exclude_none=True)
+        if "focal_px" not in given:
+            given.setdefault("fov_deg", 42.0)
+        return given
+
+
+class DeviceConfig(Strict):
+    """What the unit says of itself, and how long it boots."""
+
+    node_type: Annotated[int, Field(ge=0, le=255)] = 0x53
+    interface_version: Annotated[int, Field(ge=0, le=255)] = 1
+    firmware_major: Annotated[int, Field(ge=0, le=255)] = 1
+    firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
+    boot_s: NotNegative = 0.5
+    """Least time in boot mode."""
+    rate_window: Annotated[int, Field(ge=2, le=20)] = 2
+    """Valid frames from which the body rate is estimated, where the identifier gives none."""
+
+
+class TimingConfig(Strict):
+    """How long the unit takes for a frame; reported in telemetry and kept before a result is published."""
+
+    readout_s: NotNegative = 0.020
+    detect_s: NotNegative = 0.010
+    detect_per_star_s: NotNegative = 0.0001
+    identify_lost_s: NotNegative = 0.020
+    identify_tracking_s: NotNegative = 0.005
+
+
+class SerialConfig(Strict):
+    """The serial link."""
+
+    port: str = "auto"
+    """`auto` (a pty), a device, `listen://HOST:PORT`, or `off`."""
+    dialect: Literal["a", "b", "c"] = "b"
+    baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
+    pace: bool = True
+    """Send bytes no faster than the baud rate lets them."""
+    symlink: str = ""
+    """Link to the pty, made at start and removed at the end."""
+
+
+class CanConfig(Strict):
+    """The CAN link."""
+
+    channel: str = "auto"
+    """`auto` (vcan0, else the TCP hub), a channel of python-can, or `off`."""
+    address: Annotated[int, Field(ge=1, le=254)] = 4
+    host_address: Annotated[int, Field(ge=1, le=254)] = 1
+    frame_gap_s: NotNegative = 0.0
+    """Least time between two frames of one message."""
+
+
+class CanopenConfig(Strict):
+    """The CANopen slave; it joins the CAN link's channel."""
+
+    node: Annotated[int, Field(ge=0, le=127)] = 0
+    """Node identifier; 0: off."""
+
+
+class LinksConfig(Strict):
+    """The links to the OBC."""
+
+    serial: SerialConfig = SerialConfig()
+    can: CanConfig = CanConfig()
+    canopen: CanopenConfig = CanopenConfig()
+
+
+class Profile(Strict):
+    """A whole profile."""
+
+    name: str = DEFAULT_PROFILE
+    run: RunConfig = RunConfig()
+    catalog: CatalogConfig = CatalogConfig()
+    camera: CameraConfig = CameraConfig()
+    sensor: dict[str, Any] = {}
+    """Fields of `emulator.sensor_model.SensorModel`, but for those that are parameters of the device."""
+    identifier: dict[str, Any] = {}
+    """Options of the algorithm."""
+    truth: TruthConfig = FixedConfig(kind="fixed")
+    device: DeviceConfig = DeviceConfig()
+    timing: TimingConfig = TimingConfig()
+    links: LinksConfig = LinksConfig()
+    parameters: dict[str, Any] = {}
+    """Parameters of the device by the names of the interface definition: its defaults in this profile."""
+
+
+LINK_PARAMETERS: Final[dict[str, str]] = {
+    "serial_dialect": "links.serial.dialect",
+    "serial_baud": "links.serial.baud",
+    "can_address": "links.can.address",
+    "host_address": "links.can.host_address",
+    "canopen_node": "links.canopen.node",
+}
+"""Parameters of the device whose defaults stand under another key of a profile."""
+
+
+def configs_folder() -> Path:
+    """Folder `configs` of the installed product, or of the checkout."""
+    return Path(__file__).resolve().parent.parent / "configs"
+
+
+def find_profile(name_or_path: str, beside: Path | None = None) -> Path:
+    """Path of a profile given by name or path.
+
+    Raises
+    ------
+    EmulatorError
+        There is none; the text lists the names that there are.
+    """
+    folder = configs_folder() / "profiles"
+    if "/" not in name_or_path and not name_or_path.endswith(".toml"):
+        path = folder / f"{name_or_path}.toml"
+        if path.is_file():
+            return path
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+        raise EmulatorError(
+            f"profile {name_or_path!r}: not known; give a path to a .toml file or one of: {known}"
+        )
+    path = Path(name_or_path).expanduser()
+    if beside is not None and not path.is_absolute():
+        path = beside / path
+    if not path.is_file():
+        raise EmulatorError(f"profile {path}: no such file; give a path to a .toml file or a profile's name")
+    return path
+
+
+def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> tuple[Profile, Path]:
+    """Read a profile with all that it extends, and set `section.key=value` overrides over it.
+
+    Returns
+    -------
+    profile
+        Validated.
+    folder
+        Folder of the file, from which its relative paths count.
+
+    Raises
+    ------
+    EmulatorError
+        One line: file, key and remedy.
+    """
+    path = find_profile(name_or_path)
+    values = _read(path, 0)
+    for override in overrides:
+        _override(values, override)
+    try:
+        profile = Profile.model_validate(values)
+    except ValidationError as error:
+        raise EmulatorError(f"profile {path}: {explain(error, Profile)}") from None
+    for name in profile.parameters:
+        if name in LINK_PARAMETERS:
+            raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
+    return profile, path.parent
+
+
+def _read(path: Path, depth: int) -> dict[str, Any]:
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise EmulatorError(f"profile {path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise EmulatorError(f"profile {path}: not TOML ({error})") from None
+    base = values.pop("extends", None)
+    if base is None:
+        return values
+    if not isinstance(base, str):
+        raise EmulatorError(f"profile {path}: extends: a name or a path in quotes is needed")
+    if depth >= MAX_DEPTH:
+        raise EmulatorError(
+            f"profile {path}: extends: more than {MAX_DEPTH} deep; does a profile extend itself?"
+        )
+    return merge(_read(find_profile(base, path.parent), depth + 1), values)
+
+
+def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Lay `over` over `base`, table by table; a `[truth]` of another kind replaces the whole table."""
+    merged = dict(base)
+    for key, value in over.items():
+        below = merged.get(key)
+        other_kind = (
+            isinstance(value, Mapping) and isinstance(below, dict) and value.get("kind") != below.get("kind")
+        )
+        if isinstance(below, dict) and isinstance(value, Mapping) and not ("kind" in value and other_kind):
+            merged[key] = merge(below, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _override(values: dict[str, Any], override: str) -> None:
+    """Set one `section.key=value`; the value is TOML, or else text."""
+    key, equals, text = override.partition("=")
+    parts = [part.strip() for part in key.split(".")]
+    if not equals or not all(parts):
+        raise EmulatorError(f"--set {override}: write section.key=value, e.g. parameters.update_rate=5")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    table = values
+    for part in parts[:-1]:
+        below = table.setdefault(part, {})
+        if not isinstance(below, dict):
+            raise EmulatorError(f"--set {override}: {part} is a value, not a section")
+        table = below
+    if parts[-1] == "kind" and table.get("kind") != value:
+        for other in set(table) - {"attitude"}:
+            del table[other]
+    table[parts[-1]] = value
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """Say in one line where the first fault of a validation is, what it is and what to do."""
+    first = error.errors(include_url=False)[0]
+    loc = first["loc"]
+    where = ".".join(str(part) for part in loc if part not in _TAGS) or "as a whole"
+    if first["type"] == "extra_forbidden":
+        known = _keys_at(model, loc[:-1])
+        near = difflib.get_close_matches(str(loc[-1]), known, n=1)
+        remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+        return f"{where}: unknown key; {remedy}"
+    message = first["msg"].removeprefix("Value error, ")
+    shown = "" if isinstance(first["input"], (dict, list)) else f" (given: {first['input']!r})"
+    return f"{where}: {message[0].lower()}{message[1:]}{shown}"
+
+
+_TAGS: Final = frozenset({"fixed", "rate", "slew", "file", "live", "hold"})
+"""Names of the alternatives that pydantic puts between the keys of a place; no key has such a name."""
+
+
+def _keys_at(model: type[BaseModel], place: Sequence[Any]) -> list[str]:
+    """Return the keys that may stand at a place, which may hold the names of alternatives."""
+    models: list[type[BaseModel]] = [model]
+    for part in place:
+        if isinstance(part, int):
+            continue
+        if part in _TAGS:
+            models = [each for each in models if part in _tags_of(each)]
+        else:
+            models = [
+                below
+                for each in models
+                if part in each.model_fields
+                for below in _models_in(each.model_fields[part].annotation)
+            ]
+    return sorted({key for each in models for key in each.model_fields})
+
+
+def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
+    """Return the values by which a model is told from its alternatives."""
+    return tuple(
+        value
+        for name in ("kind", "do")
+        if name in model.model_fields
+        for value in getattr(model.model_fields[name].annotation, "__args__", ())
+    )
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models that an annotation names, however deep."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]

@@ -1,0 +1,77 @@
+"""The attitude as the device reports it: in the frame of its mounting, with validity and time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from emulator.clock import NANOSECONDS
+from emulator.cycle import as_quaternion
+from emulator.frames import ZERO, Quaternion, Triple
+from emulator.modes import Mode
+from starid.attitude import Attitude
+
+if TYPE_CHECKING:
+    from emulator.device import Device
+    from emulator.parameters import Parameters
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What goes out.
+
+    Attributes
+    ----------
+    valid, reason
+        Whether the attitude holds, and why not.
+    quaternion_xyzw
+        ICRS → reported frame, scalar not negative; all zeros where invalid.
+    rate_rad_s
+        Body rate in the reported frame; zeros where not known.
+    mid_unix_s
+        Middle of the exposure on the device's clock, seconds.
+    """
+
+    valid: bool
+    reason: str
+    quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 0.0)
+    rate_rad_s: Triple = ZERO
+    mid_unix_s: float = 0.0
+
+
+def reported(device: Device) -> Reported:
+    """Return what the device reports now."""
+    last = device.fresh
+    if last is None:
+        running = device.modes.mode.makes_frames
+        failed = device.modes.mode is Mode.ERROR
+        return Reported(False, "processing_error" if failed else "no_frame" if running else "not_running")  # noqa: FBT003
+    mid_unix_s = last.mid_unix_ns / NANOSECONDS
+    if not last.valid:
+        return Reported(False, last.reason, mid_unix_s=mid_unix_s)  # noqa: FBT003
+    attitude = Attitude(np.array(last.result.quaternion_xyzw))
+    rate = np.array(last.rate_rad_s)
+    turns = mounting_turns(device.parameters)
+    for turn in turns:
+        attitude = attitude.rotated(turn)
+        rate = Attitude.identity().rotated(turn).to_sensor(rate)
+    x, y, z = rate.tolist()
+    return Reported(True, "ok", as_quaternion(attitude), (x, y, z), mid_unix_s)  # noqa: FBT003
+
+
+def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
+    """Rotation vectors that lead from the sensor frame to the reported one; none where all angles are zero.
+
+    The reported frame is the sensor frame turned by alpha about x, then by beta about its new y, then by gamma about
+    its new z.
+    """
+    turns = []
+    for axis, name in enumerate(("mounting_alpha", "mounting_beta", "mounting_gamma")):
+        angle = np.radians(float(parameters[name]))
+        if angle != 0.0:
+            turn = np.zeros(3)
+            turn[axis] = angle
+            turns.append(turn)
+    return turns

@@ -1,0 +1,147 @@
+"""What the device keeps across a restart: parameters, boot count, reset cause; never half-written.
+
+The file is JSON with a checksum over its content. It is written to a temporary name, flushed to the disk and renamed over the
+old one, so that a reader finds the old state or the new one, whenever the writer is killed. A file that cannot be read
+as such is set aside under another name, reported, and the device starts from its defaults.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from emulator.errors import EmulatorError
+
+FORMAT: Final = 1
+STATE_FILE: Final = "device.json"
+LOCK_FILE: Final = "lock"
+MAX_BYTES: Final = 1_000_000
+
+
+class StateStore(Protocol):
+    """Where the device keeps what survives a restart."""
+
+    corrupt: bool
+    """The stored state could not be read and was set aside."""
+
+    def load(self) -> dict[str, Any]:
+        """What was saved last; empty if nothing was, or if it is corrupt."""
+
+    def save(self, content: dict[str, Any]) -> None:
+        """Save all of the content, or nothing of it."""
+
+    def close(self) -> None:
+        """Give the store free for another process."""
+
+
+class MemoryStore:
+    """State that survives a reset of the device, and ends with the process."""
+
+    def __init__(self) -> None:
+        self.corrupt = False
+        self._text = "{}"
+
+    def load(self) -> dict[str, Any]:
+        """What was saved last."""
+        content: dict[str, Any] = json.loads(self._text)
+        return content
+
+    def save(self, content: dict[str, Any]) -> None:
+        """Save the content."""
+        self._text = json.dumps(content)
+
+    def close(self) -> None:
+        """Nothing is to be given free."""
+
+
+class FileStore:
+    """State in a folder of its own, used by one process at a time.
+
+    Raises
+    ------
+    EmulatorError
+        The folder cannot be made or written, or another emulator uses it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.corrupt = False
+        self.path = folder / STATE_FILE
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(folder / LOCK_FILE, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise EmulatorError(
+                f"state folder {folder}: cannot be used ({error.strerror}); choose another with --state-dir"
+            ) from None
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise EmulatorError(
+                f"state folder {folder}: in use by another emulator; choose another with --state-dir"
+            ) from None
+
+    def load(self) -> dict[str, Any]:
+        """What was saved last; a corrupt file is set aside as `device.json.corrupt`."""
+        try:
+            with self.path.open("rb") as file:
+                data = file.read(MAX_BYTES + 1)
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise EmulatorError(f"state file {self.path}: cannot be read ({error.strerror})") from None
+        content = _decode(data)
+        if content is None:
+            self.corrupt = True
+            os.replace(self.path, self.path.with_name(STATE_FILE + ".corrupt"))  # noqa: PTH105 (pairs with save)
+            return {}
+        return content
+
+    def save(self, content: dict[str, Any]) -> None:
+        """Save all of the content, or nothing of it."""
+        temporary = self.path.with_name(STATE_FILE + ".new")
+        try:
+            with temporary.open("wb") as file:
+                file.write(_encode(content))
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, self.path)  # noqa: PTH105 (the atomic step, named as the system call)
+            folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError as error:
+            raise EmulatorError(
+                f"state file {self.path}: cannot be written ({error.strerror}); the state before it is kept"
+            ) from None
+
+    def close(self) -> None:
+        """Give the folder free."""
+        os.close(self._lock)
+
+
+def _encode(content: dict[str, Any]) -> bytes:
+    body = json.dumps(content, sort_keys=True, allow_nan=False)
+    digest = hashlib.sha256(body.encode()).hexdigest()
+    return json.dumps(
+        {"format": FORMAT, "sha256": digest, "state": content}, sort_keys=True, indent=1
+    ).encode()
+
+
+def _decode(data: bytes) -> dict[str, Any] | None:
+    """Return the content of a state file, or None if it is not whole."""
+    try:
+        document = json.loads(data)
+        content = document["state"]
+        body = json.dumps(content, sort_keys=True, allow_nan=False)
+        whole = (
+            document["format"] == FORMAT and document["sha256"] == hashlib.sha256(body.encode()).hexdigest()
+        )
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return content if whole and isinstance(content, dict) else None

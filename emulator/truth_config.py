@@ -1,0 +1,184 @@
+"""Truth sources as a profile or the control channel write them, and how they become sources."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal, Self, TypeAlias
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from emulator.truth import (
+    FixedTruth,
+    HoldSegment,
+    RateSegment,
+    RateTruth,
+    Segment,
+    SlewSegment,
+    SlewTruth,
+    TruthSource,
+)
+from emulator.truth_file import read_truth_file
+from emulator.truth_live import LiveTruth
+from starid.attitude import Attitude
+
+Rate: TypeAlias = tuple[float, float, float]
+"""Body rate in the sensor frame, degrees a second."""
+
+
+class Strict(BaseModel):
+    """A part of a profile: unknown keys, numbers in quotes and not-finite numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+
+class AttitudeConfig(Strict):
+    """An attitude: right ascension, declination and roll in degrees, or a quaternion."""
+
+    ra_deg: float | None = None
+    dec_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    roll_deg: float | None = None
+    quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        angles = (self.ra_deg, self.dec_deg, self.roll_deg)
+        if self.quaternion_xyzw is not None:
+            if any(angle is not None for angle in angles):
+                raise ValueError("give ra_deg, dec_deg, roll_deg or quaternion_xyzw, not both")
+            if abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
+                raise ValueError("quaternion_xyzw is not of length 1")
+        elif self.ra_deg is None or self.dec_deg is None:
+            raise ValueError("give ra_deg and dec_deg (roll_deg is 0 if left out), or quaternion_xyzw")
+        return self
+
+    def build(self) -> Attitude:
+        """Make the attitude."""
+        if self.quaternion_xyzw is not None:
+            return Attitude(np.array(self.quaternion_xyzw))
+        return Attitude.from_radec_roll(self.ra_deg or 0.0, self.dec_deg or 0.0, self.roll_deg or 0.0)
+
+
+DEFAULT_ATTITUDE = AttitudeConfig(ra_deg=83.8, dec_deg=-1.2, roll_deg=0.0)
+"""Orion: bright stars, and easy to recognise in an image."""
+
+
+class FixedConfig(Strict):
+    """An attitude that does not change."""
+
+    kind: Literal["fixed"]
+    attitude: AttitudeConfig = DEFAULT_ATTITUDE
+
+    def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
+        """Make the source."""
+        return FixedTruth(self.attitude.build())
+
+
+class RateConfig(Strict):
+    """A turn at a constant body rate from an attitude."""
+
+    kind: Literal["rate"]
+    attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    rate_deg_s: Rate
+
+    def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
+        """Make the source; the turn begins now."""
+        return RateTruth(self.attitude.build(), np.radians(self.rate_deg_s), start_s=now_s)
+
+
+class HoldConfig(Strict):
+    """Rest for a time."""
+
+    do: Literal["hold"]
+    seconds: Annotated[float, Field(gt=0.0)]
+
+    def build(self) -> Segment:
+        """Make the segment."""
+        return HoldSegment(self.seconds)
+
+
+class TurnConfig(Strict):
+    """Turn at a constant body rate for a time."""
+
+    do: Literal["rate"]
+    seconds: Annotated[float, Field(gt=0.0)]
+    rate_deg_s: Rate
+
+    def build(self) -> Segment:
+        """Make the segment."""
+        return RateSegment(self.seconds, np.radians(self.rate_deg_s))
+
+
+class SlewToConfig(Strict):
+    """Turn about one axis to an attitude, starting and ending at rest."""
+
+    do: Literal["slew"]
+    to: AttitudeConfig
+    max_rate_deg_s: Annotated[float, Field(gt=0.0, le=100.0)]
+    shape: Literal["smooth", "limited"] = "smooth"
+    acceleration_deg_s2: Annotated[float, Field(gt=0.0)] = 0.1
+
+    def build(self) -> Segment:
+        """Make the segment."""
+        return SlewSegment(
+            self.to.build(),
+            math.radians(self.max_rate_deg_s),
+            self.shape,
+            math.radians(self.acceleration_deg_s2),
+        )
+
+
+SegmentConfig: TypeAlias = Annotated[HoldConfig | TurnConfig | SlewToConfig, Field(discriminator="do")]
+
+
+class SlewConfig(Strict):
+    """A profile of rests, turns and slews."""
+
+    kind: Literal["slew"]
+    attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    segments: Annotated[list[SegmentConfig], Field(min_length=1)]
+    repeat: bool = False
+
+    def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
+        """Make the source; the first segment begins now."""
+        segments = [segment.build() for segment in self.segments]
+        return SlewTruth(self.attitude.build(), segments, start_s=now_s, repeat=self.repeat)
+
+
+class FileConfig(Strict):
+    """A table of times and attitudes; a relative path counts from the profile's folder."""
+
+    kind: Literal["file"]
+    path: str
+    start: Literal["run", "now"] = "run"
+    """What the file's time zero is: the start of the run, or the moment the source is taken into use."""
+    repeat: bool = False
+
+    def build(self, now_s: float, folder: Path) -> TruthSource:
+        """Read the file."""
+        start_s = now_s if self.start == "now" else 0.0
+        return read_truth_file(folder / self.path, start_s=start_s, repeat=self.repeat)
+
+
+class LiveConfig(Strict):
+    """A feed of JSON lines, the message of `emulator.truth_live`."""
+
+    kind: Literal["live"]
+    protocol: Literal["udp", "tcp"] = "udp"
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 0
+    """0 takes a free port; the ready line tells which."""
+    stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
+    timeline: Literal["anchor", "run"] = "anchor"
+    attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    """Attitude until the first message comes."""
+
+    def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
+        """Make the source; its socket is opened by whoever runs it."""
+        return LiveTruth(self.attitude.build(), stale_s=self.stale_s, timeline=self.timeline)
+
+
+TruthConfig: TypeAlias = Annotated[
+    FixedConfig | RateConfig | SlewConfig | FileConfig | LiveConfig, Field(discriminator="kind")
+]

@@ -1,0 +1,179 @@
+"""Truth from a file: a table of times and attitudes, interpolated on the shortest turn.
+
+The file is CSV with one header line. Columns, in any order:
+
+- ``t``: seconds of run time, rising from row to row;
+- either ``qx, qy, qz, qw`` (quaternion ICRS→sensor, scalar last) or ``ra_deg, dec_deg, roll_deg``;
+- if known, ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them the rate between two rows is
+  the constant one that leads from the first to the second.
+
+Empty lines and lines that begin with ``#`` are passed over.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.errors import EmulatorError
+from emulator.truth import ZERO_RATE, TruthState, TruthStatus, Vector
+from starid.attitude import Attitude, interpolate, rate_between
+
+QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
+ANGLE_COLUMNS: Final = ("ra_deg", "dec_deg", "roll_deg")
+RATE_COLUMNS: Final = ("wx_deg_s", "wy_deg_s", "wz_deg_s")
+
+NORM_TOLERANCE: Final = 0.01
+"""A quaternion whose length is off by more than this is taken for a mistake, not for rounding."""
+
+
+class FileTruth:
+    """Rows of attitudes, interpolated in time; at rest before the first and after the last.
+
+    Parameters
+    ----------
+    times_s
+        Run time (n,) of each row, seconds, rising.
+    attitudes
+        Attitude of each row.
+    rates_rad_s
+        Body rates (n, 3), radians a second, sensor frame; None to take them from the rows' differences.
+    start_s
+        Run time that the file's zero stands for.
+    repeat
+        Begin anew after the last row.
+    """
+
+    kind: Final = "file"
+
+    def __init__(
+        self,
+        times_s: NDArray[np.float64],
+        attitudes: list[Attitude],
+        rates_rad_s: NDArray[np.float64] | None = None,
+        *,
+        start_s: float = 0.0,
+        repeat: bool = False,
+    ) -> None:
+        if not attitudes:
+            raise EmulatorError("truth: a truth file needs at least one row")
+        self.times_s = times_s
+        self.attitudes = attitudes
+        self.rates_rad_s = rates_rad_s
+        self.start_s = start_s
+        self.repeat = repeat
+
+    def state(self, t_s: float) -> TruthState:
+        """Truth at a run time in seconds."""
+        first, last = float(self.times_s[0]), float(self.times_s[-1])
+        t = t_s - self.start_s
+        if self.repeat and t > last > first:
+            t = first + (t - first) % (last - first)
+        if t < first:
+            return TruthState(self.attitudes[0], ZERO_RATE, TruthStatus.BEFORE_START)
+        if t > last:
+            return TruthState(self.attitudes[-1], ZERO_RATE, TruthStatus.AFTER_END)
+        upper = int(np.searchsorted(self.times_s, t, side="right"))
+        if upper == len(self.attitudes):
+            if upper == 1:
+                return TruthState(self.attitudes[0], self._given(0, ZERO_RATE))
+            upper -= 1
+        low = upper - 1
+        span = float(self.times_s[upper] - self.times_s[low])
+        fraction = (t - float(self.times_s[low])) / span
+        before, after = self.attitudes[low], self.attitudes[upper]
+        if self.rates_rad_s is None:
+            rate = rate_between(before, after, span)
+        else:
+            rate = (1.0 - fraction) * self.rates_rad_s[low] + fraction * self.rates_rad_s[upper]
+        return TruthState(interpolate(before, after, fraction), rate)
+
+    def _given(self, row: int, otherwise: Vector) -> Vector:
+        return otherwise if self.rates_rad_s is None else self.rates_rad_s[row]
+
+
+def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -> FileTruth:
+    """Read a truth file; the first bad row is named by its line.
+
+    Raises
+    ------
+    EmulatorError
+        The file is missing, has not the columns of this module's head, or a row is not numbers, not a rotation, or not later than the row before.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise EmulatorError(
+            f"truth file {path}: cannot be read ({error}); give a CSV file of times and attitudes"
+        ) from None
+    lines = [
+        (n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"
+    ]
+    if not lines:
+        raise EmulatorError(f"truth file {path}: empty; the first line names the columns, e.g. t,qx,qy,qz,qw")
+    columns = [name.strip() for name in next(csv.reader([lines[0][1]]))]
+    needed = _attitude_columns(path, columns)
+    has_rates = all(name in columns for name in RATE_COLUMNS)
+    times: list[float] = []
+    attitudes: list[Attitude] = []
+    rates: list[list[float]] = []
+    for number, line in lines[1:]:
+        where = f"truth file {path} line {number}"
+        row = _row(where, columns, line)
+        if times and row["t"] <= times[-1]:
+            raise EmulatorError(f"{where}: t = {row['t']:g} is not later than the row before ({times[-1]:g})")
+        times.append(row["t"])
+        attitudes.append(_attitude(where, needed, row))
+        if has_rates:
+            rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
+    if not times:
+        raise EmulatorError(f"truth file {path}: no rows after the header; add at least one")
+    rate_array = np.array(rates) if has_rates else None
+    return FileTruth(np.array(times), attitudes, rate_array, start_s=start_s, repeat=repeat)
+
+
+def _attitude_columns(path: Path, columns: list[str]) -> tuple[str, ...]:
+    known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS}
+    unknown = [name for name in columns if name not in known]
+    if unknown:
+        raise EmulatorError(
+            f"truth file {path} line 1: unknown column {unknown[0]!r}; known: {', '.join(sorted(known))}"
+        )
+    for needed in (QUATERNION_COLUMNS, ANGLE_COLUMNS):
+        if "t" in columns and all(name in columns for name in needed):
+            return needed
+    raise EmulatorError(
+        f"truth file {path} line 1: columns t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg needed"
+    )
+
+
+def _row(where: str, columns: list[str], line: str) -> dict[str, float]:
+    cells = next(csv.reader([line]))
+    if len(cells) != len(columns):
+        raise EmulatorError(f"{where}: {len(cells)} values for {len(columns)} columns")
+    row: dict[str, float] = {}
+    for name, cell in zip(columns, cells, strict=True):
+        try:
+            row[name] = float(cell)
+        except ValueError:
+            raise EmulatorError(f"{where}: {name} = {cell.strip()!r} is not a number") from None
+        if not math.isfinite(row[name]):
+            raise EmulatorError(f"{where}: {name} = {cell.strip()} is not finite")
+    return row
+
+
+def _attitude(where: str, needed: tuple[str, ...], row: dict[str, float]) -> Attitude:
+    values = [row[name] for name in needed]
+    if needed is ANGLE_COLUMNS:
+        if abs(row["dec_deg"]) > 90.0:
+            raise EmulatorError(f"{where}: dec_deg = {row['dec_deg']:g} is outside ±90")
+        return Attitude.from_radec_roll(*values)
+    norm = math.sqrt(sum(v * v for v in values))
+    if abs(norm - 1.0) > NORM_TOLERANCE:
+        raise EmulatorError(f"{where}: quaternion of length {norm:.3f}; a rotation has length 1")
+    return Attitude(np.array(values))

@@ -1,0 +1,270 @@
+"""Truth from a live feed: a dynamics simulator sends attitudes as JSON lines over UDP or TCP.
+
+One message a line (TCP) or one or more lines a datagram (UDP)::
+
+    {"t": 12.25, "q": [0.0, 0.0, 0.0, 1.0], "rate": [0.0, 0.3, 0.0]}
+
+``t``
+    Seconds on the sender's own time line, rising. May be left out: then the time of receipt counts.
+``q``
+    Quaternion ICRS→sensor, scalar last (x, y, z, w), of length 1 within 1 %.
+``rate``
+    Body rate in the sensor frame, degrees a second. May be left out: then it is taken from the last two messages.
+
+The sender's time line is tied to run time by its first message: what came first is taken to hold at its receipt. With
+``timeline = "run"`` in the profile, ``t`` is run time as it stands. Between two messages the attitude is interpolated, after
+the last one it is carried on at the last rate; when the feed has been silent for ``stale_s`` the attitude stands still and is
+flagged ``stale``. A bad message is counted, the last one's fault is kept, and nothing else happens. A ``t`` that does not
+rise is a bad message, except that a jump back by more than `RESTART_S` begins a new time line.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import bisect
+import json
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from emulator.errors import EmulatorError
+from emulator.truth import ZERO_RATE, TruthState, TruthStatus, Vector
+from starid.attitude import Attitude, interpolate, propagate, rate_between
+
+HISTORY: Final = 512
+"""Messages kept for exposures whose middle has passed already."""
+
+RESTART_S: Final = 1.0
+"""A sender's time that falls back by more than this begins a new time line, seconds."""
+
+NORM_TOLERANCE: Final = 0.01
+MAX_LINE: Final = 4096
+"""A line longer than this is refused, bytes."""
+
+
+class FeedError(EmulatorError):
+    """A live message that is refused; the text says why."""
+
+
+@dataclass(frozen=True)
+class FeedMessage:
+    """One decoded message: the sender's time (or None), attitude and rate (radians a second, or None)."""
+
+    t: float | None
+    attitude: Attitude
+    rate_rad_s: Vector | None
+
+
+def parse_message(line: bytes | str) -> FeedMessage:
+    """Decode one line.
+
+    Raises
+    ------
+    FeedError
+        The line is not the documented message; the text names the key.
+    """
+    try:
+        message: Any = json.loads(line)
+    except (ValueError, RecursionError):
+        raise FeedError("not a JSON line") from None
+    if not isinstance(message, dict):
+        raise FeedError("not a JSON object")
+    unknown = sorted(set(message) - {"t", "q", "rate"})
+    if unknown:
+        raise FeedError(f"unknown key {unknown[0]!r}; known: t, q, rate")
+    if "q" not in message:
+        raise FeedError("q is missing")
+    quaternion = _numbers("q", message["q"], 4)
+    if abs(float(np.linalg.norm(quaternion)) - 1.0) > NORM_TOLERANCE:
+        raise FeedError("q is not of length 1")
+    rate = _numbers("rate", message["rate"], 3) if message.get("rate") is not None else None
+    t = _numbers("t", [message["t"]], 1)[0] if message.get("t") is not None else None
+    return FeedMessage(
+        None if t is None else float(t), Attitude(quaternion), None if rate is None else np.radians(rate)
+    )
+
+
+def _numbers(key: str, value: object, count: int) -> Vector:
+    if not isinstance(value, list) or len(value) != count:
+        raise FeedError(f"{key} is not {count} numbers")
+    for number in value:
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) < 1e15:
+            raise FeedError(f"{key} holds {number!r}, not a finite number")
+    return np.array(value, dtype=np.float64)
+
+
+class LiveTruth:
+    """What a live feed has told so far.
+
+    Parameters
+    ----------
+    attitude
+        Attitude until the first message comes.
+    stale_s
+        Silence, in seconds of run time, after which the truth is flagged and stands still.
+    timeline
+        `anchor`: the sender's time line is tied to run time by the first message; `run`: it is run time.
+    """
+
+    kind: Final = "live"
+
+    def __init__(
+        self, attitude: Attitude, *, stale_s: float = 1.0, timeline: Literal["anchor", "run"] = "anchor"
+    ) -> None:
+        self.stale_s = stale_s
+        self.timeline = timeline
+        self.accepted = 0
+        self.refused = 0
+        self.last_fault = ""
+        self._start = attitude
+        self._offset_s: float | None = 0.0 if timeline == "run" else None
+        self._times: deque[float] = deque(maxlen=HISTORY)
+        self._states: deque[tuple[Attitude, Vector]] = deque(maxlen=HISTORY)
+
+    def receive(self, line: bytes | str, received_s: float) -> bool:
+        """Take in one line at a run time in seconds; a bad one is counted and kept by name in `last_fault`."""
+        try:
+            self._push(parse_message(line), received_s)
+        except FeedError as fault:
+            self.refuse(str(fault))
+            return False
+        self.accepted += 1
+        return True
+
+    def refuse(self, fault: str) -> None:
+        """Count a bad message."""
+        self.refused += 1
+        self.last_fault = fault
+
+    def _push(self, message: FeedMessage, received_s: float) -> None:
+        if message.t is None:
+            t = received_s
+        else:
+            if self._offset_s is None:
+                self._offset_s = received_s - message.t
+            t = message.t + self._offset_s
+        if self._times and t <= self._times[-1]:
+            if self._times[-1] - t <= RESTART_S:
+                raise FeedError(f"t = {message.t} is not later than the message before")
+            self._times.clear()
+            self._states.clear()
+            if message.t is not None and self.timeline == "anchor":
+                self._offset_s = received_s - message.t
+                t = received_s
+        if message.rate_rad_s is not None:
+            rate = message.rate_rad_s
+        elif self._times:
+            rate = rate_between(self._states[-1][0], message.attitude, t - self._times[-1])
+        else:
+            rate = ZERO_RATE
+        self._times.append(t)
+        self._states.append((message.attitude, rate))
+
+    def state(self, t_s: float) -> TruthState:
+        """Truth at a run time in seconds."""
+        if not self._times:
+            return TruthState(self._start, ZERO_RATE, TruthStatus.WAITING)
+        age = t_s - self._times[-1]
+        attitude, rate = self._states[-1]
+        if age > self.stale_s:
+            return TruthState(propagate(attitude, rate, self.stale_s), ZERO_RATE, TruthStatus.STALE)
+        if age >= 0.0:
+            status = TruthStatus.EXTRAPOLATED if age > 0.0 else TruthStatus.OK
+            return TruthState(propagate(attitude, rate, age), rate, status)
+        if t_s <= self._times[0]:
+            attitude, rate = self._states[0]
+            return TruthState(attitude, rate, TruthStatus.BEFORE_START)
+        upper = bisect.bisect_right(self._times, t_s)
+        low = upper - 1
+        fraction = (t_s - self._times[low]) / (self._times[upper] - self._times[low])
+        (before, rate_before), (after, rate_after) = self._states[low], self._states[upper]
+        rate = (1.0 - fraction) * rate_before + fraction * rate_after
+        return TruthState(interpolate(before, after, fraction), rate)
+
+
+class _Datagrams(asyncio.DatagramProtocol):
+    """Hands each line of each datagram on."""
+
+    def __init__(self, feed: LiveFeed) -> None:
+        self._feed = feed
+
+    def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
+        """Take in a datagram."""
+        for line in data.splitlines():
+            if line.strip():
+                self._feed.receive(line)
+
+
+class LiveFeed:
+    """The socket that a dynamics simulator sends to, feeding a `LiveTruth`.
+
+    Parameters
+    ----------
+    truth
+        Where messages go.
+    now_s
+        Run time in seconds.
+    """
+
+    def __init__(self, truth: LiveTruth, now_s: Callable[[], float]) -> None:
+        self.truth = truth
+        self._now_s = now_s
+        self._transport: asyncio.DatagramTransport | None = None
+        self._server: asyncio.Server | None = None
+        self._writers: set[asyncio.StreamWriter] = set()
+
+    async def start(self, protocol: Literal["udp", "tcp"], host: str, port: int) -> str:
+        """Listen; return where, as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
+        loop = asyncio.get_running_loop()
+        try:
+            if protocol == "udp":
+                transport, _ = await loop.create_datagram_endpoint(
+                    lambda: _Datagrams(self), local_addr=(host, port)
+                )
+                self._transport = transport
+                address = transport.get_extra_info("sockname")
+            else:
+                self._server = await asyncio.start_server(self._serve, host, port, limit=MAX_LINE)
+                address = self._server.sockets[0].getsockname()
+        except OSError as error:
+            raise EmulatorError(
+                f"truth feed {protocol}:{host}:{port}: cannot listen ({error.strerror or error}); choose another port, or 0"
+            ) from None
+        return f"{protocol}:{address[0]}:{address[1]}"
+
+    def receive(self, line: bytes) -> None:
+        """Take in one line, at the time now."""
+        self.truth.receive(line, self._now_s())
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        try:
+            while True:
+                try:
+                    line = await reader.readline()
+                except ValueError:
+                    self.truth.refuse(f"line longer than {MAX_LINE} bytes")
+                    break
+                if not line:
+                    break
+                if line.strip():
+                    self.receive(line)
+        except ConnectionError:
+            self.truth.refuse("connection broken")
+        finally:
+            self._writers.discard(writer)
+            writer.close()
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        for writer in list(self._writers):
+            writer.transport.abort()
