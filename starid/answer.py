@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from starid.jit import compiled
 from starid.pattern_index import IndexArrays
 from starid.refinement import solve_symmetric
-from starid.search import Outcome, search
+from starid.search import SCALE_TOLERANCE, Outcome, search
+from starid.tracking import track_near
 
 PRIOR_FREEDOM: Final = 10.0
 """Weight of the errors that the caller gives, in degrees of freedom, against what the residuals say."""
@@ -125,4 +126,21 @@ def identify_kernel(
 ) -> Answer:
     """Lost in space, whole: see `starid.search.search` and `finish`."""
     outcome = search(index, params, xy, flux, sigmas, settings)
-    return finish(outcome, sigmas, sigmas_known, 4 if settings[3] > 0.0 else 3)
+    return finish(outcome, sigmas, sigmas_known, 4 if settings[SCALE_TOLERANCE] > 0.0 else 3)
+
+
+@compiled
+def track_kernel(
+    index: IndexArrays,
+    params: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    flux: NDArray[np.float64],
+    sigmas: NDArray[np.float64],
+    sigmas_known: bool,
+    settings: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    window_rad: float,
+) -> Answer:
+    """Tracking, whole: see `starid.tracking.track_near` and `finish`."""
+    outcome = track_near(index, params, xy, flux, sigmas, settings, predicted, window_rad)
+    return finish(outcome, sigmas, sigmas_known, 3)

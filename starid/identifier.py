@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starid import index_file
-from starid.answer import Answer, identify_kernel
+from starid.answer import Answer, identify_kernel, track_kernel
 from starid.attitude import Attitude
 from starid.cache import cache_dir
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -38,6 +38,7 @@ from starid.search import (
     LARGEST_SIGMA,
     LEAST_PX_PER_RAD,
     LOG_CHANCE,
+    LOG_CHANCE_TRACKING,
     MAGNITUDE_GATE,
     MAX_TRIANGLES,
     NOISY,
@@ -58,6 +59,7 @@ FAINTEST_LIMIT: Final = 9.0
 BLEND_PX: Final = 2.0
 TOLERANCE_PX: Final = 8.0
 WINDOW_PX: Final = 14.0
+TRACKING_WINDOW_PX: Final = 20.0
 _REASONS: Final = {TOO_FEW: Reason.TOO_FEW_STARS, NOISY: Reason.RESIDUAL}
 
 
@@ -96,7 +98,9 @@ class Effort:
     max_triangles : int
         Triangles of detections looked up before giving up.
     max_false_probability : float
-        Largest bound on the probability of a false answer that is accepted.
+        Largest bound on the probability of a false answer that is accepted, lost in space.
+    max_false_probability_tracking : float
+        The same near a predicted attitude.
     """
 
     tolerance_px: float = TOLERANCE_PX
@@ -104,6 +108,7 @@ class Effort:
     magnitude_gate: float = 1.5
     max_triangles: int = 1500
     max_false_probability: float = 1e-9
+    max_false_probability_tracking: float = 1e-6
 
 
 class Identifier:
@@ -170,6 +175,7 @@ class Identifier:
         self._kernel_settings[WINDOW] = self._effort.window_px / least
         self._kernel_settings[LARGEST_SIGMA] = 0.3 * self._effort.window_px
         self._kernel_settings[LOG_CHANCE] = math.log(self._effort.max_false_probability)
+        self._kernel_settings[LOG_CHANCE_TRACKING] = math.log(self._effort.max_false_probability_tracking)
         self._kernel_settings[PX_PER_RAD] = least
         self._kernel_settings[LEAST_PX_PER_RAD] = least
         self._kernel_settings[FIELD_PX] = camera.width * camera.height
@@ -225,9 +231,53 @@ class Identifier:
         )
         return self._solution(answer, "lost_in_space", begin)
 
+    def track(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        predicted: Attitude | ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        window_px: float | None = None,
+    ) -> Solution:
+        """Attitude near a predicted one; invalid, with the reason, where it does not hold.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `identify`.
+        predicted : Attitude or array (4,)
+            Attitude expected at the time of the exposure, or its scalar-last quaternion.
+        window_px : float, optional
+            Largest distance of a star from where the prediction puts it, pixels (`TRACKING_WINDOW_PX`).
+
+        Raises
+        ------
+        StaridError
+            The arrays do not fit each other, or hold values that are not finite.
+        """
+        begin = time.perf_counter()
+        xy, brightness, sigmas = _checked(xy_px, flux, xy_sigma_px)
+        window = TRACKING_WINDOW_PX if window_px is None else window_px
+        if not 0.0 < window < math.inf:
+            raise StaridError(f"tracking window_px: {window} given, a positive number of pixels needed")
+        attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
+        answer = track_kernel(
+            self._index, self._camera.params, xy, brightness, sigmas, xy_sigma_px is not None,
+            self._kernel_settings, attitude.matrix, window / self._kernel_settings[LEAST_PX_PER_RAD],
+        )  # fmt: skip
+        return self._solution(answer, "tracking", begin)
+
+    def warm_up(self) -> None:
+        """Compile, or load, the kernels, so that the first real frame is not late."""
+        xy = self._camera.border(2)[:6]
+        self.identify(xy, np.ones(6))
+        self.track(xy, np.ones(6), Attitude.identity())
+
     def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
         if answer.status != ACCEPTED:
-            reason = _REASONS.get(answer.status, Reason.NO_MATCH)
+            lost = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST
+            reason = _REASONS.get(answer.status, lost)
             return Solution.invalid(reason, mode=mode, elapsed=time.perf_counter() - begin)
         rms, sigma, log_false, _, _, _ = answer.numbers.tolist()
         return Solution(

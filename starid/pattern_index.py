@@ -355,7 +355,7 @@ def field_solid_angle(camera: Camera) -> float:
     y = (np.arange(steps) + 0.5) * camera.height / steps - 0.5
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     here = camera.back_project(grid)
-    right = camera.back_project([*grid, 0.01, 0.0]) - here
-    down = camera.back_project([*grid, 0.0, 0.01]) - here
+    right = camera.back_project(grid + np.array([0.01, 0.0])) - here
+    down = camera.back_project(grid + np.array([0.0, 0.01])) - here
     areas = np.linalg.norm(np.cross(right, down), axis=1) / 1e-4
     return float(np.nanmean(areas)) * camera.width * camera.height

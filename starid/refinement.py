@@ -71,6 +71,14 @@ class Refined(NamedTuple):
 
 
 @compiled
+def nothing_refined() -> Refined:
+    """Return the outcome of a refinement that never was."""
+    none = math.nan
+    stars = np.empty(0, dtype=np.int64)
+    return Refined(0, np.empty((0, 0)), 1.0, stars, np.empty((0, 0)), none, none, none, none)
+
+
+@compiled
 def turned(rotation: NDArray[np.float64], vx: float, vy: float, vz: float) -> NDArray[np.float64]:
     """Matrix after the sensor has turned by +v: ``exp(−[v]×)·A`` (Rodrigues)."""
     angle2 = vx * vx + vy * vy + vz * vz

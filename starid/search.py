@@ -27,7 +27,7 @@ from starid.pattern_index import (
     magnitude_bin,
     sorted_triangle,
 )
-from starid.refinement import Refined, refine
+from starid.refinement import Refined, nothing_refined, refine
 from starid.sky_grid import cell_of
 from starid.verification import hit_odds, log_chance, worth_refining
 
@@ -51,7 +51,9 @@ LEAST_PX_PER_RAD: Final = 8
 """Least pixels per radian in the field."""
 FIELD_PX: Final = 9
 """Pixels in the field."""
-SETTING_COUNT: Final = 10
+LOG_CHANCE_TRACKING: Final = 10
+"""The same as `LOG_CHANCE` for an answer near a predicted attitude."""
+SETTING_COUNT: Final = 11
 
 SYSTEMATIC: Final = 14
 """Brightest detections of which every triangle is tried first."""
@@ -126,21 +128,28 @@ def rotation_between(sensor: NDArray[np.float64], sky: NDArray[np.float64]) -> N
 
 @compiled
 def accept(
-    index: IndexArrays, refined: Refined, tested: int, hypotheses: float, settings: NDArray[np.float64]
+    index: IndexArrays,
+    refined: Refined,
+    tested: int,
+    hypotheses: float,
+    consumed: int,
+    settings: NDArray[np.float64],
 ) -> float:
     """Logarithm of the bound on the probability that a refined attitude is chance; 0 where it is worthless.
 
-    The pattern's own three stars do not count. The field's star density down to the faintest match times
-    the final window is the chance of a single accidental match.
+    The stars that the attitude was made from, `consumed`, do not count. The field's star density down to
+    the faintest match times the final window is the chance of a single accidental match.
     """
-    if refined.matched < 4:
+    if refined.matched <= consumed:
         return 0.0
     boresight = refined.rotation[2]
     cell = cell_of(boresight[0], boresight[1], boresight[2], COUNT_CELLS)
     depth = magnitude_bin(refined.faintest + 0.5, index.counts.shape[1])
     density = max(float(index.counts[cell, depth]), 1.0) / settings[FIELD_PX]
     chance = min(density * math.pi * refined.window_px * refined.window_px, 0.5)
-    bound = math.log(hypotheses * LOOK_ELSEWHERE) + log_chance(refined.matched - 3, tested - 3, chance)
+    bound = math.log(hypotheses * LOOK_ELSEWHERE) + log_chance(
+        refined.matched - consumed, tested - consumed, chance
+    )
     return min(bound, 0.0)
 
 
@@ -158,10 +167,7 @@ def _try_triangle(
     `work` counts triangles and candidates. Returns the last refinement, its bound, and whether it stands.
     """
     directions = observations.directions
-    none = Refined(
-        0, np.empty((0, 0)), 1.0, np.empty(0, dtype=np.int64), np.empty((0, 0)), math.nan, math.nan, math.nan,
-        math.nan,
-    )  # fmt: skip
+    none = nothing_refined()
     i, j, k = corners
     c0, c1, c2 = chord(directions, j, k), chord(directions, i, k), chord(directions, i, j)
     s0, s1, s2, i, j, k = sorted_triangle(c0, c1, c2, i, j, k)
@@ -228,7 +234,7 @@ def _try_triangle(
             )  # fmt: skip
             if refined.matched == 0:
                 continue
-            bound = accept(index, refined, n, float(work[1]), settings)
+            bound = accept(index, refined, n, float(work[1]), 3, settings)
             if bound < settings[LOG_CHANCE]:
                 return refined, bound, True
     return none, 0.0, False
@@ -259,10 +265,7 @@ def search(
     """Find the attitude of a set of detections without knowing anything of it."""
     observations = observe(params, xy, flux, sigmas)
     n = observations.directions.shape[0]
-    refined = Refined(
-        0, np.empty((0, 0)), 1.0, np.empty(0, dtype=np.int64), np.empty((0, 0)), math.nan, math.nan, math.nan,
-        math.nan,
-    )  # fmt: skip
+    refined = nothing_refined()
     work = np.zeros(2, dtype=np.int64)
     if n < 4:
         return Outcome(TOO_FEW, refined, observations.source, 0.0, 0, 0)

@@ -1,0 +1,113 @@
+"""The tracker: an identifier with a memory of attitude and rate."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.attitude import Attitude, propagate, rate_between
+from starid.errors import StaridError
+from starid.interface import StarIdentifier
+from starid.solution import Solution
+
+LONGEST_GAP_S: Final = 10.0
+"""After this long without a valid attitude, seconds, a prediction is worth nothing."""
+
+
+class Tracker:
+    """Attitude from frame to frame: predict, match near the prediction, fall back to lost in space.
+
+    Parameters
+    ----------
+    identifier : StarIdentifier
+        Does the work.
+    longest_gap_s : float
+        Age of the last valid attitude beyond which the next frame is identified lost in space, seconds.
+    window_px : float, optional
+        Passed on to `StarIdentifier.track`.
+
+    Attributes
+    ----------
+    attitude : Attitude or None
+        Last valid attitude.
+    rate_rad_s : ndarray (3,) or None
+        Body rate in the sensor frame, from the last two valid attitudes.
+    """
+
+    def __init__(
+        self,
+        identifier: StarIdentifier,
+        *,
+        longest_gap_s: float = LONGEST_GAP_S,
+        window_px: float | None = None,
+    ) -> None:
+        if not longest_gap_s > 0.0:
+            raise StaridError(f"tracker longest_gap_s: {longest_gap_s} given, seconds > 0 needed")
+        self.identifier = identifier
+        self.attitude: Attitude | None = None
+        self.rate_rad_s: NDArray[np.float64] | None = None
+        self._time_s = 0.0
+        self._longest_gap_s = longest_gap_s
+        self._window_px = window_px
+
+    def reset(self) -> None:
+        """Forget attitude and rate: the next frame is identified lost in space."""
+        self.attitude = None
+        self.rate_rad_s = None
+
+    def predict(self, time_s: float) -> Attitude | None:
+        """Attitude expected at a time; None where there is nothing to go by."""
+        gap = time_s - self._time_s
+        if self.attitude is None or not 0.0 <= gap <= self._longest_gap_s:
+            return None
+        if self.rate_rad_s is None:
+            return self.attitude
+        return propagate(self.attitude, self.rate_rad_s, gap)
+
+    def update(
+        self,
+        xy_px: NDArray[np.float64],
+        flux: NDArray[np.float64],
+        time_s: float,
+        xy_sigma_px: NDArray[np.float64] | None = None,
+        *,
+        rate_hint_rad_s: ArrayLike | None = None,
+    ) -> Solution:
+        """Attitude of the detections of one frame.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `StarIdentifier.identify`.
+        time_s : float
+            Time of the exposure, seconds on any steady clock.
+        rate_hint_rad_s : array (3,), optional
+            Body rate from elsewhere (a gyro), sensor frame; it replaces the tracker's own.
+
+        Returns
+        -------
+        Solution
+            With `rate_rad_s` where two valid frames are known. `mode` says how it was found. After an
+            invalid one the last valid attitude is kept for predictions until the gap is too long.
+        """
+        if rate_hint_rad_s is not None:
+            self.rate_rad_s = np.asarray(rate_hint_rad_s, dtype=np.float64)
+        predicted = self.predict(time_s)
+        solution: Solution | None = None
+        if predicted is not None:
+            solution = self.identifier.track(xy_px, flux, predicted, xy_sigma_px, window_px=self._window_px)
+        if solution is None or not solution.valid:
+            spent = 0.0 if solution is None else solution.elapsed
+            solution = self.identifier.identify(xy_px, flux, xy_sigma_px)
+            solution = dataclasses.replace(solution, elapsed=solution.elapsed + spent)
+        if solution.valid:
+            gap = time_s - self._time_s
+            if self.attitude is not None and 0.0 < gap <= self._longest_gap_s:
+                self.rate_rad_s = rate_between(self.attitude, solution.attitude, gap)
+            else:
+                self.rate_rad_s = None
+            self.attitude, self._time_s = solution.attitude, time_s
+        return dataclasses.replace(solution, rate_rad_s=self.rate_rad_s if solution.valid else None)
