@@ -1,0 +1,123 @@
+"""The bench's own quaternion algebra against closed forms and against an independent implementation."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hil_tests.attitude import (
+    Quaternion,
+    attitude_error,
+    boresight,
+    from_radec_roll,
+    from_vector_part,
+    interpolate,
+    unit,
+    wrapped_difference,
+)
+from hil_tests.errors import BenchError
+
+ARCSEC = math.radians(1.0 / 3600.0)
+TOLERANCE_ARCSEC = 1e-3
+
+angles = st.floats(0.0, 360.0, exclude_max=True)
+declinations = st.floats(-89.9, 89.9)
+
+
+def compose(vector_rad: tuple[float, float, float], q: Quaternion) -> Quaternion:
+    """Turn the sensor frame by a rotation vector, with scipy."""
+    return unit(list((Rotation.from_rotvec(vector_rad).inv() * Rotation.from_quat(q)).as_quat()))
+
+
+@pytest.mark.parametrize(
+    ("ra", "dec", "roll", "expected"),
+    [
+        (0.0, 0.0, 0.0, (1.0, 0.0, 0.0)),
+        (90.0, 0.0, 77.0, (0.0, 1.0, 0.0)),
+        (12.0, 90.0, 5.0, (0.0, 0.0, 1.0)),
+        (180.0, -45.0, 0.0, (-math.sqrt(0.5), 0.0, -math.sqrt(0.5))),
+    ],
+)
+def test_the_boresight_points_where_ra_and_dec_say(ra, dec, roll, expected):
+    assert boresight(from_radec_roll(ra, dec, roll)) == pytest.approx(expected, abs=1e-12)
+
+
+@given(angles, declinations, angles)
+@settings(max_examples=200, deadline=None)
+def test_rows_of_the_matrix_are_those_of_the_convention(ra, dec, roll):
+    alpha, delta, rho = (math.radians(v) for v in (ra, dec, roll))
+    north = (-math.sin(delta) * math.cos(alpha), -math.sin(delta) * math.sin(alpha), math.cos(delta))
+    east = (-math.sin(alpha), math.cos(alpha), 0.0)
+    matrix = Rotation.from_quat(from_radec_roll(ra, dec, roll)).as_matrix()
+    x = [-math.sin(rho) * n - math.cos(rho) * e for n, e in zip(north, east, strict=True)]
+    y = [-math.cos(rho) * n + math.sin(rho) * e for n, e in zip(north, east, strict=True)]
+    assert matrix[0] == pytest.approx(x, abs=1e-12)
+    assert matrix[1] == pytest.approx(y, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("vector", "cross", "roll", "total"),
+    [
+        ((10 * ARCSEC, 0.0, 0.0), 10.0, 0.0, 10.0),
+        ((0.0, -25 * ARCSEC, 0.0), 25.0, 0.0, 25.0),
+        ((0.0, 0.0, 40 * ARCSEC), 0.0, 40.0, 40.0),
+        ((30 * ARCSEC, 0.0, 40 * ARCSEC), 30.0, 40.0, 50.0),
+        ((0.0, 0.0, math.pi / 2), 0.0, 90 * 3600.0, 90 * 3600.0),
+        ((math.pi, 0.0, 0.0), 180 * 3600.0, 0.0, 180 * 3600.0),
+    ],
+)
+def test_error_is_split_into_boresight_and_roll(vector, cross, roll, total):
+    truth = from_radec_roll(83.8, -1.2, 30.0)
+    error = attitude_error(compose(vector, truth), truth)
+    assert error.cross_boresight_arcsec == pytest.approx(cross, abs=TOLERANCE_ARCSEC)
+    assert error.roll_arcsec == pytest.approx(roll, abs=TOLERANCE_ARCSEC)
+    assert error.total_arcsec == pytest.approx(total, abs=TOLERANCE_ARCSEC)
+
+
+@given(angles, declinations, angles)
+@settings(max_examples=100, deadline=None)
+def test_a_quaternion_and_its_negative_are_one_attitude(ra, dec, roll):
+    q = from_radec_roll(ra, dec, roll)
+    assert attitude_error(Quaternion(*(-v for v in q)), q).total_arcsec == pytest.approx(
+        0.0, abs=TOLERANCE_ARCSEC
+    )
+
+
+@given(angles, declinations, angles)
+@settings(max_examples=100, deadline=None)
+def test_the_vector_part_alone_gives_the_attitude(ra, dec, roll):
+    q = from_radec_roll(ra, dec, roll)
+    sign = 1.0 if q.w >= 0.0 else -1.0
+    rebuilt = from_vector_part(sign * q.x, sign * q.y, sign * q.z)
+    # near a half turn the scalar is the root of a difference, so its rounding counts
+    assert attitude_error(rebuilt, q).total_arcsec < 0.01
+
+
+@pytest.mark.parametrize(
+    "values", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)]
+)
+def test_what_is_no_attitude_is_refused(values):
+    with pytest.raises(BenchError, match="quaternion"):
+        unit(values)
+
+
+def test_interpolation_goes_the_short_way_at_constant_rate():
+    first = from_radec_roll(10.0, 20.0, 30.0)
+    second = compose((0.0, math.radians(10.0), 0.0), first)
+    quarter = interpolate(first, Quaternion(*(-v for v in second)), 0.25)
+    assert attitude_error(quarter, first).cross_boresight_arcsec == pytest.approx(
+        2.5 * 3600.0, abs=TOLERANCE_ARCSEC
+    )
+    assert interpolate(first, first, 0.3) == pytest.approx(first)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected", "difference"),
+    [(359.9, 0.1, 0.2), (0.1, 359.9, 0.2), (-179.5, 179.5, 1.0), (10.0, 370.0, 0.0), (90.0, 270.0, 180.0)],
+)
+def test_angles_wrap(value, expected, difference):
+    assert wrapped_difference(value, expected) == pytest.approx(difference, abs=1e-9)

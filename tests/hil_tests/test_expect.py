@@ -1,0 +1,79 @@
+"""Expectations: what holds, what does not, and what is said about it."""
+
+from __future__ import annotations
+
+import pytest
+
+from hil_tests.attitude import from_radec_roll
+from hil_tests.errors import BenchError
+from hil_tests.expect import AttitudeCheck, Expectation, Variable, measured_attitude, read_expectation, show
+from hil_tests.script_reader import TableReader
+
+
+def expectation(value, known=frozenset()):
+    return read_expectation("x", value, TableReader({}, "place"), known)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "good", "bad"),
+    [
+        (5, 5, 6),
+        (5.0, 5.000001, 5.01),
+        (True, True, False),
+        ("tracking", "tracking", "standby"),
+        ({"value": 10.0, "within": 0.5}, 10.5, 10.6),
+        ({"value": 10, "within": 2}, 8, 7),
+        ({"min": 3}, 3, 2.999),
+        ({"max": 3}, 3, 3.001),
+        ({"min": 1, "max": 2}, 1.5, 2.5),
+        ({"above": 3}, 3.1, 3),
+        ({"one_of": ["a", "b"]}, "b", "c"),
+        ({"not": 0}, 1, 0),
+        ({"angle_deg": 0.0, "within": 0.2}, 359.9, 359.7),
+        ({"value": 5, "plus": 1}, 6, 5),
+        ("0A0B", b"\x0a\x0b", b"\x0a\x0c"),
+    ],
+)
+def test_each_form_holds_where_it_should_and_nowhere_else(wanted, good, bad):
+    assert expectation(wanted).mismatch(good, {}) is None
+    text = expectation(wanted).mismatch(bad, {})
+    assert text is not None
+    assert text.startswith(f"x is {show(bad)}, expected ")
+
+
+def test_a_captured_value_is_taken_at_the_time_of_the_check():
+    growing = expectation({"above": "$before"}, frozenset({"before"}))
+    assert growing.above == Variable("before")
+    assert growing.mismatch(8, {"before": 7}) is None
+    assert growing.mismatch(7, {"before": 7}) == "x is 7, expected more than 7"
+
+
+def test_not_a_number_fails_every_comparison():
+    nan = float("nan")
+    for wanted in ({"min": 0}, {"max": 0}, {"above": 0}, {"value": 0, "within": 1}, 0.0):
+        assert expectation(wanted).mismatch(nan, {}) is not None
+
+
+def test_a_flag_is_not_the_number_one():
+    assert Expectation("x", equals=True).mismatch(1, {}) is not None
+
+
+def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
+    truth = from_radec_roll(10.0, 20.0, 30.0)
+    off = from_radec_roll(10.0, 20.0 + 10.0 / 3600.0, 30.0)
+    values = dict(zip(("q_x", "q_y", "q_z", "q_w"), off, strict=True)) | {"valid": True, "reason": "ok"}
+    error, problem = AttitudeCheck(10.1, None, None, None).judge(values, truth)
+    assert problem is None
+    assert error.cross_boresight_arcsec == pytest.approx(10.0, abs=1e-6)
+    _, problem = AttitudeCheck(9.9, None, None, None).judge(values, truth)
+    assert problem == "cross-boresight error 10.0 arcsec, expected at most 9.9 arcsec"
+    error, problem = AttitudeCheck(1e9, None, None, None).judge(
+        values | {"valid": False, "reason": "no_match"}, truth
+    )
+    assert error is None
+    assert "no_match" in problem
+
+
+def test_all_zeros_are_no_attitude():
+    with pytest.raises(BenchError, match="length is 0"):
+        measured_attitude({"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 0.0})

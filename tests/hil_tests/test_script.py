@@ -1,0 +1,183 @@
+"""Session scripts: what is read, and the one line that each mistake is answered with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hil_tests.attitude import attitude_error, from_radec_roll
+from hil_tests.errors import ScriptError
+from hil_tests.expect import Variable
+from hil_tests.script import load_script
+from hil_tests.script_model import Command, Read, Sample, Send
+from hil_tests.session_run import SCRIPT_FOLDER, find_script
+from protocol.icd import load_icd
+
+ICD = load_icd()
+
+
+@pytest.fixture
+def load(tmp_path):
+    def _load(text: str):
+        path = tmp_path / "trial.toml"
+        path.write_text(text, encoding="utf-8")
+        return load_script(path, ICD)
+
+    return _load
+
+
+def refusal(load, text: str) -> str:
+    with pytest.raises(ScriptError) as caught:
+        load(text)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("trial.toml") or "trial.toml:" in message
+    return message
+
+
+FULL = """
+title = "All parts"
+doc = "Why."
+[defaults]
+timeout_s = 0.5
+retries = 1
+keep_going = true
+link = "both"
+[emulator]
+profile = "demo"
+set = ["truth.ra_deg=83.8"]
+seed = 3
+[truth]
+ra_deg = 83.8
+dec_deg = -1.2
+roll_deg = 30
+[[step]]
+read = "identification"
+expect = { interface_version = 1, runtime_s = { max = 60 }, node_type = { one_of = [1, 0x53] } }
+capture = { before = "runtime_s" }
+[[step]]
+name = "set the clock"
+command = "set_unix_time"
+with = { seconds = "$now_s", milliseconds = "$now_ms" }
+[[step]]
+read = "precise_attitude"
+expect = { valid = true, mode = "tracking", rate_x = { value = 0.3, within = 0.01 } }
+attitude = { within_arcsec = 30 }
+within_s = 20
+link = "can"
+[[step]]
+sample = { telemetry = "precise_attitude", every_s = 0.2, for_s = 1, file = "slew.csv", at_least = 0.9 }
+[[step]]
+send = "1F 7F 80 1F FF"
+answer = "1F 7F .. .. 1F FF"
+[[step]]
+wait_s = 0.5
+"""
+
+
+def test_a_full_script_is_read_as_it_stands(load):
+    script = load(FULL)
+    assert (script.title, script.timeout_s, script.retries, script.keep_going, script.link) == (
+        "All parts", 0.5, 1, True, "both",
+    )  # fmt: skip
+    assert (script.emulator.profile, script.emulator.settings, script.emulator.seed) == (
+        "demo", ("truth.ra_deg=83.8",), 3,
+    )  # fmt: skip
+    assert attitude_error(script.truth.attitude, from_radec_roll(83.8, -1.2, 30.0)).total_arcsec == 0.0
+    read, clock, attitude, sample, send, wait = script.steps
+    assert isinstance(read.action, Read)
+    assert read.action.row.id == 128
+    assert read.capture == {"before": "runtime_s"}
+    assert isinstance(clock.action, Command)
+    assert clock.action.values["seconds"] == Variable("now_s")
+    assert clock.name == "set the clock"
+    assert (attitude.link, attitude.within_s, attitude.attitude.cross_arcsec) == ("can", 20.0, 30.0)
+    assert isinstance(sample.action, Sample)
+    assert (sample.action.file, sample.action.at_least, sample.every_s) == ("slew.csv", 0.9, 0.2)
+    assert isinstance(send.action, Send)
+    assert send.link == "serial"
+    assert wait.name == "wait 0.5 s"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[[step]]\nread = 'quaternoin'", ["step 1", "quaternoin", "did you mean 'quaternion'"]),
+        ("[[step]]\ncommand = 'set_mod'\nwith = { mode = 'standby' }", ["step 1", "set_mod", "'set_mode'"]),
+        ("[[step]]\nread = 'reset'", ["it is a telecommand: use command"]),
+        ("[[step]]\ncommand = 'identification'", ["it is telemetry: use read"]),
+        (
+            "[[step]]\nwait_s = 1\n[[step]]\nread = 'rates'\nexpect = { rat_x = 1 }",
+            ["step 2", "rat_x", "'rate_x'"],
+        ),
+        ("[[step]]\ncommand = 'set_mode'\nwith = { mod = 'standby' }", ["'mod'", "did you mean 'mode'"]),
+        ("[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }", ["tracing", "tracking"]),
+        ("[[step]]\ncommand = 'set_mode'", ["set_mode.mode", "no value"]),
+        ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["unknown key 'expct'", "'expect'"]),
+        ("[[step]]\nreed = 'rates'", ["exactly one action", "'reed'", "'read'"]),
+        ("[[step]]\nread = 'rates'\nwait_s = 1", ["has read and wait_s"]),
+        ("[[step]]\nname = 'x'", ["has none"]),
+        ("title = 'empty'", ["no step"]),
+        ("stepp = 1\n[[step]]\nwait_s = 1", ["unknown key 'stepp'", "'step'"]),
+        ("[step]\nwait_s = 1", ["[[step]]"]),
+        ("[[step]]\nwait_s = -1", ["at least 0"]),
+        ("[[step]]\nwait_s = 'long'", ["'wait_s' must be a number"]),
+        ("[[step]]\nset_parameter = 'exposur'\nvalue = 1", ["exposur", "'exposure'"]),
+        ("[[step]]\nset_parameter = 'exposure'\nvalue = 1e9", ["exposure", "outside"]),
+        ("[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'trackin' }", ["trackin", "'tracking'"]),
+        ("[[step]]\nread = 'precise_attitude'\nexpect = { valid = 1 }", ["'valid' is true or false"]),
+        ("[[step]]\nread = 'rates'\nexpect = { rate_x = 'fast' }", ["'rate_x' is a number"]),
+        ("[[step]]\nread = 'rates'\nexpect = { rate_x = { vale = 1 } }", ["unknown key 'vale'", "'value'"]),
+        ("[[step]]\nread = 'rates'\nexpect = { rate_x = {} }", ["says nothing"]),
+        ("[[step]]\nread = 'rates'\nexpect = { rate_x = { within = 1 } }", ["need 'value'"]),
+        ("[[step]]\nread = 'rates'\nexpect = { rate_x = '$befor' }", ["nothing was captured as '$befor'"]),
+        ("[[step]]\nwait_s = 1\nexpect = { rate_x = 1 }", ["needs a step that reads telemetry"]),
+        ("[[step]]\nread = 'rates'\nattitude = { within_arcsec = 3 }", ["row with a quaternion"]),
+        ("[[step]]\nread = 'quaternion'\nattitude = { within_arcsec = 3 }", ["nothing to compare with"]),
+        ("[truth]\nra_deg = 1\n[[step]]\nwait_s = 1", ["truth", "'dec_deg'", "missing"]),
+        ("[truth]\nra_deg = 1\ndec_deg = 91\nroll_deg = 0\n[[step]]\nwait_s = 1", ["-90 and 90"]),
+        ("[truth]\nquaternion_xyzw = [1, 1, 1, 1]\n[[step]]\nwait_s = 1", ["length is 2"]),
+        ("[[step]]\nread = 'rates'\nrefused = 'invalid_idd'", ["invalid_idd", "'invalid_id'"]),
+        ("[[step]]\ndownload_image = '../x.png'", ["plain file name"]),
+        ("[[step]]\ndownload_image = 'x.png'\nsize = 'size_100'", ["size_100", "size_1024"]),
+        ("[[step]]\nsend = 'zz'", ["'send'"]),
+        ("[[step]]\nsend = ['1F', '123#00']", ["not both"]),
+        ("[[step]]\nsend = '123#001'", ["not a CAN frame"]),
+        ("[[step]]\nread = 'rates'\nlink = 'i2c'", ["i2c", "can"]),
+        ("[[step]]\nrestart = 'gently'", ["gently", "kill"]),
+        ("[[step]]\nsample = 'rates'\nevery_s = 1\nfor_s = 1\nat_least = 2", ["from 0 to 1"]),
+        ("[[step]\n", ["not valid TOML"]),
+    ],
+)
+def test_a_mistake_is_answered_with_file_step_name_and_near_matches(load, text, words):
+    message = refusal(load, text)
+    for word in words:
+        assert word in message
+
+
+def test_a_captured_value_may_be_used_by_later_steps_only(load):
+    script = load(
+        "[[step]]\nread = 'boot_status'\ncapture = { boots = 'boot_count' }\n"
+        "[[step]]\nread = 'boot_status'\nexpect = { boot_count = { value = '$boots', plus = 1 } }"
+    )
+    assert script.steps[1].expect[0].equals == Variable("boots")
+
+
+def test_values_that_a_honest_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):
+    script = load("[[step]]\ncommand = 'set_mode'\nwith = { mode = 77 }\nrefused = 'invalid_parameter'")
+    assert script.steps[0].action.refused == "invalid_parameter"
+
+
+def test_a_missing_file_is_refused_with_near_names(tmp_path):
+    with pytest.raises(ScriptError, match="first_light"):
+        find_script(Path("first_lite"))
+    with pytest.raises(ScriptError, match="cannot be read"):
+        load_script(tmp_path / "none.toml", ICD)
+
+
+@pytest.mark.parametrize("path", sorted(SCRIPT_FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_scripts_that_come_along_are_valid(path):
+    script = load_script(path, ICD)
+    assert script.steps
+    assert script.doc
