@@ -1,0 +1,93 @@
+"""What a device gives to its object dictionary and takes from it, as an interface and as a stand-in without a device."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.codec import Row
+from protocol.icd import InterfaceDefinition
+from protocol.messages import ErrorCode
+from protocol.values import LengthError, MessageError, Value
+
+STATUS_ABORTS = {
+    ErrorCode.INVALID_ID: AbortCode.NO_OBJECT,
+    ErrorCode.INVALID_LENGTH: AbortCode.LENGTH,
+    ErrorCode.INVALID_PARAMETER: AbortCode.VALUE_RANGE,
+    ErrorCode.NOT_IMPLEMENTED: AbortCode.UNSUPPORTED_ACCESS,
+    ErrorCode.BUSY: AbortCode.DEVICE_STATE,
+    ErrorCode.SEQUENCE: AbortCode.DEVICE_STATE,
+}
+
+
+class Application(Protocol):
+    """The device behind an object dictionary; each method may refuse by `SdoAbortError`."""
+
+    def telemetry(self, row: Row) -> bytes:
+        """Return the present bytes of a telemetry row."""
+
+    def telecommand(self, row: Row, payload: bytes) -> None:
+        """Execute a telecommand whose payload has been checked against its row."""
+
+    def parameter(self, name: str) -> Value:
+        """Return a parameter's value in its unit."""
+
+    def set_parameter(self, name: str, value: Value) -> None:
+        """Set a parameter; the value is within the limits of the interface definition."""
+
+    def domain(self, name: str) -> bytes:
+        """Return bulk data (an image)."""
+
+
+def check_status(status: int, what: str) -> None:
+    """Turn a published error code into an `SdoAbortError`; 0 passes."""
+    if status != ErrorCode.OK:
+        code = ErrorCode(status)
+        raise SdoAbortError(STATUS_ABORTS.get(code, AbortCode.GENERAL), f"{what}: {code.name.lower()}")
+
+
+def abort_of(error: MessageError) -> SdoAbortError:
+    """Return the refusal that a value against the interface definition gets."""
+    return SdoAbortError(
+        AbortCode.LENGTH if isinstance(error, LengthError) else AbortCode.VALUE_RANGE, str(error)
+    )
+
+
+class StandInApplication:
+    """An application without a device: telemetry as it was set, parameters held, telecommands noted.
+
+    Attributes
+    ----------
+    rows
+        Values of telemetry rows by row name; the row's defaults where none are given.
+    commands
+        Telecommands executed: row name and values.
+    """
+
+    def __init__(self, icd: InterfaceDefinition) -> None:
+        self._parameters: dict[str, Value] = {name: item.default for name, item in icd.parameters.items()}
+        self.rows: dict[str, dict[str, Value]] = {}
+        self.domains: dict[str, bytes] = {}
+        self.commands: list[tuple[str, dict[str, Value]]] = []
+
+    def telemetry(self, row: Row) -> bytes:
+        """Encode the values that were set."""
+        return row.encode(self.rows.get(row.name, {}))
+
+    def telecommand(self, row: Row, payload: bytes) -> None:
+        """Note the telecommand."""
+        self.commands.append((row.name, dict(row.decode(payload))))
+
+    def parameter(self, name: str) -> Value:
+        """Return the held value."""
+        return self._parameters[name]
+
+    def set_parameter(self, name: str, value: Value) -> None:
+        """Hold the value."""
+        self._parameters[name] = value
+
+    def domain(self, name: str) -> bytes:
+        """Return the data that was set."""
+        if name not in self.domains:
+            raise SdoAbortError(AbortCode.NO_DATA, name)
+        return self.domains[name]

@@ -1,0 +1,266 @@
+"""The objects of the communication profile (1000h to 1FFFh) that the slave serves, as the library's classes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
+
+from protocol.canopen.cob import BIT_30, EMERGENCY, INVALID, SDO_RECEIVE, SDO_TRANSMIT, SYNC, TIME
+from protocol.canopen.pdo_mapping import LARGEST_MAPPING
+
+U8: Final = datatypes.UNSIGNED8
+U16: Final = datatypes.UNSIGNED16
+U32: Final = datatypes.UNSIGNED32
+TEXT: Final = datatypes.VISIBLE_STRING
+DOMAIN: Final = datatypes.DOMAIN
+
+HISTORY_LENGTH: Final = 8
+CONSUMERS: Final = 4
+HEARTBEAT_MS: Final = 1000
+RPDO_IDENTIFIERS: Final = (0x200, 0x300, 0x400, 0x500)
+TPDO_IDENTIFIERS: Final = (0x180, 0x280, 0x380, 0x480)
+EVENT_DRIVEN: Final = 255
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who the node is: 1000h, 1008h to 100Ah and 1018h."""
+
+    device_type: int = 0
+    device_name: str = "star sensor"
+    hardware_version: str = "1"
+    software_version: str = "1"
+    vendor_name: str = ""
+    vendor_id: int = 0
+    product_code: int = 0
+    revision: int = 0
+    serial_number: int = 0
+    bit_rates: tuple[int, ...] = (1_000_000,)
+
+
+@dataclass(frozen=True)
+class PdoDefault:
+    """A PDO as it is before anybody configures it.
+
+    Attributes
+    ----------
+    enabled
+        Whether it exists; its COB-ID is then the predefined one of the first four PDOs.
+    transmission_type
+        0 to 240 synchronous, 254 or 255 by event.
+    inhibit, event_ms
+        Inhibit time in 100 µs, event timer in ms.
+    mapping
+        Mapping entries: index, sub-index, bits.
+    """
+
+    name: str
+    enabled: bool = False
+    transmission_type: int = EVENT_DRIVEN
+    inhibit: int = 0
+    event_ms: int = 0
+    mapping: tuple[int, ...] = ()
+
+
+def variable(
+    name: str,
+    index: int,
+    subindex: int,
+    data_type: int,
+    access: str,
+    default: float | str | None = None,
+    *,
+    relative: bool = False,
+    mappable: bool = False,
+    limits: tuple[float, float] | None = None,
+) -> ODVariable:
+    """Make a variable of the library's object dictionary; `limits` are raw values."""
+    item = ODVariable(name, index, subindex)
+    item.data_type = data_type
+    item.access_type = access
+    item.default = default  # type: ignore[assignment]
+    item.relative = relative
+    item.pdo_mappable = mappable
+    if limits is not None:
+        set_limits(item, *limits)
+    return item
+
+
+def set_limits(item: ODVariable, low: float, high: float) -> None:
+    """Set the least and greatest raw value (the library's annotation knows integers only)."""
+    item.min, item.max = low, high  # type: ignore[assignment]
+
+
+def add_record(
+    od: ObjectDictionary,
+    name: str,
+    members: Sequence[ODVariable],
+    *,
+    array: bool = False,
+    count: tuple[str, int] | None = None,
+) -> None:
+    """Add a record or array; sub-index 0 tells the highest sub-index, or is a writable `count` (name, default)."""
+    index = members[0].index
+    group = ODArray(name, index) if array else ODRecord(name, index)
+    if count is None:
+        highest = max(member.subindex for member in members)
+        group.add_member(variable("Highest sub-index supported", index, 0, U8, "const", highest))
+    else:
+        group.add_member(variable(count[0], index, 0, U8, "rw", count[1]))
+    for member in members:
+        group.add_member(member)
+    od.add_object(group)
+
+
+def add_communication(
+    od: ObjectDictionary, identity: Identity, rpdos: Sequence[PdoDefault], tpdos: Sequence[PdoDefault]
+) -> None:
+    """Add the whole communication profile.
+
+    Parameters
+    ----------
+    od
+        Takes the objects.
+    identity
+        Who the node is.
+    rpdos, tpdos
+        The PDOs, the first of each with number 1.
+    """
+    information = od.device_information
+    information.vendor_name = identity.vendor_name
+    information.vendor_number = identity.vendor_id
+    information.product_name = identity.device_name
+    information.product_number = identity.product_code
+    information.revision_number = identity.revision
+    information.order_code = ""
+    information.simple_boot_up_master = False
+    information.simple_boot_up_slave = True
+    information.granularity = 8  # type: ignore[assignment]
+    information.dynamic_channels_supported = False
+    information.group_messaging = False
+    information.nr_of_RXPDO = len(rpdos)  # type: ignore[assignment]
+    information.nr_of_TXPDO = len(tpdos)
+    information.LSS_supported = True
+    information.allowed_baudrates = set(identity.bit_rates)
+    _add_general(od, identity)
+    _add_messages(od)
+    _add_services(od, identity)
+    for number, default in enumerate(rpdos):
+        _add_rpdo(od, number, default)
+    for number, default in enumerate(tpdos):
+        _add_tpdo(od, number, default)
+
+
+def _add_general(od: ObjectDictionary, identity: Identity) -> None:
+    for item in (
+        variable("Device type", 0x1000, 0, U32, "ro", identity.device_type),
+        variable("Error register", 0x1001, 0, U8, "ro", 0, mappable=True),
+        variable("Manufacturer device name", 0x1008, 0, TEXT, "const", identity.device_name),
+        variable("Manufacturer hardware version", 0x1009, 0, TEXT, "const", identity.hardware_version),
+        variable("Manufacturer software version", 0x100A, 0, TEXT, "const", identity.software_version),
+    ):
+        od.add_object(item)
+    errors = [
+        variable(f"Standard error field {number}", 0x1003, number, U32, "ro", 0)
+        for number in range(1, HISTORY_LENGTH + 1)
+    ]
+    add_record(od, "Pre-defined error field", errors, array=True, count=("Number of errors", 0))
+    for index, name, verb in (
+        (0x1010, "Store parameters", "Store"),
+        (0x1011, "Restore default parameters", "Restore"),
+    ):
+        groups = [
+            variable(f"{verb} {group} parameters", index, subindex, U32, "rw", 1)
+            for subindex, group in enumerate(("all", "communication", "application"), 1)
+        ]
+        add_record(od, name, groups, array=True)
+
+
+def _add_messages(od: ObjectDictionary) -> None:
+    for item in (
+        variable("COB-ID SYNC message", 0x1005, 0, U32, "rw", SYNC),
+        variable("Communication cycle period", 0x1006, 0, U32, "rw", 0),
+        variable("Guard time", 0x100C, 0, U16, "rw", 0),
+        variable("Life time factor", 0x100D, 0, U8, "rw", 0),
+        variable("COB-ID time stamp message", 0x1012, 0, U32, "rw", INVALID | TIME),
+        variable("High resolution time stamp", 0x1013, 0, U32, "rw", 0, mappable=True),
+        variable("COB-ID emergency message", 0x1014, 0, U32, "rw", EMERGENCY, relative=True),
+        variable("Inhibit time emergency", 0x1015, 0, U16, "rw", 0),
+        variable("Producer heartbeat time", 0x1017, 0, U16, "rw", HEARTBEAT_MS),
+        variable("Synchronous counter overflow value", 0x1019, 0, U8, "rw", 0),
+    ):
+        od.add_object(item)
+    consumers = [
+        variable(f"Consumer heartbeat time {number}", 0x1016, number, U32, "rw", 0)
+        for number in range(1, CONSUMERS + 1)
+    ]
+    add_record(od, "Consumer heartbeat time", consumers, array=True)
+    behaviour = variable("Communication error", 0x1029, 1, U8, "rw", 0, limits=(0, 2))
+    add_record(od, "Error behaviour", [behaviour], array=True)
+
+
+def _add_services(od: ObjectDictionary, identity: Identity) -> None:
+    numbers = (identity.vendor_id, identity.product_code, identity.revision, identity.serial_number)
+    names = ("Vendor-ID", "Product code", "Revision number", "Serial number")
+    members = [
+        variable(name, 0x1018, subindex, U32, "ro", number)
+        for subindex, (name, number) in enumerate(zip(names, numbers, strict=True), 1)
+    ]
+    add_record(od, "Identity object", members)
+    od.add_object(variable("Store EDS", 0x1021, 0, DOMAIN, "ro"))
+    od.add_object(variable("Store format", 0x1022, 0, U8, "ro", 0))
+    add_record(
+        od,
+        "SDO server parameter",
+        [
+            variable("COB-ID client to server (receive)", 0x1200, 1, U32, "ro", SDO_RECEIVE, relative=True),
+            variable("COB-ID server to client (transmit)", 0x1200, 2, U32, "ro", SDO_TRANSMIT, relative=True),
+        ],
+    )
+
+
+def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
+    index = 0x1400 + number
+    predefined = number < len(RPDO_IDENTIFIERS)
+    cob_id = (RPDO_IDENTIFIERS[number] if predefined else 0) | (0 if default.enabled else INVALID)
+    add_record(
+        od,
+        f"RPDO {number + 1} communication parameter: {default.name}",
+        [
+            variable("COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=predefined),
+            variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
+            variable("Event timer", index, 5, U16, "rw", default.event_ms),
+        ],
+    )
+    _add_mapping(od, 0x1600 + number, f"RPDO {number + 1}", default)
+
+
+def _add_tpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
+    index = 0x1800 + number
+    predefined = number < len(TPDO_IDENTIFIERS)
+    cob_id = BIT_30 | (TPDO_IDENTIFIERS[number] if predefined else 0) | (0 if default.enabled else INVALID)
+    add_record(
+        od,
+        f"TPDO {number + 1} communication parameter: {default.name}",
+        [
+            variable("COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=predefined),
+            variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
+            variable("Inhibit time", index, 3, U16, "rw", default.inhibit),
+            variable("Event timer", index, 5, U16, "rw", default.event_ms),
+            variable("SYNC start value", index, 6, U8, "rw", 0),
+        ],
+    )
+    _add_mapping(od, 0x1A00 + number, f"TPDO {number + 1}", default)
+
+
+def _add_mapping(od: ObjectDictionary, index: int, name: str, default: PdoDefault) -> None:
+    slots = default.mapping + (0,) * (LARGEST_MAPPING - len(default.mapping))
+    members = [
+        variable(f"Mapped object {subindex}", index, subindex, U32, "rw", value)
+        for subindex, value in enumerate(slots, 1)
+    ]
+    count = ("Number of mapped objects", len(default.mapping))
+    add_record(od, f"{name} mapping parameter: {default.name}", members, count=count)

@@ -1,0 +1,386 @@
+"""Builds a node's object dictionary: the communication profile, and the interface definition as the layout places it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.application import Application, StandInApplication, abort_of
+from protocol.canopen.communication import (
+    Identity,
+    PdoDefault,
+    add_communication,
+    add_record,
+    set_limits,
+    variable,
+)
+from protocol.canopen.dictionary import Dictionary, decode, encode, type_size
+from protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, load_layout
+from protocol.codec import Field, Row, Slot
+from protocol.icd import InterfaceDefinition, load_icd
+from protocol.values import IcdError, MessageError, Parameter, Value, to_f32
+
+DATA_TYPES: Final[dict[str, int]] = {
+    "u8": datatypes.UNSIGNED8,
+    "i8": datatypes.INTEGER8,
+    "u16": datatypes.UNSIGNED16,
+    "i16": datatypes.INTEGER16,
+    "u24": datatypes.UNSIGNED24,
+    "i24": datatypes.INTEGER24,
+    "u32": datatypes.UNSIGNED32,
+    "i32": datatypes.INTEGER32,
+    "u48": datatypes.UNSIGNED48,
+    "u64": datatypes.UNSIGNED64,
+    "i64": datatypes.INTEGER64,
+    "f32": datatypes.REAL32,
+    "f64": datatypes.REAL64,
+    "bool": datatypes.UNSIGNED8,
+    "enum8": datatypes.UNSIGNED8,
+    "bytes": datatypes.OCTET_STRING,
+}
+"""Types of the interface definition → CANopen. A switch is a byte, since a BOOLEAN maps as one bit into a PDO."""
+
+Key = tuple[int, int]
+
+
+class DeviceDictionary(Dictionary):
+    """Object dictionary of a device, made from its interface definition.
+
+    Parameters
+    ----------
+    icd
+        The interface definition.
+    layout
+        Where its rows, fields and parameters stand.
+    identity
+        Who the node is; by default what the layout says.
+
+    Attributes
+    ----------
+    sources
+        Telemetry row → keys of the entries that show it.
+    """
+
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        layout: CanopenModel,
+        identity: Identity | None = None,
+    ) -> None:
+        self.icd = icd
+        self.layout = layout
+        self.application: Application = StandInApplication(icd)
+        self.sources: dict[str, set[Key]] = {}
+        self._readers: dict[Key, Callable[[], bytes]] = {}
+        self._writers: dict[Key, Callable[[bytes], None]] = {}
+        self._sizes: dict[Key, int] = {}
+        self._names: dict[str, Key] = {}
+        self._cache: dict[str, bytes] = {}
+        self._cached_at = -1
+        objects = ObjectDictionary()  # type: ignore[no-untyped-call]
+        for placed in layout.object:
+            self._place(objects, placed)
+        rpdos = [self._pdo_default(objects, model) for model in layout.rpdo]
+        tpdos = [self._pdo_default(objects, model) for model in layout.tpdo]
+        self.identity = identity or identity_of(layout)
+        add_communication(objects, self.identity, rpdos, tpdos)
+        super().__init__(objects)
+        for key, reader in self._readers.items():
+            self.entries[key].reader = reader
+        for key, writer in self._writers.items():
+            self.entries[key].writer = writer
+        for key, size in self._sizes.items():
+            self.entries[key].maximum_size = size
+
+    def row_bytes(self, row: Row) -> bytes:
+        """Return a telemetry row, asked of the application once in a sampling instant."""
+        if self._cached_at != self.instant:
+            self._cache.clear()
+            self._cached_at = self.instant
+        data = self._cache.get(row.name)
+        if data is None:
+            data = self._cache[row.name] = self.application.telemetry(row)
+        return data
+
+    def key_of(self, name: str) -> Key:
+        """Return the key of "INDEX.NAME" or "INDEX" (hexadecimal); `IcdError` if there is none."""
+        key = self._names.get(name.lower())
+        if key is None:
+            raise IcdError(f"canopen.toml: no object {name!r} to map")
+        return key
+
+    def _place(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        if placed.index in objects.indices:
+            raise IcdError(f"canopen.toml: index {placed.index:04X}h is used twice")
+        if placed.requests:
+            self._place_requests(objects, placed)
+        elif placed.telemetry is not None:
+            self._place_telemetry(objects, placed, self.icd.telemetry[placed.telemetry])
+        elif placed.parameters:
+            self._place_parameters(objects, placed)
+        elif placed.domain is not None:
+            self._place_domain(objects, placed, placed.domain)
+        elif placed.packed:
+            self._place_packed(objects, placed)
+        else:
+            self._place_value(objects, placed)
+
+    def _place_requests(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        members: list[ODVariable] = []
+        for row in self.icd.rows:
+            key = (placed.index, row.id)
+            if row.kind == "telemetry":
+                member = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
+                self._show(key, row, row.name, partial(self.row_bytes, row))
+            else:
+                member = self._telecommand_variable(row.name, key, row)
+            member.description = row.doc
+            members.append(member)
+        add_record(objects, placed.name, members)
+
+    def _place_telemetry(self, objects: ObjectDictionary, placed: PlacedObject, row: Row) -> None:
+        members: list[ODVariable] = []
+        for slot, fields in _slots(row):
+            key = (placed.index, len(members) + 1)
+            name = " ".join(field.name for field in fields)
+            member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
+            _describe(member, fields)
+            for field in fields:
+                self._show(key, row, field.name, partial(self._row_part, row, slot))
+            members.append(member)
+        add_record(objects, placed.name, members)
+
+    def _place_value(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        key = (placed.index, 0)
+        if placed.telecommand is not None:
+            member = self._telecommand_variable(placed.name, key, self.icd.telecommands[placed.telecommand])
+        if placed.value is not None:
+            row, slot, fields = self._slot_of(placed.value)
+            if placed.telecommand is None:
+                member = variable(placed.name, *key, DATA_TYPES[slot.type], "ro", mappable=True)
+                _describe(member, fields)
+            elif member.data_type != DATA_TYPES[slot.type]:
+                raise IcdError(
+                    f"canopen.toml: {placed.index:04X}h: {placed.value} and {placed.telecommand} differ in type"
+                )
+            else:
+                member.access_type = "rw"
+            self._show(key, row, "", partial(self._row_part, row, slot))
+        objects.add_object(member)
+        self._names[f"{placed.index:04x}"] = key
+
+    def _place_parameters(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        members: list[ODVariable] = []
+        for number, parameter in sorted(self.icd.parameters_by_id.items()):
+            key = (placed.index, number)
+            default = parameter.to_number(parameter.default)
+            if parameter.type not in {"f32", "f64"}:
+                default = int(default)
+            data_type = DATA_TYPES[parameter.type]
+            member = variable(parameter.name, *key, data_type, "rw", default, mappable=True)
+            low, high = parameter.minimum, parameter.maximum
+            if parameter.type == "f32":
+                low, high = min(low, to_f32(low)), max(high, to_f32(high))
+            set_limits(member, low, high)
+            member.unit = parameter.unit
+            member.description = parameter.doc
+            if parameter.enum is not None:
+                member.value_descriptions = dict(parameter.enum.names)
+            self._names[f"{placed.index:04x}.{parameter.name}"] = key
+            self._readers[key] = partial(self._read_parameter, parameter, data_type)
+            self._writers[key] = partial(self._write_parameter, parameter, data_type)
+            members.append(member)
+        add_record(objects, placed.name, members)
+
+    def _read_parameter(self, parameter: Parameter, data_type: int) -> bytes:
+        return encode(data_type, parameter.to_number(self.application.parameter(parameter.name)))
+
+    def _write_parameter(self, parameter: Parameter, data_type: int, data: bytes) -> None:
+        try:
+            value = parameter.check(decode(data_type, data))
+        except MessageError as error:
+            raise abort_of(error) from None
+        self.application.set_parameter(parameter.name, value)
+
+    def _place_domain(self, objects: ObjectDictionary, placed: PlacedObject, name: str) -> None:
+        key = (placed.index, 0)
+        objects.add_object(variable(placed.name, *key, datatypes.DOMAIN, "ro"))
+        self._readers[key] = partial(self._read_domain, name)
+
+    def _read_domain(self, name: str) -> bytes:
+        return self.application.domain(name)
+
+    def _place_packed(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        members: list[ODVariable] = []
+        for model in placed.packed:
+            key = (placed.index, len(members) + 1)
+            row, slot, fields = self._slot_of(model.source)
+            name = model.name or model.source.partition(".")[2]
+            member = variable(name, *key, DATA_TYPES[model.type], "ro", mappable=True)
+            _describe(member, fields)
+            member.min = member.max = None
+            member.factor = model.scale
+            self._show(key, row, name, _Packer(self, row, slot, fields, model))
+            members.append(member)
+        add_record(objects, placed.name, members)
+
+    def _telecommand_variable(self, name: str, key: Key, row: Row) -> ODVariable:
+        """Make what a client writes to execute a telecommand: its one value, all its bytes, or 1 if it has none."""
+        if row.size == 0:
+            member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
+            self._writers[key] = partial(self._execute_bare, row)
+        elif len(row.slots) == 1 and row.slots[0].type != "bytes":
+            slot, fields = _slots(row)[0]
+            member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
+            _describe(member, fields)
+            self._writers[key] = partial(self._execute, row)
+        else:
+            member = variable(name, *key, datatypes.OCTET_STRING, "wo")
+            self._sizes[key] = row.size
+            self._writers[key] = partial(self._execute, row)
+        member.description = row.doc
+        return member
+
+    def _execute(self, row: Row, payload: bytes) -> None:
+        if len(payload) < row.size:
+            raise SdoAbortError(AbortCode.LENGTH_LOW, f"{row.name}: {len(payload)} bytes, {row.size} needed")
+        try:
+            row.decode(payload)
+        except MessageError as error:
+            raise abort_of(error) from None
+        self.application.telecommand(row, payload)
+
+    def _execute_bare(self, row: Row, _data: bytes) -> None:
+        self._execute(row, b"")
+
+    def _row_part(self, row: Row, slot: Slot) -> bytes:
+        return self.row_bytes(row)[_span(slot)]
+
+    def _show(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
+        self._readers[key] = reader
+        self.sources.setdefault(row.name, set()).add(key)
+        self._names[f"{key[0]:04x}.{name}"] = key
+
+    def _slot_of(self, reference: str) -> tuple[Row, Slot, list[Field]]:
+        row_name, _, field_name = reference.partition(".")
+        row = self.icd.telemetry[row_name]
+        if field_name not in row.named_fields:
+            raise IcdError(f"canopen.toml: telemetry {row_name} has no field {field_name!r}")
+        slot = row.named_fields[field_name].slot
+        return row, slot, [field for field in row.named_fields.values() if field.slot.index == slot.index]
+
+    def _pdo_default(self, objects: ObjectDictionary, model: PdoModel) -> PdoDefault:
+        mapping = []
+        for name in model.objects:
+            index, subindex = self.key_of(name)
+            item = objects[index]
+            member = item if isinstance(item, ODVariable) else item[subindex]
+            mapping.append(index << 16 | subindex << 8 | (type_size(member.data_type) or 0) * 8)
+        return PdoDefault(
+            name=model.name,
+            enabled=model.enabled,
+            transmission_type=model.transmission_type,
+            inhibit=round(model.inhibit_ms * 10),
+            event_ms=model.event_ms,
+            mapping=tuple(mapping),
+        )
+
+
+class _Packer:
+    """Reads a field of a telemetry row in a narrower integer type."""
+
+    def __init__(
+        self, dictionary: DeviceDictionary, row: Row, slot: Slot, fields: list[Field], model: PackedField
+    ) -> None:
+        self._dictionary = dictionary
+        self._row = row
+        self._slot = slot
+        self._field = fields[0] if fields[0].width == 0 else None
+        self._model = model
+        data_type = DATA_TYPES[model.type]
+        self._data_type = data_type
+        bits = (type_size(data_type) or 0) * 8
+        self._bits = bits
+        signed = model.type.startswith("i")
+        self._limits = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+
+    def __call__(self) -> bytes:
+        data = self._dictionary.row_bytes(self._row)
+        if self._field is None:
+            raw = int.from_bytes(data[_span(self._slot)], "little")
+        else:
+            value = self._row.decode(data)[self._field.name]
+            number = value if isinstance(value, int | float) else self._raw(value)
+            raw = round(number / self._model.scale)
+        if self._model.wrap:
+            raw &= (1 << self._bits) - 1
+        low, high = self._limits
+        return encode(self._data_type, min(max(raw, low), high))
+
+    def _raw(self, value: Value) -> int:
+        enum = None if self._field is None else self._field.enum
+        if enum is None or not isinstance(value, str):
+            raise SdoAbortError(AbortCode.GENERAL, f"{self._model.source}: {value!r} is no number")
+        return enum.values[value]
+
+
+def identity_of(layout: CanopenModel) -> Identity:
+    """Return the identity that the layout gives."""
+    return Identity(
+        device_type=layout.device_type,
+        device_name=layout.device_name,
+        vendor_name=layout.vendor_name,
+        vendor_id=layout.vendor_id,
+        product_code=layout.product_code,
+        revision=layout.revision,
+        bit_rates=tuple(layout.bit_rates),
+    )
+
+
+def build_dictionary(
+    icd: InterfaceDefinition | None = None,
+    layout: CanopenModel | None = None,
+    *,
+    serial_number: int = 1,
+    software_version: str = "1",
+) -> DeviceDictionary:
+    """Build the object dictionary of the device from the interface definition that travels with the package."""
+    layout = load_layout() if layout is None else layout
+    identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
+    return DeviceDictionary(load_icd() if icd is None else icd, layout, identity)
+
+
+def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
+    """Return the slots of a row that carry values, each with its fields."""
+    slots = []
+    for slot in row.slots:
+        fields = [field for field in row.named_fields.values() if field.slot.index == slot.index]
+        if fields:
+            slots.append((slot, fields))
+    return slots
+
+
+def _span(slot: Slot) -> slice:
+    return slice(slot.offset, slot.offset + slot.size)
+
+
+def _describe(member: ODVariable, fields: list[Field]) -> None:
+    """Give a variable the unit, scale, limits, names and text of its field; a bit field gets the names of its bits."""
+    first = fields[0]
+    if first.width:
+        for field in fields:
+            member.add_bit_definition(field.name, list(range(field.shift, field.shift + field.width)))
+        member.description = "; ".join(f"{field.name}: {field.doc}" for field in fields)
+        return
+    member.unit = first.unit
+    member.factor = first.scale
+    member.description = first.doc
+    if first.enum is not None:
+        member.value_descriptions = dict(first.enum.names)
+    elif first.minimum is not None or first.maximum is not None:
+        set_limits(member, *(first.physical_limits if first.kind == "float" else first.raw_limits))

@@ -1,0 +1,239 @@
+"""The object dictionary of a running node: values, access checks and handlers over the library's classes.
+
+`canopen.ObjectDictionary` describes the objects (and makes the EDS); a `Dictionary` adds to each of its variables an
+`Entry` with the present value as bytes on the wire, and the functions that read and write it in the device.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+
+Value = int | float | bool | str | bytes
+
+MAXIMUM_STRING: Final = 256
+"""Longest string or octet string, in bytes, that a write may bring unless the entry says otherwise."""
+
+COMMUNICATION: Final = range(0x1000, 0x2000)
+"""Indices of the communication profile; all above belong to the application."""
+
+
+@dataclass(slots=True)
+class Entry:
+    """One variable of a node's object dictionary with its present value.
+
+    Attributes
+    ----------
+    variable
+        Its description in the library's object dictionary.
+    value
+        Present value as on the wire; not used while `reader` is given.
+    reader
+        Gives the present value from the device instead of `value`.
+    writer
+        Takes a value that passed the access, length and range checks; refuses by raising `SdoAbortError`. It runs before
+        `value` is changed.
+    maximum_size
+        Longest value in bytes of a type without a fixed size.
+    persistent
+        Whether store (1010h) keeps it.
+    """
+
+    variable: ODVariable
+    value: bytes = b""
+    reader: Callable[[], bytes] | None = None
+    writer: Callable[[bytes], None] | None = None
+    maximum_size: int = MAXIMUM_STRING
+    persistent: bool = False
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Index and sub-index."""
+        return self.variable.index, self.variable.subindex
+
+    @property
+    def size(self) -> int | None:
+        """Bytes on the wire, or None for strings and domains."""
+        return type_size(self.variable.data_type)
+
+    def read(self) -> bytes:
+        """Return the present value as on the wire, whatever the access type (the node's own access)."""
+        return self.value if self.reader is None else self.reader()
+
+    def number(self) -> int:
+        """Return the value of an integer entry that the node holds itself."""
+        return int.from_bytes(self.value, "little")
+
+    def set_number(self, value: int) -> None:
+        """Set the value of an unsigned entry that the node holds itself, without checks."""
+        self.value = value.to_bytes(self.size or 4, "little")
+
+
+def type_size(data_type: int | None) -> int | None:
+    """Bytes of a CANopen data type, or None where the length is free (strings, DOMAIN)."""
+    if data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
+        return 6
+    packer = ODVariable.STRUCT_TYPES.get(data_type if data_type is not None else -1)
+    return None if packer is None else packer.size
+
+
+def encode(data_type: int, value: Value) -> bytes:
+    """Pack a raw (unscaled) value; `bytes` pass as they are.
+
+    Raises
+    ------
+    SdoAbortError
+        VALUE_RANGE if the value does not fit the type.
+    """
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, str):
+        return value.encode("ascii", errors="replace")
+    size = type_size(data_type)
+    try:
+        if data_type in (datatypes.REAL32, datatypes.REAL64):
+            return struct.pack("<f" if data_type == datatypes.REAL32 else "<d", value)
+        if size is not None:
+            return int(value).to_bytes(size, "little", signed=data_type in datatypes.SIGNED_TYPES)
+    except (OverflowError, struct.error) as error:
+        raise SdoAbortError(
+            AbortCode.VALUE_RANGE, f"{value!r} does not fit type 0x{data_type:04X}: {error}"
+        ) from None
+    raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value!r} has no form in type 0x{data_type:04X}")
+
+
+def decode(data_type: int, data: bytes) -> Value:
+    """Unpack the wire form to a number, a string (VISIBLE_STRING) or bytes."""
+    if data_type == datatypes.VISIBLE_STRING:
+        return data.decode("ascii", errors="replace")
+    if data_type == datatypes.BOOLEAN:
+        return data != b"\0"
+    if data_type in (datatypes.REAL32, datatypes.REAL64):
+        return float(struct.unpack("<f" if data_type == datatypes.REAL32 else "<d", data)[0])
+    if type_size(data_type) is None:
+        return bytes(data)
+    return int.from_bytes(data, "little", signed=data_type in datatypes.SIGNED_TYPES)
+
+
+class Dictionary:
+    """Object dictionary of one node.
+
+    Parameters
+    ----------
+    od
+        The described objects; entries are made for all of its variables, with `default` as first value (defaults
+        that are relative to the node-ID are set by `load_defaults`).
+    """
+
+    def __init__(self, od: ObjectDictionary) -> None:
+        self.od = od
+        self.entries: dict[tuple[int, int], Entry] = {}
+        for item in od.values():
+            variables = (
+                [item] if isinstance(item, ODVariable) else [item[number] for number in item.subindices]
+            )
+            for variable in variables:
+                entry = Entry(variable)
+                entry.persistent = variable.writable and variable.readable
+                self.entries[entry.key] = entry
+        self.changed: set[tuple[int, int]] = set()
+        """Keys written since the node last looked."""
+        self.instant = 0
+        """Counts the sampling instants: values that a provider gave once in an instant are used all through it."""
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(self.entries.values())
+
+    def find(self, index: int, subindex: int) -> Entry:
+        """Return an entry; `SdoAbortError` NO_OBJECT or NO_SUBINDEX if there is none."""
+        entry = self.entries.get((index, subindex))
+        if entry is not None:
+            return entry
+        if index in self.od.indices:
+            raise SdoAbortError(AbortCode.NO_SUBINDEX, f"{index:04X}h:{subindex:02X}h")
+        raise SdoAbortError(AbortCode.NO_OBJECT, f"{index:04X}h")
+
+    def load_defaults(self, indices: range, node_id: int) -> None:
+        """Set the entries of a range of indices to their defaults, node-ID added where these are relative."""
+        for (index, _), entry in self.entries.items():
+            if index in indices and entry.reader is None:
+                entry.value = default_bytes(entry.variable, node_id)
+
+    def new_instant(self) -> None:
+        """Begin a new sampling instant: from here providers are asked anew, once each."""
+        self.instant += 1
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """Read as an SDO client does; `SdoAbortError` if there is no such entry or it is write-only."""
+        entry = self.find(index, subindex)
+        if not entry.variable.readable:
+            raise SdoAbortError(AbortCode.WRITE_ONLY, f"{index:04X}h:{subindex:02X}h")
+        return entry.read()
+
+    def writable(self, index: int, subindex: int) -> Entry:
+        """Return an entry that an SDO client may write; `SdoAbortError` READ_ONLY and others if not."""
+        entry = self.find(index, subindex)
+        if not entry.variable.writable:
+            raise SdoAbortError(AbortCode.READ_ONLY, f"{index:04X}h:{subindex:02X}h")
+        return entry
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Write as an SDO client does: access, length and range are checked, then the handler decides."""
+        entry = self.writable(index, subindex)
+        check_length(entry, len(data))
+        check_value(entry.variable, data)
+        if entry.writer is not None:
+            entry.writer(data)
+        entry.value = data
+        self.changed.add(entry.key)
+        self.new_instant()
+
+
+def default_bytes(variable: ODVariable, node_id: int) -> bytes:
+    """Return a variable's default as bytes; zero or empty where it has none."""
+    default = variable.default
+    if default is None:
+        return bytes(type_size(variable.data_type) or 0)
+    if variable.relative:
+        default += node_id
+    return encode(variable.data_type or 0, default)
+
+
+def check_length(entry: Entry, length: int) -> None:
+    """Refuse a length in bytes that the entry's type does not have."""
+    lowest, highest = (0, entry.maximum_size) if entry.size is None else (entry.size, entry.size)
+    if length > highest:
+        raise SdoAbortError(
+            AbortCode.LENGTH_HIGH, f"{length} bytes for {entry.variable.qualname}, at most {highest}"
+        )
+    if length < lowest:
+        raise SdoAbortError(
+            AbortCode.LENGTH_LOW, f"{length} bytes for {entry.variable.qualname}, {lowest} needed"
+        )
+
+
+def check_value(variable: ODVariable, data: bytes) -> None:
+    """Refuse a number outside the variable's limits, outside its named values, or that is no number."""
+    data_type = variable.data_type or 0
+    if type_size(data_type) is None or data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
+        return
+    if data_type == datatypes.BOOLEAN and data not in {b"\0", b"\1"}:
+        raise SdoAbortError(AbortCode.VALUE_HIGH, f"{variable.qualname} takes 0 or 1")
+    value = decode(data_type, data)
+    if not isinstance(value, int | float):
+        return
+    if math.isnan(value):
+        raise SdoAbortError(AbortCode.VALUE_RANGE, f"{variable.qualname} takes no NaN")
+    if variable.max is not None and value > variable.max:
+        raise SdoAbortError(AbortCode.VALUE_HIGH, f"{value} for {variable.qualname}, at most {variable.max}")
+    if variable.min is not None and value < variable.min:
+        raise SdoAbortError(AbortCode.VALUE_LOW, f"{value} for {variable.qualname}, at least {variable.min}")
+    if variable.value_descriptions and value not in variable.value_descriptions:
+        raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value} is no named value of {variable.qualname}")

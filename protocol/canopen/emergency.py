@@ -1,0 +1,157 @@
+"""Emergency producer: error register, error history, EMCY messages with inhibit time (CiA 301, EMCY)."""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import IntEnum, IntFlag
+from functools import partial
+from typing import Final
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.cob import ID_MASK, INVALID, check_identifier, check_replacement
+from protocol.canopen.context import Context, EventKind
+
+ERROR_REGISTER: Final = (0x1001, 0)
+HISTORY: Final = 0x1003
+COB_ID: Final = (0x1014, 0)
+INHIBIT: Final = (0x1015, 0)
+INHIBIT_UNIT_S: Final = 1e-4
+LONGEST_QUEUE: Final = 32
+"""Messages that wait for the inhibit time; the oldest falls out beyond it (its error stays in the history)."""
+
+
+class ErrorCode(IntEnum):
+    """EMCY error codes that this slave sends by itself."""
+
+    RESET = 0x0000
+    GENERIC = 0x1000
+    COMMUNICATION = 0x8100
+    CAN_OVERRUN = 0x8110
+    CAN_PASSIVE = 0x8120
+    HEARTBEAT = 0x8130
+    BUS_OFF_RECOVERED = 0x8140
+    PROTOCOL = 0x8200
+    PDO_LENGTH_LOW = 0x8210
+    PDO_LENGTH_HIGH = 0x8220
+    SYNC_LENGTH = 0x8240
+    RPDO_TIMEOUT = 0x8250
+
+
+class ErrorRegister(IntFlag):
+    """Bits of the error register 1001h."""
+
+    GENERIC = 0x01
+    CURRENT = 0x02
+    VOLTAGE = 0x04
+    TEMPERATURE = 0x08
+    COMMUNICATION = 0x10
+    PROFILE = 0x20
+    MANUFACTURER = 0x80
+
+
+class EmergencyProducer:
+    """Holds the errors that are present and tells the bus of each that comes or goes."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        dictionary = context.dictionary
+        self._register = dictionary.find(*ERROR_REGISTER)
+        self._cob_id = dictionary.find(*COB_ID)
+        self._inhibit = dictionary.find(*INHIBIT)
+        self._count = dictionary.find(HISTORY, 0)
+        self._capacity = max(subindex for index, subindex in dictionary.entries if index == HISTORY)
+        self._active: dict[tuple[int, bytes], int] = {}
+        self._history: list[int] = []
+        self._queue: deque[bytes] = deque(maxlen=LONGEST_QUEUE)
+        self._free_at = 0.0
+        self._cob_id.writer = self._check_cob_id
+        self._count.reader = lambda: bytes([len(self._history)])
+        self._count.writer = self._clear_history
+        for subindex in range(1, self._capacity + 1):
+            dictionary.find(HISTORY, subindex).reader = partial(self._recall, subindex - 1)
+        self._register.reader = lambda: bytes([self._bits()])
+
+    def reset(self, *, application: bool) -> None:
+        """Forget the queue and the communication errors; at a reset of the node all errors and the history."""
+        self._queue.clear()
+        self._free_at = 0.0
+        for error, bits in list(self._active.items()):
+            if application or bits & ErrorRegister.COMMUNICATION:
+                del self._active[error]
+        if application:
+            self._history.clear()
+
+    def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> bool:
+        """Report an error unless the same one is present already.
+
+        Parameters
+        ----------
+        code
+            Error code, 16 bits.
+        bits
+            Bits of the error register that it sets; the generic bit comes by itself.
+        data
+            Up to 5 manufacturer-specific bytes.
+        key
+            Tells apart errors of one code (a PDO number, a node-ID).
+
+        Returns
+        -------
+        bool
+            Whether it is new.
+        """
+        if (code, key) in self._active:
+            return False
+        self._active[code, key] = bits | ErrorRegister.GENERIC
+        self._history.insert(0, code | int.from_bytes(data[:2].ljust(2, b"\0"), "little") << 16)
+        del self._history[self._capacity :]
+        self._context.report(EventKind.EMERGENCY, code, f"error 0x{code:04X} data {data.hex() or '-'}")
+        self._enqueue(code, data)
+        return True
+
+    def clear_error(self, code: int, *, key: bytes = b"") -> bool:
+        """Report that an error is gone; the message has code 0 and names the code in its manufacturer bytes."""
+        if self._active.pop((code, key), None) is None:
+            return False
+        self._context.report(EventKind.EMERGENCY, 0, f"error 0x{code:04X} gone")
+        self._enqueue(ErrorCode.RESET, code.to_bytes(2, "little"))
+        return True
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When the next waiting message may be sent."""
+        return self._free_at if self._queue and self._context.communicates else None
+
+    def flush(self) -> None:
+        """Send what waits, as far as the state and the inhibit time allow."""
+        while self._queue and self._context.communicates and self._context.now >= self._free_at:
+            message = self._queue.popleft()
+            if not self._cob_id.number() & INVALID:
+                self._context.send(self._cob_id.number() & ID_MASK, message)
+                self._free_at = self._context.now + self._inhibit.number() * INHIBIT_UNIT_S
+
+    def _bits(self) -> int:
+        register = 0
+        for bits in self._active.values():
+            register |= bits
+        return register
+
+    def _enqueue(self, code: int, data: bytes) -> None:
+        self._queue.append(code.to_bytes(2, "little") + bytes([self._bits()]) + data[:5].ljust(5, b"\0"))
+        self.flush()
+
+    def _recall(self, position: int) -> bytes:
+        if position >= len(self._history):
+            raise SdoAbortError(AbortCode.NO_DATA, f"{len(self._history)} errors in the history")
+        return self._history[position].to_bytes(4, "little")
+
+    def _clear_history(self, data: bytes) -> None:
+        if data != b"\0":
+            raise SdoAbortError(AbortCode.VALUE_RANGE, "the error history takes 0 only")
+        self._history.clear()
+
+    def _check_cob_id(self, data: bytes) -> None:
+        old, new = self._cob_id.number(), int.from_bytes(data, "little")
+        check_replacement(old, new, lives_before=not old & INVALID, lives_after=not new & INVALID)
+        if not new & INVALID:
+            check_identifier(new)

@@ -1,0 +1,161 @@
+"""Error control: heartbeat producer and consumer, node guarding and life guarding (CiA 301)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.cob import ERROR_CONTROL
+from protocol.canopen.context import Context, EventKind, NmtState
+from protocol.canopen.dictionary import Entry
+from protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+
+GUARD_TIME: Final = (0x100C, 0)
+LIFE_FACTOR: Final = (0x100D, 0)
+CONSUMERS: Final = 0x1016
+PRODUCER: Final = (0x1017, 0)
+GUARDING_KEY: Final = b"guarding"
+
+
+@dataclass
+class Monitor:
+    """Watch over the heartbeat of one node; it begins with the first heartbeat."""
+
+    period_s: float
+    deadline: float | None = None
+    lost: bool = False
+
+
+class ErrorControl:
+    """Says that this node lives, and notes that others do.
+
+    Parameters
+    ----------
+    context, emergency
+        Shared by the node.
+    on_failure
+        Called when a watched node or the guarding master falls silent: the error behaviour of 1029h.
+    """
+
+    def __init__(
+        self, context: Context, emergency: EmergencyProducer, on_failure: Callable[[], None]
+    ) -> None:
+        self._context = context
+        self._emergency = emergency
+        self._on_failure = on_failure
+        dictionary = context.dictionary
+        self._guard_time = dictionary.find(*GUARD_TIME)
+        self._life_factor = dictionary.find(*LIFE_FACTOR)
+        self._producer = dictionary.find(*PRODUCER)
+        self._producer.writer = self._producer_changed
+        self._consumers = [entry for entry in dictionary if entry.key[0] == CONSUMERS and entry.key[1] > 0]
+        for entry in self._consumers:
+            entry.writer = self._checker(entry)
+        self._monitors: dict[int, Monitor] = {}
+        self._toggle = 0
+        self._next_heartbeat: float | None = None
+        self._life_deadline: float | None = None
+        self._guarding_lost = False
+
+    def configure(self) -> None:
+        """Begin anew: toggle bit at 0, heartbeats from one period on, no node heard yet."""
+        self._toggle = 0
+        self._life_deadline = None
+        self._guarding_lost = False
+        self._monitors.clear()
+        for entry in self._consumers:
+            self._watch(entry.number())
+        self._schedule(self._producer.number())
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When the next heartbeat is due or a watch runs out."""
+        times = [
+            self._next_heartbeat,
+            self._life_deadline,
+            *(watch.deadline for watch in self._monitors.values()),
+        ]
+        return min((time for time in times if time is not None), default=None)
+
+    def receive_heartbeat(self, node_id: int, data: bytes) -> None:
+        """Take an error control message of another node (heartbeat or boot-up)."""
+        if len(data) != 1:
+            return
+        monitor = self._monitors.get(node_id)
+        if monitor is None:
+            return
+        if data[0] == 0:
+            self._context.report(EventKind.NODE_BOOTED, node_id)
+        monitor.deadline = self._context.now + monitor.period_s
+        if monitor.lost:
+            monitor.lost = False
+            self._context.report(EventKind.NODE_FOUND, node_id)
+            self._emergency.clear_error(ErrorCode.HEARTBEAT, key=bytes([node_id]))
+
+    def receive_guarding(self) -> None:
+        """Answer the guarding request of the master, unless the heartbeat is in use."""
+        if self._producer.number() or self._context.state is NmtState.INITIALISING:
+            return
+        self._context.send(ERROR_CONTROL + self._context.node_id, bytes([self._toggle | self._context.state]))
+        self._toggle ^= 0x80
+        life_s = self._guard_time.number() * self._life_factor.number() * 1e-3
+        self._life_deadline = self._context.now + life_s if life_s else None
+        if self._guarding_lost:
+            self._guarding_lost = False
+            self._context.report(EventKind.GUARDING_FOUND)
+            self._emergency.clear_error(ErrorCode.HEARTBEAT, key=GUARDING_KEY)
+
+    def tick(self) -> None:
+        """Send the heartbeat that is due; note who has fallen silent."""
+        now = self._context.now
+        if self._next_heartbeat is not None and now >= self._next_heartbeat:
+            self._context.send(ERROR_CONTROL + self._context.node_id, bytes([self._context.state]))
+            self._next_heartbeat = max(self._next_heartbeat + self._producer.number() * 1e-3, now)
+        for node_id, monitor in self._monitors.items():
+            if monitor.deadline is not None and now >= monitor.deadline:
+                monitor.deadline = None
+                monitor.lost = True
+                self._context.report(EventKind.NODE_LOST, node_id)
+                self._failed(bytes([node_id]), bytes([node_id]))
+        if self._life_deadline is not None and now >= self._life_deadline:
+            self._life_deadline = None
+            self._guarding_lost = True
+            self._context.report(EventKind.GUARDING_LOST)
+            self._failed(GUARDING_KEY, b"")
+
+    def _failed(self, key: bytes, data: bytes) -> None:
+        self._emergency.raise_error(ErrorCode.HEARTBEAT, ErrorRegister.COMMUNICATION, data, key=key)
+        self._on_failure()
+
+    def _schedule(self, period_ms: int) -> None:
+        self._next_heartbeat = self._context.now + period_ms * 1e-3 if period_ms else None
+
+    def _producer_changed(self, data: bytes) -> None:
+        period_ms = int.from_bytes(data, "little")
+        self._schedule(period_ms)
+        if period_ms:
+            self._life_deadline = None
+
+    def _watch(self, value: int) -> None:
+        node_id, period_ms = value >> 16 & 0xFF, value & 0xFFFF
+        if 1 <= node_id <= 127 and period_ms:
+            self._monitors[node_id] = Monitor(period_ms * 1e-3)
+
+    def _unwatch(self, value: int) -> None:
+        node_id, period_ms = value >> 16 & 0xFF, value & 0xFFFF
+        if period_ms and self._monitors.pop(node_id, None) is not None:
+            self._emergency.clear_error(ErrorCode.HEARTBEAT, key=bytes([node_id]))
+
+    def _checker(self, entry: Entry) -> Callable[[bytes], None]:
+        def changed(data: bytes) -> None:
+            value = int.from_bytes(data, "little")
+            node_id = value >> 16 & 0xFF
+            others = [other.number() for other in self._consumers if other is not entry]
+            if value & 0xFFFF and any(other >> 16 & 0xFF == node_id and other & 0xFFFF for other in others):
+                raise SdoAbortError(AbortCode.INCOMPATIBLE, f"node {node_id} is watched by another entry")
+            self._unwatch(entry.number())
+            self._watch(value)
+
+        return changed

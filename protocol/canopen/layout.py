@@ -1,0 +1,133 @@
+"""`configs/icd/canopen.toml`: where the interface definition stands in the object dictionary, read and checked."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from protocol.icd import default_icd_path
+from protocol.values import IcdError
+
+Index = Annotated[int, Field(ge=0x2000, le=0xFFFF)]
+PackedType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u48"]
+FILE_NAME = "canopen.toml"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class PackedField(_Model):
+    """A field of a telemetry row in a narrower integer type."""
+
+    source: str = Field(alias="from")
+    """ROW.FIELD; a bit stands for the whole byte that it is in."""
+    name: str | None = None
+    """Name in the record, the field's own by default."""
+    type: PackedType
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    """Physical = raw * scale."""
+    wrap: bool = False
+    """Keep the lowest bits of a counter instead of clipping it."""
+
+
+class PlacedObject(_Model):
+    """One object of the application and what it stands for."""
+
+    index: Index
+    name: str
+    requests: bool = False
+    telemetry: str | None = None
+    value: str | None = None
+    telecommand: str | None = None
+    parameters: bool = False
+    domain: str | None = None
+    packed: list[PackedField] = []
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> PlacedObject:
+        kinds = [
+            bool(self.requests),
+            self.telemetry is not None,
+            self.value is not None or self.telecommand is not None,
+            self.parameters,
+            self.domain is not None,
+            bool(self.packed),
+        ]
+        if sum(kinds) != 1:
+            raise ValueError(
+                "needs just one of requests, telemetry, value and/or telecommand, parameters, domain, packed"
+            )
+        return self
+
+
+class PdoModel(_Model):
+    """A PDO as it is by default."""
+
+    name: str
+    enabled: bool = False
+    transmission_type: Annotated[int, Field(ge=0, le=255)] = 255
+    inhibit_ms: Annotated[float, Field(ge=0, le=6553.5)] = 0
+    event_ms: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
+    objects: list[str] = []
+
+
+class CanopenModel(_Model):
+    """The whole file, below its table `canopen`."""
+
+    device_type: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    device_name: str
+    vendor_name: str
+    vendor_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    product_code: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    revision: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    bit_rates: list[int] = Field(min_length=1)
+    object: list[PlacedObject] = Field(min_length=1)
+    tpdo: list[PdoModel] = []
+    rpdo: list[PdoModel] = []
+
+
+class _FileModel(_Model):
+    canopen: CanopenModel
+
+
+def load_layout(path: Path | str | None = None) -> CanopenModel:
+    """Read where the interface definition stands in the object dictionary.
+
+    Parameters
+    ----------
+    path
+        The file, or the folder it is in; by default the one that travels with the package, read once.
+
+    Raises
+    ------
+    IcdError
+        Names file and key.
+    """
+    if path is None:
+        return _load_default()
+    given = Path(path)
+    return _load(given / FILE_NAME if given.is_dir() else given)
+
+
+@lru_cache(maxsize=1)
+def _load_default() -> CanopenModel:
+    return _load(default_icd_path() / FILE_NAME)
+
+
+def _load(path: Path) -> CanopenModel:
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        return _FileModel.model_validate(document).canopen
+    except OSError as error:
+        raise IcdError(f"{path}: cannot read the CANopen layout: {error.strerror}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(step) for step in first["loc"])
+        raise IcdError(f"{path}: {place}: {first['msg']}") from None
+    except ValueError as error:
+        raise IcdError(f"{path}: not valid TOML: {error}") from None

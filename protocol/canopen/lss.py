@@ -1,0 +1,228 @@
+"""LSS slave: node-ID and bit rate set over the bus, identity asked for and searched (CiA 305)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final, Protocol
+
+from protocol.canopen.cob import LSS_SLAVE
+from protocol.canopen.context import UNCONFIGURED, Context, EventKind
+from protocol.errors import ProtocolError
+
+LENGTH: Final = 8
+IDENTITY: Final = 0x1018
+BIT_RATES: Final = {
+    0: 1_000_000,
+    1: 800_000,
+    2: 500_000,
+    3: 250_000,
+    4: 125_000,
+    6: 50_000,
+    7: 20_000,
+    8: 10_000,
+}
+"""Standard bit timing table: index → bit/s."""
+
+OK: Final = 0
+OUT_OF_RANGE: Final = 1
+STORAGE_FAILED: Final = 2
+
+
+class Command(IntEnum):
+    """LSS command specifiers."""
+
+    SWITCH_GLOBAL = 0x04
+    CONFIGURE_NODE_ID = 0x11
+    CONFIGURE_BIT_TIMING = 0x13
+    ACTIVATE_BIT_TIMING = 0x15
+    STORE = 0x17
+    SWITCH_VENDOR = 0x40
+    SWITCH_PRODUCT = 0x41
+    SWITCH_REVISION = 0x42
+    SWITCH_SERIAL = 0x43
+    SWITCHED = 0x44
+    IDENTIFY_VENDOR = 0x46
+    IDENTIFY_PRODUCT = 0x47
+    IDENTIFY_REVISION_LOW = 0x48
+    IDENTIFY_REVISION_HIGH = 0x49
+    IDENTIFY_SERIAL_LOW = 0x4A
+    IDENTIFY_SERIAL_HIGH = 0x4B
+    IDENTIFY_NON_CONFIGURED = 0x4C
+    IDENTIFIED = 0x4F
+    NON_CONFIGURED = 0x50
+    FASTSCAN = 0x51
+    INQUIRE_VENDOR = 0x5A
+    INQUIRE_PRODUCT = 0x5B
+    INQUIRE_REVISION = 0x5C
+    INQUIRE_SERIAL = 0x5D
+    INQUIRE_NODE_ID = 0x5E
+
+
+class LssHost(Protocol):
+    """What the LSS slave asks of its node."""
+
+    def activate_node_id(self, node_id: int) -> None:
+        """Leave the unconfigured state with this node-ID."""
+
+    def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
+        """Change the bit rate: silence for `delay_s` before and after."""
+
+    def store_lss(self, node_id: int, bit_rate: int) -> None:
+        """Keep node-ID and bit rate; `ProtocolError` if they cannot be kept."""
+
+
+class LssSlave:
+    """Answers the LSS master.
+
+    Parameters
+    ----------
+    context
+        Shared by the node.
+    host
+        The node itself.
+    bit_rate
+        Bit rate that is in use, bit/s.
+    allowed_bit_rates
+        Those that the node can be set to, bit/s.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        host: LssHost,
+        bit_rate: int,
+        allowed_bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
+    ) -> None:
+        self._context = context
+        self._host = host
+        self._allowed = allowed_bit_rates
+        self.pending_node_id = context.node_id
+        self.pending_bit_rate = bit_rate
+        self.configuring = False
+        self._selected = 0
+        self._identified = 0
+        self._scan_position = 0
+
+    def receive(self, data: bytes) -> None:
+        """Take one frame of the LSS master; any other length than 8 is ignored."""
+        if len(data) != LENGTH:
+            return
+        command = data[0]
+        number = int.from_bytes(data[1:5], "little")
+        if command == Command.SWITCH_GLOBAL:
+            self._switch_global(data[1])
+        elif Command.SWITCH_VENDOR <= command <= Command.SWITCH_SERIAL:
+            self._switch_selective(command, number)
+        elif Command.IDENTIFY_VENDOR <= command <= Command.IDENTIFY_SERIAL_HIGH:
+            self._identify(command, number)
+        elif command == Command.IDENTIFY_NON_CONFIGURED:
+            if self._unconfigured:
+                self._send(Command.NON_CONFIGURED)
+        elif command == Command.FASTSCAN:
+            self._fastscan(number, data[5], data[6], data[7])
+        elif self.configuring:
+            self._configuration(command, data)
+
+    @property
+    def _unconfigured(self) -> bool:
+        return self._context.node_id == UNCONFIGURED and self.pending_node_id == UNCONFIGURED
+
+    def _identity(self, number: int) -> int:
+        """Vendor-ID, product code, revision number or serial number for 0 to 3."""
+        return self._context.dictionary.find(IDENTITY, number + 1).number()
+
+    def _send(self, command: int, payload: bytes = b"") -> None:
+        self._context.send(LSS_SLAVE, bytes([command]) + payload.ljust(LENGTH - 1, b"\0"))
+
+    def _switch_global(self, mode: int) -> None:
+        if mode == 1:
+            self.configuring = True
+        elif mode == 0:
+            self._to_waiting()
+
+    def _to_waiting(self) -> None:
+        self.configuring = False
+        if self._context.node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
+            self._host.activate_node_id(self.pending_node_id)
+
+    def _switch_selective(self, command: int, number: int) -> None:
+        """Four frames in their order, each with a part of this node's identity, select it."""
+        step = command - Command.SWITCH_VENDOR
+        if step == 0:
+            self._selected = 0
+        if step != self._selected or number != self._identity(step):
+            self._selected = 0
+            return
+        self._selected += 1
+        if self._selected == 4:
+            self._selected = 0
+            self.configuring = True
+            self._send(Command.SWITCHED)
+
+    def _identify(self, command: int, number: int) -> None:
+        """Six frames in their order: vendor, product, and ranges of revision and serial number."""
+        step = command - Command.IDENTIFY_VENDOR
+        if step == 0:
+            self._identified = 0
+        own = self._identity((0, 1, 2, 2, 3, 3)[step])
+        matches = (number == own, number == own, number <= own, number >= own, number <= own, number >= own)[
+            step
+        ]
+        if step != self._identified or not matches:
+            self._identified = 0
+            return
+        self._identified += 1
+        if self._identified == 6:
+            self._identified = 0
+            self._send(Command.IDENTIFIED)
+
+    def _fastscan(self, number: int, bit: int, part: int, following: int) -> None:
+        """Compare the upper bits of one part of the identity; the match of a whole part leads to the next."""
+        if not self._unconfigured or self.configuring:
+            return
+        if bit == 0x80:
+            self._scan_position = 0
+            self._send(Command.IDENTIFIED)
+            return
+        if bit > 31 or part > 3 or following > 3 or part != self._scan_position:
+            return
+        if number >> bit != self._identity(part) >> bit:
+            return
+        self._send(Command.IDENTIFIED)
+        if bit == 0:
+            self._scan_position = following
+            self.configuring = following < part
+
+    def _configuration(self, command: int, data: bytes) -> None:
+        """Take a command that only a node in the configuration state obeys."""
+        if Command.INQUIRE_VENDOR <= command <= Command.INQUIRE_SERIAL:
+            self._send(command, self._identity(command - Command.INQUIRE_VENDOR).to_bytes(4, "little"))
+        elif command == Command.INQUIRE_NODE_ID:
+            self._send(command, bytes([self._context.node_id]))
+        elif command == Command.CONFIGURE_NODE_ID:
+            valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
+            if valid:
+                self.pending_node_id = data[1]
+                self._context.report(
+                    EventKind.NODE_ID, data[1], "from the next reset of the communication on"
+                )
+            self._send(command, bytes([OK if valid else OUT_OF_RANGE]))
+        elif command == Command.CONFIGURE_BIT_TIMING:
+            bit_rate = BIT_RATES.get(data[2]) if data[1] == 0 else None
+            if bit_rate in self._allowed and bit_rate is not None:
+                self.pending_bit_rate = bit_rate
+                self._send(command, bytes([OK]))
+            else:
+                self._send(command, bytes([OUT_OF_RANGE]))
+        elif command == Command.ACTIVATE_BIT_TIMING:
+            self._host.activate_bit_rate(self.pending_bit_rate, int.from_bytes(data[1:3], "little") * 1e-3)
+        elif command == Command.STORE:
+            self._send(command, bytes([self._store()]))
+
+    def _store(self) -> int:
+        try:
+            self._host.store_lss(self.pending_node_id, self.pending_bit_rate)
+        except ProtocolError as error:
+            self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+            return STORAGE_FAILED
+        return OK

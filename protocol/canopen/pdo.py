@@ -1,0 +1,270 @@
+"""RPDOs and TPDOs at run time: synchronous and event-driven transmission, timers, length checks (CiA 301, PDO)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from protocol.canopen.abort import SdoAbortError
+from protocol.canopen.context import Context, EventKind, NmtState
+from protocol.canopen.dictionary import check_value
+from protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedObject, PdoRecords
+
+
+class ReceivePdo:
+    """Writes the mapped objects when its message comes (event-driven) or at the next SYNC (synchronous)."""
+
+    def __init__(self, context: Context, emergency: EmergencyProducer, number: int) -> None:
+        self._context = context
+        self._emergency = emergency
+        self.records = PdoRecords(context.dictionary, Direction.RECEIVE, number)
+        self._key = bytes([number + 1])
+        self._objects: list[MappedObject] = []
+        self._size = 0
+        self._pending: bytes | None = None
+        self.next_deadline: float | None = None
+
+    def configure(self) -> None:
+        """Take over the present records; what waited for SYNC is dropped."""
+        self.records.changed = False
+        self._objects = self.records.mapped()
+        self._size = sum(mapped.size for mapped in self._objects)
+        self._pending = None
+        self.next_deadline = None
+
+    @property
+    def identifier(self) -> int | None:
+        """Identifier of its message, None while it does not exist or maps nothing."""
+        return self.records.identifier if self.records.valid and self._objects else None
+
+    def receive(self, data: bytes) -> None:
+        """Take a message: too short is not processed, too long is processed and reported."""
+        if len(data) < self._size:
+            detail = bytes([*self._key, len(data)])
+            self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
+            self._emergency.raise_error(
+                ErrorCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key
+            )
+            return
+        self._emergency.clear_error(ErrorCode.PDO_LENGTH_LOW, key=self._key)
+        self._emergency.clear_error(ErrorCode.RPDO_TIMEOUT, key=self._key)
+        if len(data) > self._size:
+            detail = bytes([*self._key, len(data)])
+            self._emergency.raise_error(
+                ErrorCode.PDO_LENGTH_HIGH, ErrorRegister.COMMUNICATION, detail, key=self._key
+            )
+        else:
+            self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
+        self.next_deadline = self._context.now + self.records.event_s if self.records.event_s else None
+        if self.records.transmission_type <= LAST_CYCLIC:
+            self._pending = data
+        else:
+            self._apply(data)
+
+    def synchronise(self) -> None:
+        """Act on the message that waits for SYNC."""
+        if self._pending is not None:
+            data, self._pending = self._pending, None
+            self._apply(data)
+
+    def tick(self) -> None:
+        """Report that the next message did not come in time."""
+        if self.next_deadline is not None and self._context.now >= self.next_deadline:
+            self.next_deadline = None
+            self._emergency.raise_error(
+                ErrorCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, self._key, key=self._key
+            )
+
+    def _apply(self, data: bytes) -> None:
+        """Write all objects, or none if one value is out of its limits; a refusal is reported by EMCY 8200h."""
+        writes: list[tuple[int, int, bytes]] = []
+        position = 0
+        try:
+            for mapped in self._objects:
+                value = data[position : position + mapped.size]
+                position += mapped.size
+                if mapped.entry is not None:
+                    check_value(mapped.entry.variable, value)
+                    writes.append((*mapped.entry.key, value))
+            for index, subindex, value in writes:
+                self._context.dictionary.write(index, subindex, value)
+        except SdoAbortError as refusal:
+            self._context.report(EventKind.REFUSED, self.records.number + 1, f"RPDO: {refusal}")
+            self._emergency.raise_error(
+                ErrorCode.PROTOCOL,
+                ErrorRegister.COMMUNICATION,
+                self._key + refusal.code.to_bytes(4, "little"),
+                key=self._key,
+            )
+            return
+        self._emergency.clear_error(ErrorCode.PROTOCOL, key=self._key)
+
+
+class TransmitPdo:
+    """Sends the mapped objects at SYNCs, at events or by its timer."""
+
+    def __init__(self, context: Context, number: int) -> None:
+        self._context = context
+        self.records = PdoRecords(context.dictionary, Direction.TRANSMIT, number)
+        self._objects: list[MappedObject] = []
+        self._keys: frozenset[tuple[int, int]] = frozenset()
+        self._event = False
+        self._syncs = 0
+        self._started = False
+        self._free_at = 0.0
+        self._event_at: float | None = None
+
+    def configure(self) -> None:
+        """Take over the present records; timers start now, the synchronous count begins anew."""
+        self.records.changed = False
+        self._objects = self.records.mapped()
+        self._keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
+        self._event = False
+        self._syncs = 0
+        self._started = self.records.sync_start == 0
+        self._free_at = self._context.now
+        self._restart_timer()
+
+    @property
+    def active(self) -> bool:
+        """Whether it may be sent."""
+        return self.records.valid and bool(self._objects) and self._context.state is NmtState.OPERATIONAL
+
+    @property
+    def _synchronous(self) -> bool:
+        return self.records.transmission_type <= LAST_CYCLIC
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When the event timer runs out or the inhibit time lets a waiting event go."""
+        if not self.active or self._synchronous:
+            return None
+        if self._event:
+            return self._free_at
+        return None if self._event_at is None else max(self._event_at, self._free_at)
+
+    def start(self) -> None:
+        """Enter OPERATIONAL: an event-driven PDO is sent once, acyclic ones wait for an event."""
+        self._syncs = 0
+        self._started = self.records.sync_start == 0
+        self._restart_timer()
+        self._event = not self._synchronous
+
+    def concerns(self, keys: frozenset[tuple[int, int]]) -> bool:
+        """Tell whether one of these objects is mapped."""
+        return not self._keys.isdisjoint(keys)
+
+    def trigger(self) -> None:
+        """Note an event; `tick` sends an event-driven PDO as soon as the inhibit time allows."""
+        if self.active:
+            self._event = True
+
+    def synchronise(self, counter: int) -> None:
+        """Act on a SYNC with this counter (0 if it carries none)."""
+        kind = self.records.transmission_type
+        if not self.active or not self._synchronous:
+            return
+        if kind == 0:
+            if self._event:
+                self._send()
+            return
+        if not self._started:
+            if counter and counter != self.records.sync_start:
+                return
+            self._started = True
+            self._syncs = kind - 1
+        self._syncs += 1
+        if self._syncs >= kind:
+            self._syncs = 0
+            self._send()
+
+    def tick(self) -> None:
+        """Send what is due by event or timer."""
+        deadline = self.next_deadline
+        if deadline is not None and self._context.now >= deadline:
+            self._send()
+
+    def _restart_timer(self) -> None:
+        period = self.records.event_s
+        self._event_at = self._context.now + period if period else None
+
+    def _send(self) -> None:
+        self._event = False
+        self._restart_timer()
+        try:
+            data = b"".join(mapped.entry.read() for mapped in self._objects if mapped.entry is not None)
+        except SdoAbortError as refusal:
+            self._context.report(EventKind.REFUSED, self.records.number + 1, f"TPDO: {refusal}")
+            return
+        self._free_at = self._context.now + self.records.inhibit_s
+        self._context.send(self.records.identifier, data)
+
+
+class PdoService:
+    """All PDOs of a node."""
+
+    def __init__(self, context: Context, emergency: EmergencyProducer) -> None:
+        self._context = context
+        indices = {index for index, _ in context.dictionary.entries}
+        self.receiving = [
+            ReceivePdo(context, emergency, number)
+            for number in range(0x200)
+            if Direction.RECEIVE.communication + number in indices
+        ]
+        self.transmitting = [
+            TransmitPdo(context, number)
+            for number in range(0x200)
+            if Direction.TRANSMIT.communication + number in indices
+        ]
+        self._all: list[ReceivePdo | TransmitPdo] = [*self.receiving, *self.transmitting]
+
+    def configure(self, *, everything: bool = False) -> bool:
+        """Configure the PDOs whose records have changed; return whether there were any."""
+        changed = False
+        for pdo in self._all:
+            if everything or pdo.records.changed:
+                pdo.configure()
+                changed = True
+        return changed
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When the next timer of a PDO runs out."""
+        if self._context.state is not NmtState.OPERATIONAL:
+            return None
+        times = [pdo.next_deadline for pdo in self._all]
+        return min((time for time in times if time is not None), default=None)
+
+    def start(self) -> None:
+        """Enter OPERATIONAL."""
+        for transmitting in self.transmitting:
+            transmitting.start()
+
+    def stop(self) -> None:
+        """Leave OPERATIONAL: nothing waits any more."""
+        for receiving in self.receiving:
+            receiving.configure()
+        for transmitting in self.transmitting:
+            transmitting.configure()
+
+    def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
+        """Note that these objects have new values."""
+        changed = frozenset(keys)
+        for pdo in self.transmitting:
+            if pdo.concerns(changed):
+                pdo.trigger()
+
+    def synchronise(self, counter: int) -> None:
+        """Act on a SYNC: first send (all sampled at this instant), then act on received messages."""
+        for transmitting in self.transmitting:
+            transmitting.synchronise(counter)
+        for receiving in self.receiving:
+            receiving.synchronise()
+
+    def tick(self) -> None:
+        """Act on the timers."""
+        if self._context.state is NmtState.OPERATIONAL:
+            for transmitting in self.transmitting:
+                transmitting.tick()
+            for receiving in self.receiving:
+                receiving.tick()

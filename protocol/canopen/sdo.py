@@ -1,0 +1,168 @@
+"""SDO server: initiates transfers and hands further requests to the transfer under way (CiA 301, SDO)."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.dictionary import Dictionary, check_length
+from protocol.canopen.sdo_transfer import (
+    MAXIMUM_BLOCK,
+    BlockDownload,
+    BlockUpload,
+    Commit,
+    ReceiveBuffer,
+    SegmentedDownload,
+    SegmentedUpload,
+    Transfer,
+    valid_block_size,
+)
+from protocol.errors import ProtocolError
+
+LENGTH: Final = 8
+"""Data bytes of every SDO frame; others are no SDO."""
+ABORT: Final = 0x80
+
+
+class SdoServer:
+    """Answers the SDO requests of one client (1200h).
+
+    Parameters
+    ----------
+    dictionary
+        What is read and written.
+    timeout_s
+        A transfer is aborted when its client is silent for so long.
+    """
+
+    def __init__(self, dictionary: Dictionary, timeout_s: float = 1.0) -> None:
+        self._dictionary = dictionary
+        self._timeout_s = timeout_s
+        self._transfer: Transfer | None = None
+        self.deadline: float | None = None
+        self.faults: list[str] = []
+        """What handlers of the application raised beside `SdoAbortError`; the node makes events of it."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a transfer is under way."""
+        return self._transfer is not None
+
+    def reset(self) -> None:
+        """Forget the transfer under way; nothing is sent."""
+        self._transfer = None
+        self.deadline = None
+
+    def tick(self, now: float) -> list[bytes]:
+        """Abort the transfer whose client has been silent for too long."""
+        if self._transfer is None or self.deadline is None or now < self.deadline:
+            return []
+        return [self._abort(AbortCode.TIMEOUT, self._transfer.index, self._transfer.subindex)]
+
+    def receive(self, data: bytes, now: float) -> list[bytes]:
+        """Take the data of one frame and return the data of the answers.
+
+        Parameters
+        ----------
+        data
+            Data of a frame with the request's COB-ID; any other length than 8 is ignored.
+        now
+            Present time, s.
+        """
+        if len(data) != LENGTH:
+            return []
+        index, subindex = int.from_bytes(data[1:3], "little"), data[3]
+        if self._transfer is not None and not self._begins(data):
+            index, subindex = self._transfer.index, self._transfer.subindex
+        elif not self._begins(data):
+            index, subindex = 0, 0
+        try:
+            answers = self._handle(data, index, subindex)
+        except SdoAbortError as abort:
+            return [self._abort(abort.code, index, subindex)]
+        except ProtocolError as error:
+            self.faults.append(f"SDO {index:04X}h:{subindex:02X}h: {error}")
+            return [self._abort(AbortCode.GENERAL, index, subindex)]
+        if self._transfer is not None and self._transfer.done:
+            self._transfer = None
+        self.deadline = None if self._transfer is None else now + self._timeout_s
+        return answers
+
+    def _streaming(self) -> bool:
+        return isinstance(self._transfer, BlockDownload) and self._transfer.streaming
+
+    def _begins(self, data: bytes) -> bool:
+        """Tell whether a request initiates a transfer, and thereby replaces the one under way."""
+        if self._streaming():
+            return False
+        command = data[0]
+        kind = command >> 5
+        return kind in {1, 2} or (kind == 5 and command & 0x03 == 0) or (kind == 6 and command & 0x01 == 0)
+
+    def _handle(self, data: bytes, index: int, subindex: int) -> list[bytes]:
+        command = data[0]
+        if command == ABORT or (command >> 5 == 4 and not self._streaming()):
+            self._transfer = None
+            return []
+        if not self._begins(data):
+            if self._transfer is None:
+                raise SdoAbortError(AbortCode.COMMAND, f"0x{command:02X} without a transfer")
+            return self._transfer.request(data)
+        self._transfer = None
+        match command >> 5:
+            case 1:
+                return self._initiate_download(data, index, subindex)
+            case 2:
+                return self._initiate_upload(index, subindex, self._dictionary.read(index, subindex))
+            case 5:
+                return self._initiate_block_upload(data, index, subindex)
+            case _:
+                return self._initiate_block_download(data, index, subindex)
+
+    def _initiate_download(self, data: bytes, index: int, subindex: int) -> list[bytes]:
+        command = data[0]
+        if command & 0x02:
+            entry = self._dictionary.writable(index, subindex)
+            length = 4 - (command >> 2 & 0x03) if command & 0x01 else min(4, entry.size or 4)
+            self._dictionary.write(index, subindex, data[4 : 4 + length])
+        else:
+            buffer = self._buffer(data, index, subindex, sized=bool(command & 0x01))
+            self._transfer = SegmentedDownload(index, subindex, buffer, self._commit(index, subindex))
+        return [bytes([0x60]) + data[1:4] + bytes(4)]
+
+    def _initiate_upload(self, index: int, subindex: int, value: bytes) -> list[bytes]:
+        multiplexer = index.to_bytes(2, "little") + bytes([subindex])
+        if 1 <= len(value) <= 4:
+            unused = 4 - len(value)
+            return [bytes([0x43 | unused << 2]) + multiplexer + value + bytes(unused)]
+        self._transfer = SegmentedUpload(index, subindex, value)
+        return [bytes([0x41]) + multiplexer + len(value).to_bytes(4, "little")]
+
+    def _initiate_block_upload(self, data: bytes, index: int, subindex: int) -> list[bytes]:
+        value = self._dictionary.read(index, subindex)
+        size, threshold = valid_block_size(data[4]), data[5]
+        if threshold and len(value) <= threshold:
+            return self._initiate_upload(index, subindex, value)
+        self._transfer = BlockUpload(index, subindex, value, size, crc=bool(data[0] & 0x04))
+        return [bytes([0xC6]) + data[1:4] + len(value).to_bytes(4, "little")]
+
+    def _initiate_block_download(self, data: bytes, index: int, subindex: int) -> list[bytes]:
+        buffer = self._buffer(data, index, subindex, sized=bool(data[0] & 0x02))
+        commit = self._commit(index, subindex)
+        self._transfer = BlockDownload(index, subindex, buffer, commit, crc=bool(data[0] & 0x04))
+        return [bytes([0xA4]) + data[1:4] + bytes([MAXIMUM_BLOCK]) + bytes(3)]
+
+    def _buffer(self, data: bytes, index: int, subindex: int, *, sized: bool) -> ReceiveBuffer:
+        entry = self._dictionary.writable(index, subindex)
+        announced = int.from_bytes(data[4:8], "little") if sized else None
+        if announced is not None:
+            check_length(entry, announced)
+        return ReceiveBuffer(announced, entry.maximum_size if entry.size is None else entry.size)
+
+    def _commit(self, index: int, subindex: int) -> Commit:
+        return partial(self._dictionary.write, index, subindex)
+
+    def _abort(self, code: AbortCode, index: int, subindex: int) -> bytes:
+        self.reset()
+        return bytes([ABORT]) + index.to_bytes(2, "little") + bytes([subindex]) + code.to_bytes(4, "little")

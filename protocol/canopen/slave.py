@@ -1,0 +1,372 @@
+"""A CANopen slave without input or output: frames and the time go in, frames and events come out (CiA 301, CiA 305).
+
+The caller owns bus and clock: it hands over each frame with `receive`, calls `tick` at `next_deadline`, sends the
+frames that come back in their order, and takes the events. Nothing here waits, reads a clock or starts a thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from protocol.can_framing import CanFrame
+from protocol.canopen.abort import SdoAbortError
+from protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE, SDO_TRANSMIT
+from protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent
+from protocol.canopen.dictionary import Dictionary
+from protocol.canopen.eds import build_eds
+from protocol.canopen.emergency import EmergencyProducer
+from protocol.canopen.error_control import ErrorControl
+from protocol.canopen.lss import BIT_RATES, LssSlave
+from protocol.canopen.pdo import PdoService
+from protocol.canopen.sdo import SdoServer
+from protocol.canopen.storage import APPLICATION, COMMUNICATION, MemoryStorage, ParameterStorage
+from protocol.canopen.store import ParameterStore
+from protocol.canopen.sync import SyncService
+from protocol.canopen.timestamp import TimeConsumer
+from protocol.errors import ProtocolError
+
+STATE_COMMANDS: Final = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
+"""NMT command specifier → state that it asks for."""
+RESET_NODE: Final = 129
+RESET_COMMUNICATION: Final = 130
+
+ERROR_BEHAVIOUR: Final = (0x1029, 1)
+HIGH_RESOLUTION: Final = (0x1013, 0)
+STORED_EDS: Final = (0x1021, 0)
+
+Handler = Callable[[CanFrame], None]
+
+
+class CanopenSlave:
+    """One node on the bus.
+
+    Parameters
+    ----------
+    dictionary
+        Object dictionary with at least the communication profile of `communication.add_communication`.
+    node_id
+        1 to 127, or 255 for a node that waits for LSS; what LSS stored goes before it.
+    bit_rate
+        Bit rate in use, bit/s; what LSS stored goes before it.
+    storage
+        Where parameters survive a restart; by default they do not.
+    sdo_timeout_s
+        Silence of an SDO client that ends its transfer.
+    bit_rates
+        Bit rates that LSS may set, bit/s.
+
+    Raises
+    ------
+    ProtocolError
+        If the node-ID is none.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        node_id: int,
+        *,
+        bit_rate: int = 1_000_000,
+        storage: ParameterStorage | None = None,
+        sdo_timeout_s: float = 1.0,
+        bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
+    ) -> None:
+        if not 1 <= node_id <= 127 and node_id != UNCONFIGURED:
+            raise ProtocolError(f"CANopen node-ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
+        self.dictionary = dictionary
+        self._context = context = Context(dictionary, node_id)
+        self.store = ParameterStore(context, MemoryStorage() if storage is None else storage)
+        stored = self.store.load_lss()
+        if stored is not None:
+            context.node_id, bit_rate = stored
+        self.bit_rate = bit_rate
+        self.lss = LssSlave(context, self, bit_rate, bit_rates)
+        self.emergency = EmergencyProducer(context)
+        self.sdo = SdoServer(dictionary, sdo_timeout_s)
+        self.sync = SyncService(context, self.emergency)
+        self.time = TimeConsumer(context)
+        self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
+        self.pdos = PdoService(context, self.emergency)
+        self._clock_offset_us = 0
+        self._silence: tuple[float, float] | None = None
+        self._pending_bit_rate = bit_rate
+        self._routes: dict[int, list[Handler]] = {}
+        self._bind()
+
+    @property
+    def state(self) -> NmtState:
+        """NMT state."""
+        return self._context.state
+
+    @property
+    def node_id(self) -> int:
+        """Node-ID in use, 255 while LSS has to give one."""
+        return self._context.node_id
+
+    def start(self, now: float) -> list[CanFrame]:
+        """Power on: load the parameters, boot up and enter PRE-OPERATIONAL."""
+        self._begin(now)
+        self._initialise(application=True)
+        return self._finish()
+
+    def receive(self, frame: CanFrame, now: float) -> list[CanFrame]:
+        """Take a frame from the bus; those of the extended format and of unknown identifiers are ignored."""
+        handlers = self._routes.get(frame.id)
+        if frame.extended or handlers is None:
+            return []
+        self._begin(now)
+        if self._silence is None:
+            for handler in tuple(handlers):
+                handler(frame)
+        return self._finish()
+
+    def tick(self, now: float) -> list[CanFrame]:
+        """Act on the timers that have run out."""
+        self._begin(now)
+        self._end_silence()
+        if self._context.state is not NmtState.INITIALISING and self._silence is None:
+            for data in self.sdo.tick(now):
+                self._context.send(SDO_TRANSMIT + self.node_id, data)
+            self.error_control.tick()
+            counter = self.sync.tick()
+            if counter is not None:
+                self._synchronise(counter)
+            self.pdos.tick()
+            self.emergency.flush()
+        return self._finish()
+
+    def next_deadline(self) -> float | None:
+        """When `tick` has to be called, on the clock of the caller; None while nothing is due."""
+        if self._silence is not None:
+            return self._silence[0] if self._context.now < self._silence[0] else self._silence[1]
+        if self._context.state is NmtState.INITIALISING:
+            return None
+        times = (
+            self.sdo.deadline,
+            self.error_control.next_deadline,
+            self.sync.next_deadline,
+            self.pdos.next_deadline,
+            self.emergency.next_deadline,
+        )
+        return min((time for time in times if time is not None), default=None)
+
+    def notify(self, keys: frozenset[tuple[int, int]] | set[tuple[int, int]], now: float) -> list[CanFrame]:
+        """Tell that objects have new values: event-driven TPDOs go out, acyclic ones wait for SYNC."""
+        self._begin(now)
+        self.pdos.trigger(keys)
+        self.pdos.tick()
+        return self._finish()
+
+    def raise_emergency(
+        self, code: int, register_bits: int, data: bytes = b"", *, now: float, key: bytes = b""
+    ) -> list[CanFrame]:
+        """Report an error of the application that has come; see `EmergencyProducer.raise_error`."""
+        self._begin(now)
+        self.emergency.raise_error(code, register_bits, data, key=key)
+        return self._finish()
+
+    def clear_emergency(self, code: int, *, now: float, key: bytes = b"") -> list[CanFrame]:
+        """Report that an error of the application is gone."""
+        self._begin(now)
+        self.emergency.clear_error(code, key=key)
+        return self._finish()
+
+    def reset_node(self, now: float) -> list[CanFrame]:
+        """Restart as after NMT "reset node", on the application's own wish."""
+        self._begin(now)
+        self._reset(application=True)
+        return self._finish()
+
+    def take_events(self) -> list[SlaveEvent]:
+        """Return what happened since the last call."""
+        events, self._context.events = self._context.events, []
+        return events
+
+    def activate_node_id(self, node_id: int) -> None:
+        """Leave the unconfigured state (LSS)."""
+        self._context.node_id = node_id
+        self._initialise(application=False)
+
+    def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
+        """Be silent, report the new bit rate after `delay_s`, be silent for as long again (LSS)."""
+        now = self._context.now
+        self._pending_bit_rate = bit_rate
+        self._silence = (now + delay_s, now + 2 * delay_s)
+
+    def store_lss(self, node_id: int, bit_rate: int) -> None:
+        """Keep node-ID and bit rate (LSS)."""
+        self.store.save_lss(node_id, bit_rate)
+
+    def _bind(self) -> None:
+        clock = self.dictionary.find(*HIGH_RESOLUTION)
+        clock.reader = lambda: (self._clock_us() + self._clock_offset_us & 0xFFFFFFFF).to_bytes(4, "little")
+        clock.writer = self._set_clock
+        clock.persistent = False
+        stored_eds = self.dictionary.find(*STORED_EDS)
+        stored_eds.reader = lambda: build_eds(self.dictionary).encode("ascii", errors="replace")
+
+    def _clock_us(self) -> int:
+        return round(self._context.now * 1e6)
+
+    def _set_clock(self, data: bytes) -> None:
+        self._clock_offset_us = int.from_bytes(data, "little") - self._clock_us()
+
+    def _begin(self, now: float) -> None:
+        self._context.now = now
+        self.dictionary.new_instant()
+
+    def _finish(self) -> list[CanFrame]:
+        """Let writes take effect, then hand over the frames."""
+        context = self._context
+        if self.dictionary.changed:
+            changed = frozenset(self.dictionary.changed)
+            self.dictionary.changed.clear()
+            self.pdos.configure()
+            self.pdos.trigger(changed)
+            self.pdos.tick()
+            self._route()
+        for fault in self.sdo.faults:
+            context.report(EventKind.FAULT, detail=fault)
+        self.sdo.faults.clear()
+        frames, context.frames = context.frames, []
+        return frames if self._silence is None else []
+
+    def _end_silence(self) -> None:
+        if self._silence is None:
+            return
+        switch, end = self._silence
+        if self._context.now >= switch and self.bit_rate != self._pending_bit_rate:
+            self.bit_rate = self._pending_bit_rate
+            self._context.report(EventKind.BIT_RATE, self.bit_rate)
+        if self._context.now >= end:
+            self._silence = None
+
+    def _route(self) -> None:
+        """Say which identifier goes where; everything but LSS needs a node-ID."""
+        routes: dict[int, list[Handler]] = {}
+
+        def add(identifier: int | None, handler: Handler) -> None:
+            if identifier is not None:
+                routes.setdefault(identifier, []).append(handler)
+
+        add(LSS_MASTER, self._on_lss)
+        if self.node_id != UNCONFIGURED:
+            add(NMT, self._on_nmt)
+            add(self.sync.identifier, self._on_sync)
+            add(self.time.identifier, self._on_time)
+            add(SDO_RECEIVE + self.node_id, self._on_sdo)
+            for other in range(1, 128):
+                add(ERROR_CONTROL + other, self._on_error_control)
+            for pdo in self.pdos.receiving:
+                add(pdo.identifier, self._pdo_handler(pdo.receive))
+        self._routes = routes
+
+    def _pdo_handler(self, receive: Callable[[bytes], None]) -> Handler:
+        def handle(frame: CanFrame) -> None:
+            if self.state is NmtState.OPERATIONAL and not frame.remote:
+                receive(frame.data)
+
+        return handle
+
+    def _on_nmt(self, frame: CanFrame) -> None:
+        if frame.remote or len(frame.data) != 2 or frame.data[1] not in {0, self.node_id}:
+            return
+        command = frame.data[0]
+        if command in STATE_COMMANDS:
+            self._enter(STATE_COMMANDS[command])
+        elif command in {RESET_NODE, RESET_COMMUNICATION}:
+            self._reset(application=command == RESET_NODE)
+
+    def _on_sdo(self, frame: CanFrame) -> None:
+        if frame.remote or not self._context.communicates:
+            return
+        for data in self.sdo.receive(frame.data, self._context.now):
+            self._context.send(SDO_TRANSMIT + self.node_id, data)
+
+    def _on_sync(self, frame: CanFrame) -> None:
+        if frame.remote:
+            return
+        counter = self.sync.receive(frame.data)
+        if counter is not None:
+            self._synchronise(counter)
+
+    def _synchronise(self, counter: int) -> None:
+        if self.state is NmtState.OPERATIONAL:
+            self.pdos.synchronise(counter)
+
+    def _on_time(self, frame: CanFrame) -> None:
+        if not frame.remote:
+            self.time.receive(frame.data)
+
+    def _on_error_control(self, frame: CanFrame) -> None:
+        node_id = frame.id - ERROR_CONTROL
+        if node_id != self.node_id:
+            if not frame.remote and self.state is not NmtState.INITIALISING:
+                self.error_control.receive_heartbeat(node_id, frame.data)
+        elif frame.remote:
+            self.error_control.receive_guarding()
+
+    def _on_lss(self, frame: CanFrame) -> None:
+        if not frame.remote:
+            self.lss.receive(frame.data)
+
+    def _on_communication_error(self) -> None:
+        behaviour = self.dictionary.find(*ERROR_BEHAVIOUR).number()
+        if behaviour == 0 and self.state is NmtState.OPERATIONAL:
+            self._enter(NmtState.PRE_OPERATIONAL)
+        elif behaviour == 2 and self.state is not NmtState.STOPPED:
+            self._enter(NmtState.STOPPED)
+
+    def _enter(self, state: NmtState) -> None:
+        """Change between STOPPED, PRE-OPERATIONAL and OPERATIONAL."""
+        old = self._context.state
+        if state is old or old is NmtState.INITIALISING:
+            return
+        self._context.state = state
+        self._context.report(EventKind.STATE, state)
+        if old is NmtState.OPERATIONAL:
+            self.pdos.stop()
+        if state is NmtState.STOPPED:
+            self.sdo.reset()
+        elif old is NmtState.STOPPED:
+            self.sync.restart_counter()
+            self.emergency.flush()
+        if state is NmtState.OPERATIONAL:
+            self.pdos.start()
+            self.pdos.tick()
+
+    def _reset(self, *, application: bool) -> None:
+        kind = EventKind.RESET_NODE if application else EventKind.RESET_COMMUNICATION
+        self._context.report(kind)
+        self._initialise(application=application)
+
+    def _initialise(self, *, application: bool) -> None:
+        """Pass through INITIALISING: parameters at their stored values, boot-up message, PRE-OPERATIONAL."""
+        context = self._context
+        context.state = NmtState.INITIALISING
+        context.node_id = self.lss.pending_node_id
+        self.lss.configuring = False
+        self.sdo.reset()
+        self.emergency.reset(application=application)
+        if application:
+            self.store.load(APPLICATION)
+        self.store.load(COMMUNICATION)
+        self._configure()
+        if context.node_id == UNCONFIGURED:
+            return
+        context.send(ERROR_CONTROL + context.node_id, b"\0")
+        context.state = NmtState.PRE_OPERATIONAL
+        context.report(EventKind.STATE, context.state)
+
+    def _configure(self) -> None:
+        """Take over the parameters of the communication profile; refuse stored ones that no longer fit."""
+        try:
+            self.pdos.configure(everything=True)
+        except SdoAbortError as refusal:
+            self._context.report(EventKind.STORAGE_ERROR, detail=f"stored PDO mapping: {refusal}")
+            self.store.set_defaults(COMMUNICATION)
+            self.pdos.configure(everything=True)
+        self.sync.configure()
+        self.error_control.configure()
+        self._route()

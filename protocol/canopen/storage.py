@@ -1,0 +1,137 @@
+"""Where a node keeps its parameters over a restart: in memory, or in a file that is replaced as a whole."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final, Protocol
+
+from protocol.errors import ProtocolError
+
+COMMUNICATION: Final = "communication"
+APPLICATION: Final = "application"
+LSS: Final = "lss"
+
+
+class StorageError(ProtocolError):
+    """Stored parameters that cannot be read or written."""
+
+
+class ParameterStorage(Protocol):
+    """Keeps groups of named values over a restart."""
+
+    def load(self, group: str) -> dict[str, bytes]:
+        """Return a group's values, empty if none are stored; `StorageError` if they are damaged."""
+
+    def save(self, group: str, values: Mapping[str, bytes]) -> None:
+        """Replace a group's values as a whole; `StorageError` if that fails, the old ones then stay."""
+
+    def clear(self, group: str) -> None:
+        """Forget a group's values."""
+
+
+class MemoryStorage:
+    """Keeps values for as long as the object lives."""
+
+    def __init__(self) -> None:
+        self._groups: dict[str, dict[str, bytes]] = {}
+
+    def load(self, group: str) -> dict[str, bytes]:
+        """Return a copy of a group's values."""
+        return dict(self._groups.get(group, {}))
+
+    def save(self, group: str, values: Mapping[str, bytes]) -> None:
+        """Replace a group's values."""
+        self._groups[group] = dict(values)
+
+    def clear(self, group: str) -> None:
+        """Forget a group's values."""
+        self._groups.pop(group, None)
+
+
+class FileStorage:
+    """Keeps values in one JSON file with a checksum; a save writes a new file and renames it over the old one.
+
+    Parameters
+    ----------
+    path
+        The file; its folder is made at the first save.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def load(self, group: str) -> dict[str, bytes]:
+        """Return a group's values; `StorageError` if the file cannot be read or its checksum is wrong."""
+        values = self._read().get(group, {})
+        return {name: bytes.fromhex(value) for name, value in values.items()}
+
+    def save(self, group: str, values: Mapping[str, bytes]) -> None:
+        """Replace a group's values; a damaged file is replaced as a whole."""
+        groups = self._readable()
+        groups[group] = {name: value.hex() for name, value in values.items()}
+        self._write(groups)
+
+    def clear(self, group: str) -> None:
+        """Forget a group's values."""
+        groups = self._readable()
+        if groups.pop(group, None) is not None or not self._intact():
+            self._write(groups)
+
+    def _intact(self) -> bool:
+        try:
+            self._read()
+        except StorageError:
+            return False
+        return True
+
+    def _readable(self) -> dict[str, dict[str, str]]:
+        try:
+            return self._read()
+        except StorageError:
+            return {}
+
+    def _read(self) -> dict[str, dict[str, str]]:
+        try:
+            document = json.loads(self._path.read_text(encoding="ascii"))
+            groups: dict[str, dict[str, str]] = document["groups"]
+            if not isinstance(groups, dict) or document["crc32"] != _checksum(groups):
+                raise StorageError(f"{self._path}: wrong checksum; store the parameters again")
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StorageError(f"{self._path}: no stored parameters ({error}); store them again") from None
+        return groups
+
+    def _write(self, groups: Mapping[str, Mapping[str, str]]) -> None:
+        text = json.dumps({"crc32": _checksum(groups), "groups": groups}, indent=1)
+        temporary = self._path.with_name(f"{self._path.name}.{os.getpid()}.new")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with temporary.open("w", encoding="ascii") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(self._path)
+            _sync_folder(self._path.parent)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise StorageError(f"{self._path}: cannot be written ({error})") from None
+
+
+def _checksum(groups: Mapping[str, Mapping[str, str]]) -> int:
+    return zlib.crc32(json.dumps(groups, sort_keys=True).encode("ascii"))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Let the renaming reach the disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,131 @@
+"""Store and restore of parameters: 1010h and 1011h with their signatures (CiA 301)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.context import Context, EventKind
+from protocol.canopen.dictionary import COMMUNICATION as COMMUNICATION_INDICES
+from protocol.canopen.dictionary import Entry, default_bytes
+from protocol.canopen.storage import APPLICATION, COMMUNICATION, LSS, ParameterStorage, StorageError
+
+STORE: Final = 0x1010
+RESTORE: Final = 0x1011
+ALL: Final = 1
+GROUPS: Final = {2: COMMUNICATION, 3: APPLICATION}
+SAVE: Final = b"save"
+LOAD: Final = b"load"
+ON_COMMAND: Final = b"\x01\0\0\0"
+"""What reading 1010h and 1011h tells: the node stores on command, not by itself."""
+
+
+class ParameterStore:
+    """Keeps parameters over a restart, and gives the defaults back.
+
+    Parameters
+    ----------
+    context
+        Shared by the node.
+    storage
+        Where the values are kept.
+    """
+
+    def __init__(self, context: Context, storage: ParameterStorage) -> None:
+        self._context = context
+        self._storage = storage
+        self.on_save: Callable[[], None] | None = None
+        """Stores the parameters that the application keeps itself; `SdoAbortError` if it cannot."""
+        self.on_restore: Callable[[], None] | None = None
+        """Lets the application's own parameters be the defaults from its next restart on."""
+        for index, action in ((STORE, self._store), (RESTORE, self._restore)):
+            for subindex in (ALL, *GROUPS):
+                entry = context.dictionary.find(index, subindex)
+                entry.reader = lambda: ON_COMMAND
+                entry.writer = partial(action, subindex)
+                entry.persistent = False
+
+    def load(self, group: str) -> None:
+        """Set the group's entries to their defaults, then to what is stored of them."""
+        self.set_defaults(group)
+        for name, value in self._stored(group).items():
+            entry = self._named(name)
+            if entry is not None and self._belongs(entry, group) and entry.size in {None, len(value)}:
+                entry.value = value
+
+    def set_defaults(self, group: str) -> None:
+        """Set the group's entries to their defaults; the store stays as it is."""
+        above = range(COMMUNICATION_INDICES.stop, 0x10000)
+        indices = COMMUNICATION_INDICES if group == COMMUNICATION else above
+        self._context.dictionary.load_defaults(indices, self._context.node_id)
+
+    def load_lss(self) -> tuple[int, int] | None:
+        """Return the node-ID and the bit rate, bit/s, that LSS stored, or None."""
+        values = self._stored(LSS)
+        if "node_id" not in values or "bit_rate" not in values:
+            return None
+        return int.from_bytes(values["node_id"], "little"), int.from_bytes(values["bit_rate"], "little")
+
+    def save_lss(self, node_id: int, bit_rate: int) -> None:
+        """Keep node-ID and bit rate, bit/s; `StorageError` if they cannot be kept."""
+        self._storage.save(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")})
+
+    def _stored(self, group: str) -> dict[str, bytes]:
+        try:
+            return self._storage.load(group)
+        except StorageError as error:
+            self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+            return {}
+
+    def _named(self, name: str) -> Entry | None:
+        index, _, subindex = name.partition(":")
+        return self._context.dictionary.entries.get((int(index, 16), int(subindex, 16)))
+
+    def _belongs(self, entry: Entry, group: str) -> bool:
+        if not entry.persistent or entry.reader is not None:
+            return False
+        return (entry.key[0] in COMMUNICATION_INDICES) == (group == COMMUNICATION)
+
+    def _store(self, subindex: int, data: bytes) -> None:
+        if data != SAVE:
+            raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'save'")
+        for number, group in GROUPS.items():
+            if subindex in {ALL, number}:
+                self._save(group)
+        self._context.report(EventKind.STORED, subindex)
+
+    def _save(self, group: str) -> None:
+        values = {
+            f"{entry.key[0]:04X}:{entry.key[1]:02X}": entry.value
+            for entry in self._context.dictionary
+            if self._belongs(entry, group) and self._differs(entry)
+        }
+        try:
+            self._storage.save(group, values)
+        except StorageError as error:
+            self._failed(error)
+        if group == APPLICATION and self.on_save is not None:
+            self.on_save()
+
+    def _differs(self, entry: Entry) -> bool:
+        """Tell whether a value is not its default: a default that follows the node-ID goes on doing so."""
+        return entry.value != default_bytes(entry.variable, self._context.node_id)
+
+    def _restore(self, subindex: int, data: bytes) -> None:
+        if data != LOAD:
+            raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
+        for number, group in GROUPS.items():
+            if subindex in {ALL, number}:
+                try:
+                    self._storage.clear(group)
+                except StorageError as error:
+                    self._failed(error)
+                if group == APPLICATION and self.on_restore is not None:
+                    self.on_restore()
+        self._context.report(EventKind.RESTORED, subindex)
+
+    def _failed(self, error: StorageError) -> None:
+        self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+        raise SdoAbortError(AbortCode.HARDWARE, str(error))

@@ -1,0 +1,91 @@
+"""SYNC consumer and producer with the optional counter (CiA 301: 1005h, 1006h, 1019h)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
+from protocol.canopen.context import Context
+from protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+
+COB_ID: Final = (0x1005, 0)
+PERIOD: Final = (0x1006, 0)
+OVERFLOW: Final = (0x1019, 0)
+LARGEST_OVERFLOW: Final = 240
+
+
+class SyncService:
+    """Tells valid SYNC messages from others, and produces them if bit 30 of 1005h is set."""
+
+    def __init__(self, context: Context, emergency: EmergencyProducer) -> None:
+        self._context = context
+        self._emergency = emergency
+        find = context.dictionary.find
+        self._cob_id, self._period, self._overflow = find(*COB_ID), find(*PERIOD), find(*OVERFLOW)
+        self._cob_id.writer = self._check_cob_id
+        self._period.writer = self._period_changed
+        self._overflow.writer = self._check_overflow
+        self._counter = 0
+        self.next_deadline: float | None = None
+
+    @property
+    def identifier(self) -> int:
+        """Identifier of the SYNC message."""
+        return self._cob_id.number() & ID_MASK
+
+    def configure(self) -> None:
+        """Begin anew with the present parameters: counter at its start, production from one period on."""
+        self._counter = 0
+        self._schedule(self._cob_id.number(), self._period.number())
+
+    def receive(self, data: bytes) -> int | None:
+        """Return the counter of a valid SYNC (0 if it carries none), or None; report a wrong length."""
+        if not self._context.communicates:
+            return None
+        if len(data) != (1 if self._overflow.number() else 0):
+            detail = bytes([len(data)])
+            self._emergency.raise_error(ErrorCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, detail)
+            return None
+        self._emergency.clear_error(ErrorCode.SYNC_LENGTH)
+        return data[0] if data else 0
+
+    def tick(self) -> int | None:
+        """Produce a SYNC if one is due; return its counter so that the node acts on it too."""
+        now, deadline = self._context.now, self.next_deadline
+        if deadline is None or now < deadline:
+            return None
+        period = self._period.number() * 1e-6
+        self.next_deadline = max(deadline + period, now)
+        if not self._context.communicates:
+            return None
+        overflow = self._overflow.number()
+        if overflow:
+            self._counter = self._counter % overflow + 1
+        self._context.send(self.identifier, bytes([self._counter]) if overflow else b"")
+        return self._counter if overflow else 0
+
+    def restart_counter(self) -> None:
+        """Let the next counter be 1: the node has left STOPPED."""
+        self._counter = 0
+
+    def _schedule(self, cob_id: int, period_us: int) -> None:
+        produces = bool(cob_id & BIT_30) and period_us > 0
+        self.next_deadline = self._context.now + period_us * 1e-6 if produces else None
+
+    def _check_cob_id(self, data: bytes) -> None:
+        old, new = self._cob_id.number(), int.from_bytes(data, "little")
+        check_identifier(new)
+        check_replacement(old, new, lives_before=bool(old & BIT_30), lives_after=bool(new & BIT_30))
+        self._counter = 0
+        self._schedule(new, self._period.number())
+
+    def _period_changed(self, data: bytes) -> None:
+        self._schedule(self._cob_id.number(), int.from_bytes(data, "little"))
+
+    def _check_overflow(self, data: bytes) -> None:
+        if data[0] == 1 or data[0] > LARGEST_OVERFLOW:
+            raise SdoAbortError(AbortCode.VALUE_RANGE, "synchronous counter overflow is 0 or 2 to 240")
+        if self._period.number():
+            raise SdoAbortError(AbortCode.DEVICE_STATE, "set 1006h to 0 before changing the counter overflow")
+        self._counter = 0

@@ -1,0 +1,60 @@
+"""TIME consumer: the master's time of day becomes the device's (CiA 301: 1012h, TIME_OF_DAY)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
+from protocol.canopen.context import Context, EventKind
+
+COB_ID: Final = (0x1012, 0)
+CONSUMES: Final = 1 << 31
+EPOCH_UNIX_S: Final = 441_763_200
+"""1984-01-01T00:00:00 UTC, day 0 of TIME_OF_DAY, in Unix time."""
+DAY_S: Final = 86_400
+DAY_MS: Final = 86_400_000
+
+
+def decode_time_of_day(data: bytes) -> float | None:
+    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of milliseconds, 16 of days), None if it is no time."""
+    if len(data) != 6:
+        return None
+    milliseconds = int.from_bytes(data[:4], "little") & 0x0FFFFFFF
+    if milliseconds >= DAY_MS:
+        return None
+    return EPOCH_UNIX_S + int.from_bytes(data[4:], "little") * DAY_S + milliseconds / 1000
+
+
+def encode_time_of_day(unix_s: float) -> bytes:
+    """Return the TIME_OF_DAY of a Unix time, s, to the nearest millisecond."""
+    days, milliseconds = divmod(round((unix_s - EPOCH_UNIX_S) * 1000), DAY_MS)
+    return milliseconds.to_bytes(4, "little") + days.to_bytes(2, "little")
+
+
+class TimeConsumer:
+    """Reports each TIME message as an event whose value is the Unix time in s."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._cob_id = context.dictionary.find(*COB_ID)
+        self._cob_id.writer = self._check_cob_id
+
+    @property
+    def identifier(self) -> int | None:
+        """Identifier of the TIME message, None while it is not consumed."""
+        value = self._cob_id.number()
+        return value & ID_MASK if value & CONSUMES else None
+
+    def receive(self, data: bytes) -> None:
+        """Take a TIME message; one that is no time of day is ignored."""
+        unix_s = decode_time_of_day(data)
+        if unix_s is not None and self._context.communicates:
+            self._context.report(EventKind.TIME, unix_s)
+
+    def _check_cob_id(self, data: bytes) -> None:
+        old, new = self._cob_id.number(), int.from_bytes(data, "little")
+        check_identifier(new)
+        if new & BIT_30:
+            raise SdoAbortError(AbortCode.VALUE_RANGE, "this node produces no TIME message")
+        check_replacement(old, new, lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES))
