@@ -1,0 +1,15 @@
+"""Thin transports between the sans-I/O receivers and real ports and buses, for one asyncio event loop."""
+
+from protocol.transports.base import Statistics, Transport, TransportError
+from protocol.transports.can import CanTransport, open_can
+from protocol.transports.serial import SerialTransport, open_serial
+
+__all__ = [
+    "CanTransport",
+    "SerialTransport",
+    "Statistics",
+    "Transport",
+    "TransportError",
+    "open_can",
+    "open_serial",
+]

@@ -1,0 +1,157 @@
+"""CAN transports by specification: kernel CAN, the TCP hub, and python-can's other buses."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import socket
+import struct
+from functools import partial
+from typing import Any, Final
+
+import can
+
+from protocol.can_framing import CanFrame
+from protocol.errors import ProtocolError
+from protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT, CanHub
+from protocol.transports.base import Transport, TransportError
+from protocol.transports.hub_client import HubTransport
+from protocol.transports.python_can import OpenBus, PythonCanTransport
+
+CanTransport = Transport[CanFrame]
+
+DEFAULT_BITRATE: Final = 1_000_000
+
+_SIOCGIFFLAGS: Final = 0x8913
+_IFF_UP: Final = 1
+_FORMS: Final = "auto, a kernel interface (vcan0), socketcand:HOST:PORT/BUS, virtual:NAME, udp_multicast:GROUP, slcan:PORT"
+
+
+def kernel_can_is_up(name: str) -> bool:
+    """Whether the kernel has CAN and this interface is up."""
+    family = getattr(socket, "AF_CAN", None)
+    if family is None:
+        return False
+    try:
+        with socket.socket(family, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+            request = struct.pack("16sh14x", name.encode()[:15], 0)
+            answer = fcntl.ioctl(probe.fileno(), _SIOCGIFFLAGS, request)
+    except OSError:
+        return False
+    return bool(struct.unpack_from("16sh", answer)[1] & _IFF_UP)
+
+
+def open_can(
+    spec: str = "auto",
+    *,
+    bitrate: int = DEFAULT_BITRATE,
+    hub_host: str = DEFAULT_HOST,
+    hub_port: int = DEFAULT_PORT,
+) -> CanTransport:
+    """Make the CAN transport that a specification names; it is opened by `start`.
+
+    Parameters
+    ----------
+    spec:
+        `auto` (vcan0 where the kernel has it, else the hub at `hub_host:hub_port`, started in this process if none
+        answers there), a kernel interface such as `vcan0` or `socketcan:can0`, `socketcand:HOST:PORT/BUS`,
+        `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only), or `slcan:PORT`.
+    bitrate:
+        Bit rate (bit/s) of buses whose adapter is set by us (slcan).
+
+    Raises
+    ------
+    TransportError
+        The specification is none of these.
+    """
+    if spec == "auto":
+        if kernel_can_is_up(DEFAULT_BUS):
+            return _python_can("socketcan", DEFAULT_BUS, bitrate)
+        return AutoHubTransport(hub_host, hub_port)
+    interface, colon, channel = spec.partition(":")
+    if not colon:
+        interface, channel = "socketcan", spec
+    if interface == "socketcand":
+        return _socketcand(spec, channel)
+    if interface in can.VALID_INTERFACES and channel:
+        return _python_can(interface, channel, bitrate)
+    raise TransportError(f"CAN {spec}: must be {_FORMS}")
+
+
+def _socketcand(spec: str, where: str) -> CanTransport:
+    address, slash, bus = where.partition("/")
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535 or (slash and not bus):
+        raise TransportError(f"CAN {spec}: must be socketcand:HOST:PORT/BUS")
+    return HubTransport(host, int(port), bus or DEFAULT_BUS)
+
+
+def _python_can(interface: str, channel: str, bitrate: int) -> CanTransport:
+    options: dict[str, Any] = {}
+    if interface == "udp_multicast":
+        options["hop_limit"] = 0
+    elif interface == "slcan":
+        options["bitrate"] = bitrate
+    opener: OpenBus = partial(_open_bus, interface, channel, options)
+    return PythonCanTransport(f"{interface}:{channel}", opener, echoes=interface == "udp_multicast")
+
+
+def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
+    if interface == "socketcan":
+        _check_kernel(channel)
+    return can.Bus(interface=interface, channel=channel, **options)
+
+
+def _check_kernel(channel: str) -> None:
+    """Say plainly why a kernel interface cannot be had."""
+    remedy = "name another, or use auto, which falls back to the TCP hub"
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (OSError, AttributeError):
+        raise OSError(errno.EAFNOSUPPORT, f"this kernel has no CAN; {remedy}") from None
+    if channel not in (name for _, name in socket.if_nameindex()):
+        raise OSError(errno.ENODEV, f"no such interface; {remedy}")
+    if not kernel_can_is_up(channel):
+        raise OSError(errno.ENETDOWN, f"interface is down; bring it up: ip link set {channel} up")
+
+
+class AutoHubTransport(HubTransport):
+    """Joins the hub at an address, and starts it in this process whenever nobody answers there.
+
+    Port 0 starts a hub of its own at a free port.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(host, port, DEFAULT_BUS, self._ensure_hub)
+        self._hub: CanHub | None = None
+
+    async def _ensure_hub(self) -> None:
+        if self._hub is not None or (self._port and await self._answers()):
+            return
+        hub = CanHub(self._host, self._port)
+        try:
+            await hub.start()
+        except ProtocolError:
+            if not await self._answers():
+                raise
+            return
+        self._hub = hub
+        self._port = hub.port
+        self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
+
+    async def _answers(self) -> bool:
+        """Whether somebody listens at the address."""
+        try:
+            _, writer = await asyncio.open_connection(self._host, self._port)
+        except OSError:
+            return False
+        writer.close()
+        return True
+
+    async def close(self) -> None:
+        """Leave the bus, and end the hub if it was started here."""
+        await super().close()
+        if self._hub is not None:
+            await self._hub.close()
+            self._hub = None

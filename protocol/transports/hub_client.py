@@ -1,0 +1,222 @@
+"""A CAN bus over TCP: client of our hub, or of any socketcand server, that comes back when the server does."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Awaitable, Callable
+from typing import Final, cast
+
+from protocol.can_framing import CanFrame
+from protocol.errors import ProtocolError
+from protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
+from protocol.transports.base import Backoff, Transport, TransportError
+
+BACKLOG_LIMIT: Final = 4 * 1024 * 1024
+"""Bytes that wait for a hub that does not read at most."""
+
+HANDSHAKE_S: Final = 5.0
+"""Longest time for the server's greeting and answers."""
+
+CLOSE_S: Final = 0.5
+"""Longest time at close for the hub to take what is waiting."""
+
+EnsureServer = Callable[[], Awaitable[None]]
+
+
+class _Connection(asyncio.Protocol):
+    """One connection to a server: answers during the handshake, frames after it."""
+
+    def __init__(
+        self, on_frame: Callable[[CanFrame], None], on_lost: Callable[[_Connection, str], None]
+    ) -> None:
+        self._on_frame = on_frame
+        self._on_lost = on_lost
+        self._splitter = CommandSplitter()
+        self._answers: asyncio.Queue[bytes] = asyncio.Queue()
+        self._drained = asyncio.Event()
+        self._drained.set()
+        self.transport: asyncio.Transport | None = None
+        self.raw = False
+        self.bad = 0
+        """Texts from the server that made no sense."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast("asyncio.Transport", transport)
+        self.transport.set_write_buffer_limits(high=0)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.transport = None
+        self._drained.set()
+        self._answers.put_nowait(b"")
+        self._on_lost(self, str(exc) if exc else "the hub closed the connection")
+
+    def pause_writing(self) -> None:
+        self._drained.clear()
+
+    def resume_writing(self) -> None:
+        self._drained.set()
+
+    def data_received(self, data: bytes) -> None:
+        for command in self._splitter.feed(data):
+            if command is None:
+                self.bad += 1
+            elif command.startswith(b"frame "):
+                try:
+                    frame = parse_frame(command)
+                except CommandError:
+                    self.bad += 1
+                else:
+                    self._on_frame(frame)
+            elif self.raw:
+                self.bad += 1
+            else:
+                self._answers.put_nowait(command)
+
+    async def ask(self, command: str | None) -> bytes:
+        """Send a command and return the answer; with None wait for the greeting."""
+        if command is not None:
+            if self.transport is None:
+                return b""
+            self.transport.write(f"< {command} >".encode())
+        return await self._answers.get()
+
+    async def drain(self) -> None:
+        """Wait until the socket has taken all."""
+        await self._drained.wait()
+
+
+class HubTransport(Transport[CanFrame]):
+    """Frames over a socketcand server.
+
+    Parameters
+    ----------
+    host, port, bus:
+        Server and name of the bus there.
+    ensure_server:
+        Awaited before each connection; starts a server if none is there (used by `auto`).
+    """
+
+    def __init__(self, host: str, port: int, bus: str, ensure_server: EnsureServer | None = None) -> None:
+        super().__init__(f"socketcand:{host}:{port}/{bus}")
+        self._host = host
+        self._port = port
+        self._bus = bus
+        self._ensure_server = ensure_server
+        self._connection: _Connection | None = None
+        self._comeback: asyncio.Task[None] | None = None
+        self._outbox: list[bytes] = []
+        self._closing = False
+
+    async def _open(self) -> None:
+        await self._connect()
+
+    async def _connect(self) -> None:
+        if self._ensure_server is not None:
+            await self._ensure_server()
+        loop = asyncio.get_running_loop()
+        try:
+            _, connection = await loop.create_connection(
+                lambda: _Connection(self._take, self._lost), self._host, self._port
+            )
+        except OSError as error:
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            raise TransportError(
+                f"CAN {self.description}: cannot connect: {reason}; start `starhil hub --port {self._port}` first"
+            ) from None
+        try:
+            await asyncio.wait_for(self._shake_hands(connection), HANDSHAKE_S)
+        except (TransportError, TimeoutError) as error:
+            if connection.transport is not None:
+                connection.transport.abort()
+            if isinstance(error, TransportError):
+                raise
+            raise TransportError(
+                f"CAN {self.description}: no answer within {HANDSHAKE_S:g} s; is this a socketcand server?"
+            ) from None
+        self._connection = connection
+
+    async def _shake_hands(self, connection: _Connection) -> None:
+        for command, expected in ((None, b"hi"), (f"open {self._bus}", b"ok")):
+            answer = await connection.ask(command)
+            if answer != expected:
+                raise TransportError(
+                    f"CAN {self.description}: answer {answer[:40].decode(errors='replace')!r} where "
+                    f"{expected.decode()!r} is due; is this a socketcand server with bus {self._bus}?"
+                )
+        # a plain socketcand server refuses this; then there are no remote frames
+        await connection.ask("remote")
+        answer = await connection.ask("rawmode")
+        if answer != b"ok":
+            raise TransportError(f"CAN {self.description}: the server refuses raw mode")
+        connection.raw = True
+
+    def _take(self, frame: CanFrame) -> None:
+        self.statistics.received += 1
+        self._receive(frame)
+
+    def _lost(self, connection: _Connection, why: str) -> None:
+        if connection is not self._connection or self._closing:
+            return
+        self._connection = None
+        self._complain(f"CAN {self.description}: lost: {why}; waiting for it to come back")
+        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
+
+    async def _come_back(self) -> None:
+        pause = Backoff()
+        while self._connection is None:
+            await asyncio.sleep(pause.next())
+            with contextlib.suppress(ProtocolError):
+                await self._connect()
+        self.statistics.reconnects += 1
+        self._comeback = None
+
+    def send(self, item: CanFrame) -> bool:
+        """Queue a frame; all frames of one turn of the loop leave together."""
+        connection = self._connection
+        if (
+            connection is None
+            or connection.transport is None
+            or connection.transport.get_write_buffer_size() > BACKLOG_LIMIT
+        ):
+            self.statistics.dropped += 1
+            return False
+        if not self._outbox:
+            asyncio.get_running_loop().call_soon(self._flush)
+        self._outbox.append(format_send(item))
+        self.statistics.sent += 1
+        return True
+
+    def _flush(self) -> None:
+        text = b"".join(self._outbox)
+        count = len(self._outbox)
+        self._outbox.clear()
+        if self._connection is not None and self._connection.transport is not None:
+            self._connection.transport.write(text)
+        else:
+            self.statistics.sent -= count
+            self.statistics.dropped += count
+
+    async def drain(self) -> None:
+        """Wait until the socket has taken all that was queued."""
+        await asyncio.sleep(0)
+        if self._connection is not None:
+            await self._connection.drain()
+
+    async def close(self) -> None:
+        """Leave the bus; what was queued is sent first if the hub reads."""
+        self._closing = True
+        if self._comeback is not None:
+            self._comeback.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._comeback
+            self._comeback = None
+        if self._outbox:
+            self._flush()
+        connection, self._connection = self._connection, None
+        if connection is not None and connection.transport is not None:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(connection.drain(), CLOSE_S)
+            if connection.transport is not None:
+                connection.transport.close()

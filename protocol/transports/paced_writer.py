@@ -1,0 +1,129 @@
+"""Bytes leave as on a serial line: at the bit rate, without ever blocking, with a bounded backlog."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from protocol.serial_framing import PacingSchedule
+from protocol.transports.base import Statistics
+
+BACKLOG_LIMIT: Final = 64 * 1024
+"""Bytes that wait at most, for the line or for a peer that does not read."""
+
+TICK_S: Final = 0.002
+"""Time between two writes of a long message: it leaves in pieces as the line would carry it."""
+
+RETRY_S: Final = 0.005
+"""Time until the next try when the port takes no more."""
+
+
+class PacedWriter:
+    """Writes queued bytes to a port no faster than its line.
+
+    Parameters
+    ----------
+    write:
+        Takes bytes without blocking and returns how many it took (0: none now). OSError counts as a lost port; the
+        bytes are dropped, as on a line with nobody there.
+    schedule:
+        The line's byte times, or None for no pacing.
+    """
+
+    def __init__(
+        self, write: Callable[[bytes], int], schedule: PacingSchedule | None, statistics: Statistics
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._write = write
+        self._schedule = schedule
+        self._statistics = statistics
+        self._queue: deque[tuple[float, bytes]] = deque()
+        """Messages with the time at which their first byte begins."""
+        self._gone = 0
+        """Bytes of the first message that have been written."""
+        self._backlog = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that are waiting."""
+        return self._backlog
+
+    def send(self, data: bytes) -> bool:
+        """Queue a message, whole or not at all."""
+        if self._backlog + len(data) > BACKLOG_LIMIT:
+            self._statistics.dropped += len(data)
+            return False
+        if data:
+            begin = self._loop.time()
+            if self._schedule is not None:
+                begin, _ = self._schedule.reserve(begin, len(data))
+            self._queue.append((begin, data))
+            self._backlog += len(data)
+            self._idle.clear()
+            if self._timer is None:
+                self._work()
+        return True
+
+    async def drain(self) -> None:
+        """Wait until nothing is waiting."""
+        await self._idle.wait()
+
+    def clear(self) -> None:
+        """Drop what is waiting."""
+        self._statistics.dropped += self._backlog
+        self._queue.clear()
+        self._backlog = self._gone = 0
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._idle.set()
+
+    def _work(self) -> None:
+        """Write what is due, and come back when more is."""
+        self._timer = None
+        now = self._loop.time()
+        due, next_time = self._due(now)
+        if due:
+            try:
+                taken = self._write(due)
+            except OSError:
+                self.clear()
+                return
+            self._take_off(taken)
+            if taken < len(due):
+                next_time = now + RETRY_S
+        if self._queue:
+            self._timer = self._loop.call_at(max(next_time, now), self._work)
+        else:
+            self._idle.set()
+
+    def _due(self, now: float) -> tuple[bytes, float]:
+        """Return the bytes whose stop bit has passed by `now`, and when to look again."""
+        if self._schedule is None:
+            whole = b"".join(data for _, data in self._queue)
+            return whole[self._gone :], now
+        byte_s = self._schedule.seconds_per_byte
+        pieces: list[bytes] = []
+        gone = self._gone
+        for begin, data in self._queue:
+            ready = min(int((now - begin) / byte_s + 1e-6), len(data))
+            if ready > gone:
+                pieces.append(data[gone:ready])
+            if ready < len(data):
+                end = begin + len(data) * byte_s
+                return b"".join(pieces), min(max(begin + (ready + 1) * byte_s, now + TICK_S), end)
+            gone = 0
+        return b"".join(pieces), now
+
+    def _take_off(self, count: int) -> None:
+        self._statistics.sent += count
+        self._backlog -= count
+        count += self._gone
+        while self._queue and count >= len(self._queue[0][1]):
+            count -= len(self._queue.popleft()[1])
+        self._gone = count

@@ -1,0 +1,253 @@
+"""CAN buses of python-can as transports: socketcan, virtual, udp_multicast, slcan and whatever else it drives."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import can
+
+from protocol.can_framing import CanFrame
+from protocol.transports.base import Backoff, Transport, TransportError
+
+QUEUE_LIMIT: Final = 10_000
+"""Frames that wait for the bus at most."""
+
+RETRY_S: Final = 0.001
+"""Time until the next try when the bus's transmit buffer is full."""
+
+READ_TIMEOUT_S: Final = 0.2
+"""How long the reading thread waits at once (buses without a file descriptor)."""
+
+READS_PER_TURN: Final = 256
+"""Frames read before the loop serves others."""
+
+ECHO_S: Final = 0.5
+"""How long an own frame is expected to come back on buses that echo."""
+
+OpenBus = Callable[[], can.BusABC]
+
+
+class PythonCanTransport(Transport[CanFrame]):
+    """Frames over a python-can bus.
+
+    Parameters
+    ----------
+    description:
+        Specification of the bus.
+    open_bus:
+        Opens it; runs in a thread, since it may block.
+    echoes:
+        The bus hands back what was sent on it (udp_multicast): the echo is taken out again.
+    """
+
+    def __init__(self, description: str, open_bus: OpenBus, *, echoes: bool = False) -> None:
+        super().__init__(description)
+        self._open_bus = open_bus
+        self._echoes: deque[tuple[float, CanFrame]] | None = deque() if echoes else None
+        self._bus: can.BusABC | None = None
+        self._fd = -1
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._queue: deque[CanFrame] = deque()
+        self._timer: asyncio.TimerHandle | None = None
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self._comeback: asyncio.Task[None] | None = None
+        self._closing = False
+
+    async def _open(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            self._bus = await asyncio.to_thread(self._open_bus)
+        except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
+            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            raise TransportError(f"CAN {self.description}: cannot open: {reason}") from None
+        self._fd = _descriptor(self._bus)
+        if self._fd >= 0:
+            loop.add_reader(self._fd, self._readable)
+        else:
+            self._stop = threading.Event()
+            self._thread = threading.Thread(
+                target=self._read_in_thread,
+                args=(self._bus, self._stop, loop),
+                name="can-reader",
+                daemon=True,
+            )
+            self._thread.start()
+
+    def _readable(self) -> None:
+        for _ in range(READS_PER_TURN):
+            bus = self._bus
+            if bus is None:
+                return
+            try:
+                message = bus.recv(0)
+            except (can.CanError, OSError, ValueError) as error:
+                self._lost(str(error))
+                return
+            if message is None:
+                return
+            self._take(message)
+        # what the bus object has buffered raises no event of its own
+        asyncio.get_running_loop().call_soon(self._readable)
+
+    def _read_in_thread(
+        self, bus: can.BusABC, stop: threading.Event, loop: asyncio.AbstractEventLoop
+    ) -> None:
+        while not stop.is_set():
+            try:
+                message = bus.recv(READ_TIMEOUT_S)
+            except (can.CanError, OSError, ValueError) as error:
+                if not stop.is_set():
+                    self._from_thread(loop, partial(self._lost, str(error)))
+                return
+            if message is not None:
+                self._from_thread(loop, partial(self._take, message))
+
+    @staticmethod
+    def _from_thread(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
+        # the loop may have ended while the bus was being read
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(call)
+
+    def _take(self, message: can.Message) -> None:
+        if message.is_error_frame or message.is_fd or self._bus is None:
+            return
+        frame = CanFrame(
+            message.arbitration_id,
+            b"" if message.is_remote_frame else bytes(message.data),
+            message.is_extended_id,
+            message.is_remote_frame,
+            message.timestamp or None,
+        )
+        if self._echoes is not None and self._is_echo(frame):
+            return
+        self.statistics.received += 1
+        self._receive(frame)
+
+    def _is_echo(self, frame: CanFrame) -> bool:
+        """Whether the frame is one of ours coming back; it is then no longer expected."""
+        if self._echoes is None:
+            return False
+        now = time.monotonic()
+        while self._echoes and now - self._echoes[0][0] > ECHO_S:
+            self._echoes.popleft()
+        bare = CanFrame(frame.id, frame.data, frame.extended, frame.remote)
+        for index, (_, own) in enumerate(self._echoes):
+            if own == bare:
+                del self._echoes[index]
+                return True
+        return False
+
+    def send(self, item: CanFrame) -> bool:
+        """Queue a frame, and send it at once if the bus takes it."""
+        if self._bus is None or len(self._queue) >= QUEUE_LIMIT:
+            self.statistics.dropped += 1
+            return False
+        self._queue.append(item)
+        if self._timer is None:
+            self._work()
+        return True
+
+    def _work(self) -> None:
+        self._timer = None
+        while self._queue and self._bus is not None:
+            frame = self._queue[0]
+            try:
+                self._bus.send(_message(frame), timeout=0)
+            except (can.CanError, OSError) as error:
+                if not _is_full(error):
+                    self._lost(str(error))
+                    return
+                self._idle.clear()
+                self._timer = asyncio.get_running_loop().call_later(RETRY_S, self._work)
+                return
+            self._queue.popleft()
+            self.statistics.sent += 1
+            if self._echoes is not None:
+                bare = CanFrame(frame.id, frame.data, frame.extended, frame.remote)
+                self._echoes.append((time.monotonic(), bare))
+        self._idle.set()
+
+    def _lost(self, why: str) -> None:
+        if self._closing or self._bus is None:
+            return
+        self._release()
+        self._complain(f"CAN {self.description}: lost: {why}; waiting for it to come back")
+        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
+
+    async def _come_back(self) -> None:
+        pause = Backoff()
+        while self._bus is None:
+            await asyncio.sleep(pause.next())
+            with contextlib.suppress(TransportError):
+                await self._open()
+        self.statistics.reconnects += 1
+        self._comeback = None
+
+    def _release(self) -> None:
+        """Let go of the bus and of what was waiting for it."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self.statistics.dropped += len(self._queue)
+        self._queue.clear()
+        self._idle.set()
+        if self._fd >= 0:
+            asyncio.get_running_loop().remove_reader(self._fd)
+            self._fd = -1
+        self._stop.set()
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            with contextlib.suppress(can.CanError, OSError):
+                bus.shutdown()
+
+    async def drain(self) -> None:
+        """Wait until the bus has taken all that was queued."""
+        await self._idle.wait()
+
+    async def close(self) -> None:
+        """Leave the bus."""
+        self._closing = True
+        if self._comeback is not None:
+            self._comeback.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._comeback
+            self._comeback = None
+        self._release()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            await asyncio.to_thread(thread.join, 2 * READ_TIMEOUT_S)
+
+
+def _descriptor(bus: can.BusABC) -> int:
+    """File descriptor that tells when the bus has frames, or -1."""
+    try:
+        return bus.fileno()
+    except (NotImplementedError, OSError):
+        return -1
+
+
+def _message(frame: CanFrame) -> can.Message:
+    return can.Message(
+        arbitration_id=frame.id,
+        data=frame.data,
+        is_extended_id=frame.extended,
+        is_remote_frame=frame.remote,
+        dlc=len(frame.data),
+    )
+
+
+def _is_full(error: Exception) -> bool:
+    """Whether a failed send means only that the bus takes no more for the moment."""
+    if isinstance(error, can.CanTimeoutError):
+        return True
+    code = getattr(error, "error_code", None) or getattr(error, "errno", None)
+    return code in (11, 105) or "buffer full" in str(error).lower()

@@ -1,0 +1,424 @@
+"""Serial transports: an own pseudo-terminal, a real tty, and TCP sockets in place of one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import select
+import tty
+from abc import abstractmethod
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+import serial
+
+from protocol.errors import ProtocolError
+from protocol.serial_framing import PacingSchedule
+from protocol.transports.base import Backoff, Transport, TransportError
+from protocol.transports.paced_writer import PacedWriter
+
+READ_SIZE: Final = 65536
+DEFAULT_BAUD: Final = 115200
+
+SerialTransport = Transport[bytes]
+
+
+def open_serial(
+    spec: str = "auto", baud: int = DEFAULT_BAUD, *, symlink: Path | None = None, paced: bool | None = None
+) -> SerialTransport:
+    """Make the serial transport that a specification names; it is opened by `start`.
+
+    Parameters
+    ----------
+    spec:
+        `auto` or `pty` for an own pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
+        `listen://HOST:PORT` to wait for one peer (port 0: a free one, told by `description`).
+    baud:
+        Bit rate, 8N1. It sets the pace of what is sent, and a real tty's hardware.
+    symlink:
+        Path that shall lead to the pseudo-terminal; made in one step, removed at close.
+    paced:
+        Whether bytes leave no faster than the bit rate. By default yes, except on a real tty, which does it itself.
+
+    Raises
+    ------
+    TransportError
+        The specification is none of these.
+    """
+    schedule = PacingSchedule(baud)
+    pace = schedule if paced is None or paced else None
+    if spec in ("auto", "pty"):
+        return PtyTransport(pace, symlink)
+    if symlink is not None:
+        raise TransportError(f"serial {spec}: a symlink goes only with a pseudo-terminal (auto)")
+    if spec.startswith(("socket://", "listen://")):
+        host, port = _host_and_port(spec)
+        transport = _ConnectTransport if spec.startswith("socket") else _ListenTransport
+        return transport(host, port, pace)
+    if "://" in spec:
+        raise TransportError(
+            f"serial {spec}: must be auto, a tty's path, socket://HOST:PORT or listen://HOST:PORT"
+        )
+    if paced is None and not os.path.realpath(spec).startswith("/dev/pts/"):
+        pace = None
+    return TtyTransport(spec, baud, pace)
+
+
+def _host_and_port(spec: str) -> tuple[str, int]:
+    try:
+        parts = urlsplit(spec)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not host or port is None:
+        raise TransportError(f"serial {spec}: must be {spec.partition(':')[0]}://HOST:PORT")
+    return host, port
+
+
+class _PacedTransport(Transport[bytes]):
+    """Common part: the paced writer in front of the port."""
+
+    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
+        super().__init__(description)
+        self._schedule = schedule
+        self._writer: PacedWriter | None = None
+        self._closing = False
+
+    @abstractmethod
+    def _write(self, data: bytes) -> int:
+        """Write without blocking; return how many bytes were taken."""
+
+    def _make_writer(self) -> None:
+        self._writer = PacedWriter(self._write, self._schedule, self.statistics)
+
+    def send(self, item: bytes) -> bool:
+        if self._writer is None:
+            self.statistics.dropped += len(item)
+            return False
+        return self._writer.send(item)
+
+    async def drain(self) -> None:
+        if self._writer is not None:
+            await self._writer.drain()
+
+    def _drop_writer(self) -> None:
+        if self._writer is not None:
+            self._writer.clear()
+            self._writer = None
+
+    def _take(self, data: bytes) -> None:
+        self.statistics.received += len(data)
+        self._receive(data)
+
+
+def _write_fd(fd: int, data: bytes) -> int:
+    try:
+        return os.write(fd, data)
+    except BlockingIOError:
+        return 0
+
+
+class PtyTransport(_PacedTransport):
+    """An own pseudo-terminal; the peer opens its slave side like any tty, as often as it wants."""
+
+    def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
+        super().__init__("pty", schedule)
+        self._symlink = symlink
+        self._master = self._slave = -1
+
+    async def _open(self) -> None:
+        try:
+            self._master, self._slave = os.openpty()
+        except OSError as error:
+            raise TransportError(
+                f"serial pty: the system gives no pseudo-terminal: {error.strerror}"
+            ) from None
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        path = os.ttyname(self._slave)
+        if self._symlink is not None:
+            try:
+                self._link(self._symlink, path)
+            except TransportError:
+                self._close_ends()
+                raise
+        self.description = str(self._symlink) if self._symlink is not None else path
+        self._make_writer()
+        asyncio.get_running_loop().add_reader(self._master, self._readable)
+
+    def _link(self, link: Path, path: str) -> None:
+        try:
+            if link.exists() and not link.is_symlink():
+                raise TransportError(f"serial: {link} exists and is no symlink; choose another name")
+            fresh = link.with_name(f".{link.name}.{os.getpid()}")
+            fresh.symlink_to(path)
+            fresh.replace(link)
+        except OSError as error:
+            raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._master, READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            asyncio.get_running_loop().remove_reader(self._master)
+            self._complain(f"serial {self.description}: {error.strerror}")
+            return
+        self._take(data)
+
+    def _write(self, data: bytes) -> int:
+        return _write_fd(self._master, data)
+
+    async def close(self) -> None:
+        """Give the pseudo-terminal back and take away the symlink, if it still leads here."""
+        if self._master < 0:
+            return
+        asyncio.get_running_loop().remove_reader(self._master)
+        self._drop_writer()
+        if self._symlink is not None:
+            with contextlib.suppress(OSError):
+                if str(self._symlink.readlink()) == os.ttyname(self._slave):
+                    self._symlink.unlink()
+        self._close_ends()
+
+    def _close_ends(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+        self._master = self._slave = -1
+
+
+class _LossyTransport(_PacedTransport):
+    """A port that may vanish: tells so once, then tries to get it back with growing pauses."""
+
+    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
+        super().__init__(description, schedule)
+        self._comeback: asyncio.Task[None] | None = None
+
+    @abstractmethod
+    async def _connect(self) -> None:
+        """Open the port or raise TransportError."""
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Let go of the port, whatever its state."""
+
+    async def _open(self) -> None:
+        await self._connect()
+        self._make_writer()
+
+    def _lost(self, why: str) -> None:
+        if self._closing or self._comeback is not None:
+            return
+        self._disconnect()
+        self._drop_writer()
+        self._complain(f"serial {self.description}: lost: {why}; waiting for it to come back")
+        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
+
+    async def _come_back(self) -> None:
+        pause = Backoff()
+        while True:
+            await asyncio.sleep(pause.next())
+            try:
+                await self._connect()
+            except ProtocolError:
+                continue
+            self._make_writer()
+            self.statistics.reconnects += 1
+            self._comeback = None
+            return
+
+    async def close(self) -> None:
+        self._closing = True
+        if self._comeback is not None:
+            self._comeback.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._comeback
+            self._comeback = None
+        self._disconnect()
+        self._drop_writer()
+
+
+class TtyTransport(_LossyTransport):
+    """A tty opened by its path, through pyserial."""
+
+    def __init__(self, path: str, baud: int, schedule: PacingSchedule | None) -> None:
+        super().__init__(path, schedule)
+        self._path = path
+        self._baud = baud
+        self._port: serial.Serial | None = None
+
+    async def _connect(self) -> None:
+        path = Path(self._path)
+        if path.exists() and not path.is_char_device():
+            raise TransportError(f"serial {self._path}: is no tty")
+        try:
+            self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:
+            raise TransportError(_tty_problem(self._path, self._baud, error)) from None
+        asyncio.get_running_loop().add_reader(self._port.fileno(), self._readable)
+
+    def _readable(self) -> None:
+        if self._port is None:
+            return
+        try:
+            data = os.read(self._port.fileno(), READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lost(error.strerror or str(error))
+            return
+        if data:
+            self._take(data)
+        elif _hung_up(self._port.fileno()):
+            self._lost("hung up")
+
+    def _write(self, data: bytes) -> int:
+        if self._port is None:
+            raise OSError(errno.EIO, "port is closed")
+        try:
+            return _write_fd(self._port.fileno(), data)
+        except OSError as error:
+            self._lost(error.strerror or str(error))
+            raise
+
+    def _disconnect(self) -> None:
+        if self._port is not None:
+            asyncio.get_running_loop().remove_reader(self._port.fileno())
+            with contextlib.suppress(OSError):
+                self._port.close()
+            self._port = None
+
+
+def _hung_up(fd: int) -> bool:
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    return any(event & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, event in poll.poll(0))
+
+
+def _tty_problem(path: str, baud: int, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if isinstance(error, ValueError):
+        return f"serial {path}: bit rate {baud} is not possible here"
+    if number in (errno.EBUSY, errno.EAGAIN):
+        return f"serial {path}: busy, another program holds it; close that one"
+    if number == errno.ENOENT:
+        return f"serial {path}: no such port; plug the adapter in, or name another (auto makes a pseudo-terminal)"
+    if number == errno.EACCES:
+        return f"serial {path}: no permission; join the group that owns it (often dialout)"
+    return f"serial {path}: cannot open: {os.strerror(number) if number else error}"
+
+
+class _StreamProtocol(asyncio.Protocol):
+    """Hands what a TCP connection brings to its transport."""
+
+    def __init__(self, owner: _TcpTransport) -> None:
+        self._owner = owner
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if isinstance(transport, asyncio.Transport):
+            self._owner.attach(self, transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._owner.take(self, data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._owner.detach(self, exc)
+
+
+class _TcpTransport(_LossyTransport):
+    """Common part of both TCP forms."""
+
+    def __init__(self, scheme: str, host: str, port: int, schedule: PacingSchedule | None) -> None:
+        super().__init__(f"{scheme}://{host}:{port}", schedule)
+        self._host = host
+        self._port = port
+        self._stream: asyncio.Transport | None = None
+        self._protocol: _StreamProtocol | None = None
+
+    def attach(self, protocol: _StreamProtocol, stream: asyncio.Transport) -> None:
+        """Take a connection into use; a second one beside it is refused."""
+        if self._stream is not None:
+            stream.abort()
+            return
+        self._stream, self._protocol = stream, protocol
+
+    def take(self, protocol: _StreamProtocol, data: bytes) -> None:
+        """Take bytes of the connection in use."""
+        if protocol is self._protocol:
+            self._take(data)
+
+    def detach(self, protocol: _StreamProtocol, error: Exception | None) -> None:
+        """Note that a connection has ended."""
+        if protocol is self._protocol:
+            self._stream = self._protocol = None
+            self._ended(str(error) if error else "closed by the peer")
+
+    @abstractmethod
+    def _ended(self, why: str) -> None:
+        """React to the end of the connection."""
+
+    def _write(self, data: bytes) -> int:
+        if self._stream is None:
+            raise OSError(errno.ENOTCONN, "no peer")
+        if self._stream.get_write_buffer_size() > READ_SIZE:
+            return 0
+        self._stream.write(data)
+        return len(data)
+
+    def _disconnect(self) -> None:
+        if self._stream is not None:
+            self._stream.abort()
+            self._stream = self._protocol = None
+
+
+class _ConnectTransport(_TcpTransport):
+    """A TCP connection to a serial server."""
+
+    def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
+        super().__init__("socket", host, port, schedule)
+
+    async def _connect(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
+        except OSError as error:
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            raise TransportError(
+                f"serial {self.description}: cannot connect: {reason}; start the peer first"
+            ) from None
+
+    def _ended(self, why: str) -> None:
+        self._lost(why)
+
+
+class _ListenTransport(_TcpTransport):
+    """A TCP port that one peer at a time may connect to; without a peer, bytes vanish as on an open line."""
+
+    def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
+        super().__init__("listen", host, port, schedule)
+        self._server: asyncio.Server | None = None
+
+    async def _connect(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            self._server = await loop.create_server(lambda: _StreamProtocol(self), self._host, self._port)
+        except OSError as error:
+            raise TransportError(
+                f"serial {self.description}: cannot listen: {error.strerror}; choose another port"
+            ) from None
+        self._port = self._server.sockets[0].getsockname()[1]
+        self.description = f"socket://{self._host}:{self._port}"
+
+    def _ended(self, why: str) -> None:  # noqa: ARG002 (the peer may come and go)
+        if self._writer is not None:
+            self._writer.clear()
+
+    def _disconnect(self) -> None:
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        super()._disconnect()
