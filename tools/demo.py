@@ -1,0 +1,203 @@
+"""Run the product end to end: the emulator and an OBC as two processes, over a pty and then over CAN.
+
+Prints a table of truth against measured attitude and writes pictures; the exit status is 0 only if every check holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.errors import BenchError
+from starid.attitude import Attitude
+
+CROSS_LIMIT_ARCSEC = 60.0
+ROLL_LIMIT_ARCSEC = 300.0
+READY_WITHIN_S = 300.0
+"""The first start on a machine compiles the kernels and builds the index of the catalogue."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One session of the demo: the script, the link it uses, and what its samples showed."""
+
+    script: str
+    link: str
+    channel: str
+
+    @property
+    def folder_name(self) -> str:
+        """Folder of this leg's logs below the output folder."""
+        return self.link
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Measured against true attitude over the samples of one leg; arrays have one entry a frame."""
+
+    time_s: np.ndarray[Any, np.dtype[np.float64]]
+    cross_arcsec: np.ndarray[Any, np.dtype[np.float64]]
+    roll_arcsec: np.ndarray[Any, np.dtype[np.float64]]
+    rate_deg_s: np.ndarray[Any, np.dtype[np.float64]]
+    reply_ms: np.ndarray[Any, np.dtype[np.float64]]
+    latency_ms: np.ndarray[Any, np.dtype[np.float64]]
+    invalid: int
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file by column name."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Comparison:
+    """Join the samples that the OBC took with the emulator's own record of the truth, frame by frame."""
+    by_frame = {int(row["frame"]): row for row in truth}
+    rows: dict[int, tuple[float, ...]] = {}
+    invalid = 0
+    for sample in samples:
+        if sample["valid"] not in ("True", "true", "1"):
+            invalid += 1
+            continue
+        frame = int(sample["frame_counter"])
+        true_row = by_frame[frame]
+        measured = Attitude.from_quaternion([float(sample[f"q_{axis}"]) for axis in "xyzw"])
+        error = measured.error_to(
+            Attitude.from_quaternion([float(true_row[f"true_q{axis}"]) for axis in "xyzw"])
+        )
+        rate = float(np.linalg.norm([float(sample[f"rate_{axis}"]) for axis in "xyz"]))
+        rows.setdefault(
+            frame,
+            (
+                float(sample["time_of_exposure"]),
+                error.cross_boresight_arcsec,
+                error.roll_arcsec,
+                rate,
+                float(sample["latency_ms"]),
+                float(sample["latency"]),
+            ),
+        )
+    columns = np.array(list(rows.values()), float).reshape(-1, 6).T
+    return Comparison(*columns, invalid=invalid)
+
+
+def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
+    """Run the OBC's session as a process of its own; True if every step went as expected."""
+    folder = out / leg.folder_name
+    command = [
+        str(Path(sys.executable).with_name("starhil")), "session", leg.script, f"--{leg.link}", leg.channel,
+        "--log", str(folder), "--junit", str(folder / "junit.xml"), "--truth", str(truth_log),
+    ]  # fmt: skip
+    return subprocess.run(command, check=False).returncode == 0
+
+
+def plot(comparisons: dict[str, Comparison], path: Path) -> None:
+    """Draw the attitude error over the time of each leg."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(len(comparisons), 1, figsize=(9, 3 * len(comparisons)), layout="constrained")
+    for axis, (name, found) in zip(np.atleast_1d(axes), comparisons.items(), strict=True):
+        start = found.time_s[0]
+        axis.plot(found.time_s - start, found.cross_arcsec, ".-", label="boresight")
+        axis.plot(found.time_s - start, found.roll_arcsec, ".-", label="roll")
+        axis.set_title(
+            f"{name}: median body rate {np.median(found.rate_deg_s):.2f}°/s, {len(found.time_s)} frames"
+        )
+        axis.set_xlabel("time of exposure, s")
+        axis.set_ylabel("error to the truth, arcsec")
+        axis.set_yscale("log")
+        axis.grid(visible=True, which="both", alpha=0.3)
+        axis.legend()
+    figure.savefig(path, dpi=110)
+
+
+def report(comparisons: dict[str, Comparison], console: Console) -> bool:
+    """Print truth against measured attitude; True if every figure is within its limit."""
+    table = Table(title="Measured attitude against the truth, as the OBC read it")
+    for column in (
+        "link", "frames", "invalid", "body rate °/s", "boresight ″ median", "max", "roll ″ median", "max",
+        "exposure → attitude ms", "reply ms median", "p99", "within limits",
+    ):  # fmt: skip
+        table.add_column(column, justify="right")
+    all_good = True
+    for name, found in comparisons.items():
+        good = (
+            len(found.time_s) > 0
+            and found.invalid == 0
+            and found.cross_arcsec.max() <= CROSS_LIMIT_ARCSEC
+            and found.roll_arcsec.max() <= ROLL_LIMIT_ARCSEC
+        )
+        all_good = all_good and good
+        table.add_row(
+            name,
+            str(len(found.time_s)),
+            str(found.invalid),
+            f"{np.median(found.rate_deg_s):.3f}",
+            f"{np.median(found.cross_arcsec):.1f}",
+            f"{found.cross_arcsec.max():.1f}",
+            f"{np.median(found.roll_arcsec):.1f}",
+            f"{found.roll_arcsec.max():.1f}",
+            f"{np.median(found.latency_ms):.1f}",
+            f"{np.median(found.reply_ms):.2f}",
+            f"{np.percentile(found.reply_ms, 99):.2f}",
+            "yes" if good else "NO",
+        )
+    console.print(table)
+    return all_good
+
+
+def main() -> int:
+    """Run the demo; 0 if every check holds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/demo"), help="folder for logs, tables and pictures"
+    )
+    out: Path = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    console = Console()
+    truth_log = out / "truth.csv"
+    command = emulator_command(
+        profile="demo", serial="auto", can="auto", state_dir=out / "state", truth_log=truth_log
+    )
+    console.print("Starting the emulator; the first start on a machine compiles for a few minutes.")
+    begin = time.monotonic()
+    try:
+        with EmulatorProcess(command, ready_within_s=READY_WITHIN_S) as emulator:
+            console.print(f"Emulator ready after {time.monotonic() - begin:.1f} s: {emulator.ready}")
+            legs = (
+                Leg("demo_serial", "serial", emulator.ready["serial"]),
+                Leg("demo_can", "can", emulator.ready["can"]),
+            )
+            passed = [run_leg(leg, out, truth_log) for leg in legs]
+    except BenchError as error:
+        console.print(f"demo: {error}", style="red")
+        return 1
+    if not all(passed):
+        console.print("demo: a session failed; its steps stand above", style="red")
+        return 1
+    truth = read_csv(truth_log)
+    comparisons = {leg.link: compare(read_csv(out / leg.folder_name / "attitude.csv"), truth) for leg in legs}
+    good = report(comparisons, console)
+    plot(comparisons, out / "error.png")
+    console.print(
+        f"Pictures: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_1024.png. Logs beside them."
+    )
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
