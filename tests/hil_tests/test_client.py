@@ -1,0 +1,208 @@
+"""The OBC client over a pty (three dialects) and over the TCP hub, against a device of canned answers."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from hil_tests.client import ObcClient
+from hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
+from hil_tests.raw_exchange import send_and_listen
+from protocol.errors import ProtocolError
+from protocol.messages import ErrorCode
+from protocol.serial_framing import Dialect
+from tests.hil_tests.fake_device import EDGE, FakeDevice
+
+TIMEOUT_S = 0.15
+LINKS = ["serial-a", "serial-b", "serial-c", "can"]
+
+
+@pytest.fixture(params=LINKS)
+def pair(request, hub):
+    """A device and a client on it."""
+    with FakeDevice() as device:
+        if request.param == "can":
+            options = {"can": device.open_can(hub)}
+        else:
+            device.dialect = Dialect(request.param[-1])
+            options = {"serial": device.open_serial(), "dialect": request.param[-1]}
+        with ObcClient.open(**options, timeout_s=TIMEOUT_S) as client:
+            yield device, client
+
+
+def test_telemetry_comes_in_physical_units(pair):
+    device, client = pair
+    device.telemetry["rates"] = {"rate_x": 0.3, "rate_y": -0.0001, "rate_z": 0.0}
+    device.telemetry["precise_attitude"] = {"valid": True, "mode": "tracking", "q_w": 1.0}
+    assert client.telemetry("rates") == pytest.approx({"rate_x": 0.3, "rate_y": -0.0001, "rate_z": 0.0})
+    reading = client.read("precise_attitude")
+    assert (reading["valid"], reading["mode"], reading["q_w"]) == (True, "tracking", 1.0)
+    assert 0.0 < reading.latency_s < TIMEOUT_S
+
+
+def test_a_telecommand_reaches_the_device_as_it_was_given(pair):
+    device, client = pair
+    acknowledge = client.command("set_unix_time", seconds=0x1F1F1F1F, milliseconds=31)
+    assert acknowledge.name == "set_unix_time"
+    assert device.received == [("set_unix_time", {"seconds": 0x1F1F1F1F, "milliseconds": 31})]
+    values = client.icd.telecommands["set_star_config"].example()
+    client.command("set_star_config", values)
+    assert device.received[1][0] == "set_star_config"
+    assert device.received[1][1] == pytest.approx(values)
+
+
+@pytest.mark.parametrize("code", [ErrorCode.INVALID_PARAMETER, ErrorCode.BUSY, ErrorCode.SEQUENCE])
+def test_a_refusal_is_an_error_of_its_own_with_the_published_code(pair, code):
+    device, client = pair
+    device.refuse["save_image"] = code
+    device.refuse["rates"] = code
+    with pytest.raises(NackError) as caught:
+        client.command("save_image", image_size="size_64")
+    assert (caught.value.code, caught.value.code_name) == (code, code.name.lower())
+    with pytest.raises(NackError) as caught:
+        client.read("rates")
+    assert caught.value.code == code
+    assert client.transactions[-1].outcome == code.name.lower()
+
+
+def test_names_that_are_not_in_the_definition_are_refused_before_anything_is_sent(pair):
+    device, client = pair
+    with pytest.raises(ProtocolError, match="set_mode"):
+        client.command("set_mod", mode="standby")
+    with pytest.raises(ProtocolError, match="quaternion"):
+        client.read("quaternoin")
+    with pytest.raises(ProtocolError, match="set_mode"):
+        client.command("set_mode", mode="dancing")
+    assert device.received == []
+    assert client.transactions == []
+
+
+def test_no_reply_is_an_error_after_the_time_out_and_is_tried_again_only_if_asked(pair):
+    device, client = pair
+    device.mute = 1
+    with pytest.raises(NoReplyError, match=r"rates: no reply within 0\.15 s"):
+        client.read("rates")
+    device.mute = 2
+    assert client.read("rates", retries=2).latency_s < TIMEOUT_S
+    device.mute = 2
+    with pytest.raises(NoReplyError, match="2 attempts"):
+        client.read("rates", retries=1)
+    client.read("rates")
+    assert [item.outcome for item in client.transactions] == ["no_reply"] * 3 + ["ok"] + ["no_reply"] * 2 + [
+        "ok"
+    ]
+
+
+def test_a_late_reply_is_not_taken_for_that_of_the_next_request(pair):
+    device, client = pair
+    device.telemetry["rates"] = {"rate_x": 1.0}
+    device.telemetry["quaternion"] = {"q_x": 0.5}
+    device.mute, device.late_s = 1, TIMEOUT_S + 0.02
+    with pytest.raises(NoReplyError):
+        client.read("rates")
+    time.sleep(0.05)
+    assert client.telemetry("quaternion")["q_x"] == 0.5
+
+
+def test_a_request_by_number_may_be_one_that_nobody_defined(pair):
+    _device, client = pair
+    for identifier in (200, 60):
+        with pytest.raises(NackError) as caught:
+            client.request(identifier, b"\x01\x02")
+        assert caught.value.code == ErrorCode.INVALID_ID
+
+
+def test_parameters_go_by_name_and_in_their_own_type(pair):
+    _device, client = pair
+    client.set_parameter("exposure", 250)
+    client.set_parameter("tracking_enable", value=False)
+    client.set_parameter("start_mode", "lost_in_space")
+    client.set_parameter("limiting_magnitude", 5.5)
+    assert client.get_parameter("exposure") == 250
+    assert client.get_parameter("tracking_enable") is False
+    assert client.get_parameter("start_mode") == "lost_in_space"
+    assert client.get_parameter("limiting_magnitude") == 5.5
+    with pytest.raises(ProtocolError, match="exposure"):
+        client.set_parameter("exposure", 1e9)
+
+
+def test_waiting_ends_when_the_condition_holds_or_the_time_is_over(pair):
+    device, client = pair
+    device.telemetry["precise_attitude"] = {"valid": False}
+    with pytest.raises(BenchError, match="precise_attitude"):
+        client.wait_for(
+            "precise_attitude", lambda reading: bool(reading["valid"]), within_s=0.1, every_s=0.02
+        )
+    device.telemetry["precise_attitude"] = {"valid": True, "frame_counter": 7}
+    reading = client.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=1.0)
+    assert reading["frame_counter"] == 7
+
+
+def test_an_image_is_downloaded_frame_by_frame(pair):
+    device, client = pair
+    device.bad_checksums = 2
+    image = client.download_image("size_64")
+    assert (image.width, image.height, image.repeats) == (EDGE, EDGE, 2)
+    assert image.pixels == device.pixels
+
+
+def test_a_frame_that_stays_wrong_ends_the_download(pair):
+    device, client = pair
+    device.bad_checksums = 1000
+    with pytest.raises(BadReplyError, match="image frame 0: checksum"):
+        client.download_image("size_64")
+
+
+def test_an_image_is_downloaded_by_bursts_and_lost_packets_are_asked_for_again(pair):
+    device, client = pair
+    device.lost_packets = {0, 1, 17, 130, 200}
+    image = client.download_image("size_64", method="burst")
+    assert (image.width, image.height, image.repeats) == (EDGE, EDGE, 1)
+    assert image.pixels == device.pixels
+
+
+def test_unsolicited_telemetry_is_a_stream_of_its_own(hub):
+    with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=TIMEOUT_S) as client:
+        client.read("rates")
+        for count in range(3):
+            device.say("precise_attitude", {"frame_counter": count, "valid": True})
+            device.say("rates", {"rate_x": 0.1 * count})
+        client.read("identification")
+        counts = [client.wait_unsolicited("precise_attitude")["frame_counter"] for _ in range(3)]
+        assert counts == [0, 1, 2]
+        with pytest.raises(NoReplyError, match="unsolicited"):
+            client.wait_unsolicited("precise_attitude", timeout_s=0.05)
+        assert client.stray_replies == []
+
+
+def test_bytes_and_frames_can_be_sent_as_they_stand(pair):
+    device, client = pair
+    device.telemetry["boot_status"] = {"boot_count": 0x1F}
+    if client.core.link.name == "can":
+        assert send_and_listen(client, ("04810104#",), 0.2) == ("058104" + "01#001F00000000",)
+    else:
+        start, identifier = {Dialect.A: ("7F", "81"), Dialect.B: ("7F", ""), Dialect.C: ("07", "81")}[
+            device.dialect
+        ]
+        assert send_and_listen(client, ("1F7F", "811FFF"), 0.2) == (
+            f"1F{start}{identifier}001F1F000000001FFF",
+        )
+
+
+def test_ports_that_cannot_be_had_are_refused_in_one_line():
+    with pytest.raises(ProtocolError, match="/dev/no-such-port"):
+        ObcClient.open(serial="/dev/no-such-port")
+    with pytest.raises(ProtocolError, match="starhil hub"):
+        ObcClient.open(can="socketcand:127.0.0.1:1/vcan0")
+    with pytest.raises(BenchError, match="either"):
+        ObcClient.open()
+
+
+def test_a_vanished_port_is_told_from_a_silent_device():
+    device = FakeDevice()
+    with device, ObcClient.open(serial=device.open_serial(), timeout_s=TIMEOUT_S) as client:
+        client.read("rates")
+        device.close_links()
+        with pytest.raises(LinkLostError, match="/dev/pts"):
+            client.read("rates")
