@@ -119,7 +119,7 @@ class Attitude:
             raise StaridError(
                 "attitude matrix: not a rotation; its rows must be orthonormal and right-handed"
             )
-        return cls(_quaternion_of(m))
+        return cls(quaternion_of(m))
 
     @classmethod
     def from_radec_roll(cls, ra_deg: float, dec_deg: float, roll_deg: float) -> Self:
@@ -144,7 +144,7 @@ class Attitude:
         north, east, boresight = _local_frame(math.radians(ra_deg % 360.0), math.radians(dec_deg))
         roll = math.radians(roll_deg % 360.0)
         s, c = math.sin(roll), math.cos(roll)
-        return cls(_quaternion_of(np.array([-s * north - c * east, -c * north + s * east, boresight])))
+        return cls(quaternion_of(np.array([-s * north - c * east, -c * north + s * east, boresight])))
 
     @classmethod
     def identity(cls) -> Self:
@@ -296,8 +296,8 @@ def _multiply(
     )
 
 
-def _quaternion_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scalar-last quaternion (4,) of a rotation matrix, from its largest component (Shepperd 1978)."""
+def quaternion_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scalar-last unit quaternion (4,) of a (nearly) rotation matrix, by its largest part (Shepperd 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
     rows = (

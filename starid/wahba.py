@@ -1,0 +1,315 @@
+"""Wahba's problem: the attitude that best turns reference directions into observed ones.
+
+Wahba (1965) asks for the rotation A that minimises ``½ Σ wᵢ |bᵢ − A rᵢ|²`` over the stars. The five
+estimators that the thesis names (section 1.1, its references 28–35) are here behind one function:
+
+- ``davenport``: the eigenvector of the 4×4 matrix K to its largest eigenvalue (Davenport's q-method);
+- ``quest``: Shuster & Oh 1981, *Three-axis attitude determination from vector observations*;
+- ``esoq2``: Mortari 1997, *ESOQ-2 single-point algorithm for fast optimal spacecraft attitude determination*;
+- ``foam``: Markley 1993, *Attitude determination using vector observations: a fast optimal matrix algorithm*;
+- ``svd``: Markley 1988, *Attitude determination using vector observations and the singular value
+  decomposition*.
+
+The notation is that of the survey Markley & Mortari 2000, *Quaternion attitude estimation using vector
+observations*, J. Astronautical Sciences 48, 359. Inside, quaternions are those of that literature: vector part
+of opposite sign to `starid.attitude`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.attitude import Attitude, quaternion_of
+from starid.errors import StaridError
+
+Method = Literal["davenport", "quest", "esoq2", "foam", "svd"]
+METHODS: Final[tuple[Method, ...]] = get_args(Method)
+"""Names of the estimators."""
+
+Matrix = NDArray[np.float64]
+
+_LEAST_GAP: Final = 1e-12
+"""Distance of the two largest eigenvalues of K, for weights that sum to 1, below which roll is undetermined."""
+
+_CONJUGATE: Final = np.array([-1.0, -1.0, -1.0, 1.0])
+_NEWTON_STEPS: Final = 60
+_POLISHING_PASSES: Final = 2
+
+
+def solve_wahba(
+    body: ArrayLike,
+    reference: ArrayLike,
+    weights: ArrayLike | None = None,
+    method: Method = "davenport",
+) -> Attitude:
+    """Attitude that minimises Wahba's loss.
+
+    Parameters
+    ----------
+    body : array (n, 3)
+        Observed directions in the sensor frame; any length, normalised here. n ≥ 2.
+    reference : array (n, 3)
+        The same stars' directions in ICRS.
+    weights : array (n,), optional
+        Positive weights; the best are 1/σᵢ². Equal by default.
+    method : {"davenport", "quest", "esoq2", "foam", "svd"}
+        The estimator. All give the same attitude to round-off, about 1e-16 over the square of the stars'
+        rms angular spread (radians), at any rotation, half turns included.
+
+    Returns
+    -------
+    Attitude
+        The rotation ICRS→sensor.
+
+    Raises
+    ------
+    StaridError
+        Fewer than two stars, arrays that do not fit each other, bad weights, an unknown method, or
+        directions that leave the attitude undetermined (all on one line).
+    """
+    if method not in _SOLVERS:
+        raise StaridError(f"wahba: method {method!r} given, one of {', '.join(METHODS)} needed")
+    b, r = _directions("body", body), _directions("reference", reference)
+    n = len(b)
+    if len(r) != n:
+        raise StaridError(f"wahba: {n} body and {len(r)} reference directions given, as many of each needed")
+    if n < 2:
+        raise StaridError(f"wahba: {n} star given, at least 2 needed for an attitude")
+    w = np.ones(n) if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape != (n,) or not (np.isfinite(w).all() and (w > 0.0).all()):
+        raise StaridError(f"wahba: {n} positive finite weights needed")
+    profile = (b * (w / w.sum())[:, None]).T @ r
+    singular = np.linalg.svd(profile, compute_uv=False)
+    if singular[1] + np.copysign(singular[2], np.linalg.det(profile)) < _LEAST_GAP:
+        raise StaridError(
+            "wahba: the directions leave the attitude undetermined; stars apart from each other needed"
+        )
+    return _SOLVERS[method](profile)
+
+
+def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Matrix:
+    """Covariance (3, 3), rad², of the attitude's error as a rotation vector in the sensor frame.
+
+    For directions whose error is isotropic about the line of sight with σᵢ an axis, and weights 1/σᵢ²:
+    ``P = [Σ σᵢ⁻² (I − bᵢ bᵢᵀ)]⁻¹`` (Shuster & Oh 1981).
+
+    Parameters
+    ----------
+    body : array (n, 3)
+        Observed directions in the sensor frame.
+    sigma_rad : array (n,) or float
+        Standard deviation of each direction on each of its two axes, radians.
+
+    Raises
+    ------
+    StaridError
+        The arrays do not fit, a sigma is not positive, or the attitude is undetermined.
+    """
+    b = _directions("body", body)
+    sigma = np.asarray(sigma_rad, dtype=np.float64)
+    if sigma.shape not in ((), (len(b),)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+        raise StaridError(f"wahba: {len(b)} positive finite standard deviations needed")
+    information = np.broadcast_to(sigma**-2.0, (len(b),))
+    fisher = information.sum() * np.eye(3) - (b * information[:, None]).T @ b
+    smallest = np.linalg.eigvalsh(fisher)[0] if len(b) else 0.0
+    if not smallest > _LEAST_GAP * information.sum():
+        raise StaridError(
+            "wahba: the directions leave the attitude undetermined; stars apart from each other needed"
+        )
+    inverse: Matrix = np.linalg.inv(fisher)
+    symmetric: Matrix = 0.5 * (inverse + inverse.T)
+    return symmetric
+
+
+def _directions(name: str, values: ArrayLike) -> Matrix:
+    """Unit vectors (n, 3), or an error that names the array."""
+    try:
+        table = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise StaridError(
+            f"wahba: {name} directions are no table of numbers; an array (n, 3) is needed"
+        ) from None
+    if table.ndim != 2 or table.shape[1] != 3:
+        raise StaridError(f"wahba: {name} directions of shape {table.shape} given, (n, 3) needed")
+    norms = np.linalg.norm(table, axis=1)
+    if not (np.isfinite(norms).all() and (norms > 0.0).all()):
+        raise StaridError(f"wahba: {name} directions must be finite and not zero")
+    unit: Matrix = table / norms[:, None]
+    return unit
+
+
+def _davenport_matrix(profile: Matrix) -> Matrix:
+    """K (4, 4) of the attitude profile matrix B = Σ w b rᵀ."""
+    z = np.array(
+        [profile[1, 2] - profile[2, 1], profile[2, 0] - profile[0, 2], profile[0, 1] - profile[1, 0]]
+    )
+    sigma = np.trace(profile)
+    k = np.empty((4, 4))
+    k[:3, :3] = profile + profile.T - sigma * np.eye(3)
+    k[:3, 3] = k[3, :3] = z
+    k[3, 3] = sigma
+    return k
+
+
+def _attitude(quaternion: Matrix) -> Attitude:
+    """Attitude of a quaternion in the convention of the literature."""
+    return Attitude(quaternion * _CONJUGATE)
+
+
+def _largest_eigenvalue(profile: Matrix) -> float:
+    """λ_max of K by Newton's method from its upper bound 1 on the quartic of FOAM (M&M eq. 40).
+
+    ψ(λ) = (λ² − ‖B‖²)² − 8λ det B − 4‖adj B‖². All roots are real, so from above the steps shrink
+    monotonically; they end when they no longer do.
+    """
+    norm2 = float(np.sum(profile * profile))
+    determinant = float(np.linalg.det(profile))
+    adjoint2 = float(np.sum(_adjoint(profile) ** 2))
+    value, last = 1.0, np.inf
+    for _ in range(_NEWTON_STEPS):
+        excess = value * value - norm2
+        slope = 4.0 * value * excess - 8.0 * determinant
+        if slope <= 0.0:
+            break
+        step = (excess * excess - 8.0 * value * determinant - 4.0 * adjoint2) / slope
+        if abs(step) >= last or step == 0.0:
+            break
+        value, last = value - step, abs(step)
+    return value
+
+
+def _adjoint(m: Matrix) -> Matrix:
+    """Adjoint (transposed cofactors) of a 3×3 matrix."""
+    rows: Matrix = np.array([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])]).T
+    return rows
+
+
+def _polished(profile: Matrix, quaternion_at: Callable[[float], Matrix]) -> Matrix:
+    """Quaternion at λ_max, with λ improved by the Rayleigh quotient.
+
+    The quartic loses digits of λ when two eigenvalues are close (stars close together, two stars). The
+    Rayleigh quotient qᵀKq of the first answer is right to second order and restores them.
+    """
+    k = _davenport_matrix(profile)
+    quaternion = quaternion_at(_largest_eigenvalue(profile))
+    for _ in range(_POLISHING_PASSES):
+        quaternion = quaternion_at(float(quaternion @ k @ quaternion))
+    return quaternion
+
+
+def _with_reference_turned(profile: Matrix, axis: int) -> Matrix:
+    """Profile matrix after the reference frame has made half a turn about an axis; 3 means none."""
+    if axis == 3:
+        return profile
+    signs = np.full(3, -1.0)
+    signs[axis] = 1.0
+    turned: Matrix = profile * signs
+    return turned
+
+
+def _turned_back(quaternion: Matrix, axis: int) -> Matrix:
+    """Undo `_with_reference_turned`: the quaternion of A = A'·R(axis, 180°) (M&M eq. 60)."""
+    x, y, z, w = quaternion.tolist()
+    return np.array([(w, -z, y, -x), (z, w, -x, -y), (-y, x, w, -z), (x, y, z, w)][axis])
+
+
+def _davenport(profile: Matrix) -> Attitude:
+    """Davenport's q-method: K q = λ_max q (M&M eq. 13)."""
+    _, vectors = np.linalg.eigh(_davenport_matrix(profile))
+    return _attitude(vectors[:, -1])
+
+
+def _svd(profile: Matrix) -> Attitude:
+    """B = U Σ Vᵀ, A = U diag(1, 1, det U det V) Vᵀ."""
+    u, _, vt = np.linalg.svd(profile)
+    u[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    return Attitude.from_matrix(u @ vt)
+
+
+def _foam(profile: Matrix) -> Attitude:
+    """A = [(κ + ‖B‖²) B + λ adj Bᵀ − B Bᵀ B] / ζ, ζ = κλ − det B, κ = ½(λ² − ‖B‖²)."""
+    norm2 = float(np.sum(profile * profile))
+    determinant = float(np.linalg.det(profile))
+    cofactors = _adjoint(profile).T
+    cubic = profile @ profile.T @ profile
+
+    def quaternion_at(value: float) -> Matrix:
+        kappa = 0.5 * (value * value - norm2)
+        zeta = kappa * value - determinant
+        matrix = ((kappa + norm2) * profile + value * cofactors - cubic) / zeta
+        conjugated: Matrix = quaternion_of(matrix) * _CONJUGATE
+        return conjugated
+
+    return _attitude(_polished(profile, quaternion_at))
+
+
+def _quest(profile: Matrix) -> Attitude:
+    """QUEST with sequential rotations.
+
+    The Gibbs vector of the answer is singular at half a turn, so the reference frame is turned by half a
+    turn about x, y or z first where that is better. The length of the vector ((αI + βS + S²) z, γ) is the
+    scalar part of the answer times what is common to all four cases, so the longest one is the safest.
+    """
+    value = _largest_eigenvalue(profile)
+    cases = [_quest_vector(_with_reference_turned(profile, axis)) for axis in range(4)]
+    axis = int(np.argmax([float(np.linalg.norm(vector_at(value))) for vector_at in cases]))
+    turned = _with_reference_turned(profile, axis)
+    quaternion = _polished(turned, lambda value: _unit(cases[axis](value)))
+    return _attitude(_turned_back(quaternion, axis))
+
+
+def _quest_vector(profile: Matrix) -> Callable[[float], Matrix]:
+    """Return q ∝ ((αI + βS + S²) z, γ) as a function of λ."""
+    k = _davenport_matrix(profile)
+    sigma, z = float(k[3, 3]), k[:3, 3]
+    s = k[:3, :3] + sigma * np.eye(3)
+    kappa, delta = float(np.trace(_adjoint(s))), float(np.linalg.det(s))
+    sz = s @ z
+    ssz = s @ sz
+
+    def vector_at(value: float) -> Matrix:
+        alpha = value * value - sigma * sigma + kappa
+        gamma = (value + sigma) * alpha - delta
+        return np.append(alpha * z + (value - sigma) * sz + ssz, gamma)
+
+    return vector_at
+
+
+def _esoq2(profile: Matrix) -> Attitude:
+    """ESOQ2: the axis e is the null vector of M = (λ − σ)[(λ + σ)I − S] − z zᵀ.
+
+    It is the largest cross product of two rows. M vanishes at zero rotation, so the reference frame is
+    turned first such that σ = tr B becomes least; then λ − σ ≥ λ.
+    """
+    axis = int(np.argmin(np.diag(_davenport_matrix(profile))))
+    turned = _with_reference_turned(profile, axis)
+    k = _davenport_matrix(turned)
+    sigma, z = float(k[3, 3]), k[:3, 3]
+    s = k[:3, :3] + sigma * np.eye(3)
+
+    def quaternion_at(value: float) -> Matrix:
+        m = (value - sigma) * ((value + sigma) * np.eye(3) - s) - np.outer(z, z)
+        adjoint = _adjoint(m)
+        y = adjoint[:, int(np.argmax(np.abs(np.diag(adjoint))))]
+        return _unit(np.append((value - sigma) * y, z @ y))
+
+    return _attitude(_turned_back(_polished(turned, quaternion_at), axis))
+
+
+def _unit(vector: Matrix) -> Matrix:
+    """Vector of length 1."""
+    scaled: Matrix = vector / np.linalg.norm(vector)
+    return scaled
+
+
+_SOLVERS: Final[dict[str, Callable[[Matrix], Attitude]]] = {
+    "davenport": _davenport,
+    "quest": _quest,
+    "esoq2": _esoq2,
+    "foam": _foam,
+    "svd": _svd,
+}
