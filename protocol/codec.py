@@ -273,7 +273,7 @@ class Field:
         return whole
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Row:
     """A telecommand or telemetry row: its identity, its layout, and the codec between values and bytes."""
 
@@ -289,6 +289,10 @@ class Row:
     doc: str = ""
     provenance: str = "ours"
     source: str = ""
+
+    def __repr__(self) -> str:
+        """Return what tells the row apart."""
+        return f"Row({self.kind} {self.id} {self.name})"
 
     @cached_property
     def named_fields(self) -> Mapping[str, Field]:
