@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from starid.camera import Camera as Camera
     from starid.catalog import StarCatalog as StarCatalog
     from starid.catalog import load_catalog as load_catalog
+    from starid.detection import Detections as Detections
+    from starid.detection import DetectionSettings as DetectionSettings
+    from starid.detection import detect as detect
     from starid.identifier import Identifier as Identifier
     from starid.interface import make_identifier as make_identifier
     from starid.solution import Solution as Solution
@@ -21,9 +24,12 @@ if TYPE_CHECKING:
 _HOMES: Final = {
     "Attitude": "starid.attitude",
     "Camera": "starid.camera",
+    "DetectionSettings": "starid.detection",
+    "Detections": "starid.detection",
     "Identifier": "starid.identifier",
     "Solution": "starid.solution",
     "StarCatalog": "starid.catalog",
+    "detect": "starid.detection",
     "load_catalog": "starid.catalog",
     "make_identifier": "starid.interface",
 }

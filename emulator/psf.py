@@ -1,0 +1,122 @@
+"""Star light on the pixels: a Gaussian spot integrated over each pixel and along the path it takes in an exposure."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.jit_loops import compiled_loops
+
+MOST_GAUSS_NODES: Final = 200
+MOST_NODES: Final = 20_000
+MAX_RADIUS_SIGMA: Final = 7.0
+_NODES_PER_SIGMA: Final = 0.85
+_LEAST_NODES: Final = 3
+_STILL_SIGMA: Final = 1e-3
+_CUT_E: Final = 0.01
+_SQRT_HALF: Final = math.sqrt(0.5)
+
+
+@lru_cache(maxsize=64)
+def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Nodes on (−1, 1) and weights that sum to 1: Gauss–Legendre, or midpoints where there are very many."""
+    if count > MOST_GAUSS_NODES:
+        nodes = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
+        return nodes, np.full(count, 1.0 / count)
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return nodes.astype(np.float64), 0.5 * weights
+
+
+def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Moments of the exposure at which a moving spot is drawn so that their sum is the smooth trail.
+
+    Parameters
+    ----------
+    longest_px : float
+        Longest path of any star during the exposure, pixels.
+    sigma_px : float
+        Standard deviation of the spot.
+
+    Returns
+    -------
+    nodes, weights : ndarray (n,)
+        Times from −1 (start of the exposure) to 1 (its end), and their weights, which sum to 1. A path of less
+        than a thousandth of the spot gets one node; else the nodes stand closer than a spot's sigma, at which
+        Gauss–Legendre quadrature of a Gaussian is exact to about 1e-5 of its peak.
+    """
+    lengths = longest_px / sigma_px
+    if lengths < _STILL_SIGMA:
+        return _rule(1)
+    return _rule(
+        min(_LEAST_NODES + math.ceil(_NODES_PER_SIGMA * lengths + 2.0 * math.sqrt(lengths)), MOST_NODES)
+    )
+
+
+@compiled_loops
+def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -> None:
+    """Shares of a Gaussian at 0 that fall in `count` unit cells, the first of which begins at `edge`."""
+    scale = _SQRT_HALF / sigma
+    before = math.erf(edge * scale)
+    for k in range(count):
+        after = math.erf((edge + k + 1.0) * scale)
+        out[k] = 0.5 * (after - before)
+        before = after
+
+
+@compiled_loops
+def add_spots(
+    image: npt.NDArray[np.float32],
+    sensitivity: npt.NDArray[np.float32],
+    path: npt.NDArray[np.float64],
+    electrons: npt.NDArray[np.float64],
+    sigma: npt.NDArray[np.float64],
+    nodes: npt.NDArray[np.float64],
+    weights: npt.NDArray[np.float64],
+) -> None:
+    """Add the light of stars to an image of mean electrons, in place.
+
+    Parameters
+    ----------
+    image, sensitivity : ndarray (h, w), float32
+        Mean electrons, added to; relative signal of each pixel.
+    path : ndarray (n, 6)
+        x0, y0, x1, y1, x2, y2: the star is at x0 + x1·t + x2·t² (and so y) at time t, −1…1 over the exposure; pixels.
+    electrons : ndarray (n,)
+        Mean electrons of each star in the whole exposure.
+    sigma : ndarray (n, 2)
+        Standard deviation of each star's spot along x and y, pixels.
+    nodes, weights : ndarray (m,)
+        From `path_rule`.
+    """
+    height, width = image.shape
+    across = np.empty(width)
+    down = np.empty(height)
+    for i in range(electrons.size):
+        total = electrons[i]
+        if not total > 0.0:
+            continue
+        sigma_x, sigma_y = sigma[i, 0], sigma[i, 1]
+        radii = math.sqrt(2.0 * math.log(max(total / _CUT_E, 2.0)))
+        radii = min(radii, MAX_RADIUS_SIGMA)
+        for m in range(nodes.size):
+            t = nodes[m]
+            x = path[i, 0] + t * (path[i, 2] + t * path[i, 4])
+            y = path[i, 1] + t * (path[i, 3] + t * path[i, 5])
+            left = max(math.floor(x - radii * sigma_x + 0.5), 0)
+            right = min(math.floor(x + radii * sigma_x + 0.5), width - 1)
+            top = max(math.floor(y - radii * sigma_y + 0.5), 0)
+            bottom = min(math.floor(y + radii * sigma_y + 0.5), height - 1)
+            if left > right or top > bottom:
+                continue
+            columns = right - left + 1
+            _bell(left - 0.5 - x, sigma_x, across, columns)
+            _bell(top - 0.5 - y, sigma_y, down, bottom - top + 1)
+            share = total * weights[m]
+            for row in range(top, bottom + 1):
+                light = share * down[row - top]
+                for k in range(columns):
+                    image[row, left + k] += np.float32(light * across[k] * sensitivity[row, left + k])

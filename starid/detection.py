@@ -1,0 +1,288 @@
+"""Detection: from an image to stars with sub-pixel positions, fluxes and honest errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.background import Background, estimate_background
+from starid.centroid import CHI2, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
+from starid.errors import StaridError
+from starid.matched_filter import find_peaks, noise_factor, spot_taps
+from starid.measurement import AT_EDGE, SATURATED, measure
+from starid.spot_shape import SpotShape, moments_of, shape_from_moments
+
+LEAST_SIDE_PX: Final = 16
+_ASSUMED_SIGMA_PX: Final = 0.9
+_MOST_PEAKS: Final = 16384
+_STARS_FOR_SHAPE: Final = 40
+_SHAPE_WINDOW_PX: Final = 24
+_OTHER_WIDTH: Final = 0.3
+_FIT_PARAMETERS: Final = 3
+_RELAX: Final = 0.8
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """What detection may know and how careful it is.
+
+    Attributes
+    ----------
+    threshold_sigma : float
+        Least ratio of the smoothed peak to its noise.
+    psf_sigma_px : float or None
+        Standard deviation of a star's spot; estimated from the frame if None.
+    gain_e_per_dn : float or None
+        Electrons a count; with it, shot noise counts in the errors and fluxes are in electrons.
+    saturation_dn : int or None
+        Count from which a pixel is saturated; the largest the image's type can hold if None.
+    model_error : float
+        Share of a star's light in a pixel that the model of the spot may be wrong by.
+    max_stars : int
+        Brightest stars that are kept.
+    block_px : int
+        Side of the blocks in which the background is estimated.
+    follow_trails : bool
+        Whether trails of a turning sensor are looked for.
+    """
+
+    threshold_sigma: float = 5.5
+    psf_sigma_px: float | None = None
+    gain_e_per_dn: float | None = None
+    saturation_dn: int | None = None
+    model_error: float = 0.01
+    max_stars: int = 500
+    block_px: int = 32
+    follow_trails: bool = True
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "threshold_sigma": (1.0, 1000.0),
+            "psf_sigma_px": (0.3, 12.0),
+            "gain_e_per_dn": (1e-6, 1e9),
+            "saturation_dn": (1, 65535),
+            "model_error": (0.0, 1.0),
+            "max_stars": (1, 5000),
+            "block_px": (8, 1024),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise StaridError(f"detection {name}: {value!r} given, {low:g}…{high:g} needed")
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Stars found on a frame, brightest first.
+
+    Attributes
+    ----------
+    xy_px : ndarray (n, 2)
+        Positions; pixel centres are integers. On a trail, its middle.
+    flux, flux_sigma : ndarray (n,)
+        Light and its error, in electrons if the gain was given, else in counts.
+    xy_sigma_px : ndarray (n, 2)
+        Errors of the position along x and y, one standard deviation.
+    saturated, edge : ndarray (n,) of bool
+        The star has saturated pixels; its light is cut by the image's edge.
+    background, noise : float
+        Typical sky level and noise of a pixel, counts.
+    psf_sigma_px : float
+        Width of the spot that was used.
+    trail_px : float
+        Median length of the stars' trails; 0 where they are round.
+    reason : str
+        Why there is no star; empty where there is one.
+    """
+
+    xy_px: npt.NDArray[np.float64]
+    flux: npt.NDArray[np.float64]
+    flux_sigma: npt.NDArray[np.float64]
+    xy_sigma_px: npt.NDArray[np.float64]
+    saturated: npt.NDArray[np.bool_]
+    edge: npt.NDArray[np.bool_]
+    background: float
+    noise: float
+    psf_sigma_px: float
+    trail_px: float
+    reason: str
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.flux)
+
+
+def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = None) -> Detections:
+    """Find the stars of an image.
+
+    Parameters
+    ----------
+    image : ndarray (h, w), uint8 or uint16
+        Counts, one channel, at least 16 × 16 pixels.
+    settings : DetectionSettings, optional
+        What is known of the image.
+
+    Returns
+    -------
+    Detections
+        Empty, with a reason, where nothing stands out.
+
+    Raises
+    ------
+    StaridError
+        The image is not one of the above.
+    """
+    chosen = DetectionSettings() if settings is None else settings
+    counts = _checked(image)
+    saturation = chosen.saturation_dn if chosen.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
+    background = estimate_background(counts, chosen.block_px)
+    if background.median_level >= saturation:
+        return _nothing(background, "image is saturated all over: shorten the exposure")
+    sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
+    peaks, heights = _peaks(counts, background, sigma, chosen.threshold_sigma)
+    shape = _shape(counts, background, peaks, chosen, saturation)
+    if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
+        peaks, heights = _peaks(counts, background, shape.sigma_px, chosen.threshold_sigma)
+        shape = _shape(counts, background, peaks, chosen, saturation, shape.sigma_px)
+    if len(peaks) == 0:
+        flat = float(counts.min()) == float(counts.max())
+        return _nothing(
+            background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
+        )
+    return _measured(counts, background, peaks[: 2 * chosen.max_stars], heights, shape, chosen, saturation)
+
+
+def _checked(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """Refuse what is no grey image of counts; give the rest in the processor's own byte order, rows unbroken."""
+    if not isinstance(image, np.ndarray):
+        raise StaridError(f"image: a {type(image).__name__} given, an array (h, w) of uint8 or uint16 needed")
+    if image.ndim != 2:
+        colour = " (colour: convert it to grey first)" if image.ndim == 3 else ""
+        raise StaridError(f"image: shape {image.shape} given, (h, w) needed{colour}")
+    if image.dtype.kind != "u" or image.dtype.itemsize > 2:
+        raise StaridError(
+            f"image: type {image.dtype} given, uint8 or uint16 needed; scale it to counts first"
+        )
+    if min(image.shape) < LEAST_SIDE_PX:
+        raise StaridError(f"image: {image.shape[1]}×{image.shape[0]} pixels given, at least 16×16 needed")
+    return np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
+
+
+def _nothing(background: Background, reason: str) -> Detections:
+    """Detections without a star."""
+    none = np.zeros(0)
+    pairs = np.zeros((0, 2))
+    no = np.zeros(0, dtype=bool)
+    level, noise = background.median_level, background.median_noise
+    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, reason)
+
+
+def _peaks(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    sigma_px: float,
+    threshold_sigma: float,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+    """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
+    taps = spot_taps(sigma_px)
+    peaks = np.empty((_MOST_PEAKS, 2), dtype=np.int32)
+    heights = np.empty(_MOST_PEAKS, dtype=np.float32)
+    factor = threshold_sigma * noise_factor(taps)
+    count = _MOST_PEAKS
+    while count == _MOST_PEAKS:
+        threshold = (background.level + np.float32(factor) * background.noise).astype(np.float32)
+        count = find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
+        factor *= 1.5
+    heights = heights[:count] + np.float32(factor / 1.5 * background.median_noise)
+    order = np.argsort(-heights, kind="stable")
+    return peaks[:count][order], heights[order]
+
+
+def _shape(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    peaks: npt.NDArray[np.int32],
+    settings: DetectionSettings,
+    saturation: int,
+    assumed: float = _ASSUMED_SIGMA_PX,
+) -> SpotShape:
+    """Spot and trail from the brightest stars that are not saturated."""
+    height, width = counts.shape
+    table = np.empty((_STARS_FOR_SHAPE, 5))
+    start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
+    tries = peaks[: 4 * _STARS_FOR_SHAPE]
+    count = moments_of(
+        counts,
+        tries,
+        background.level,
+        background.block_px,
+        start,
+        _SHAPE_WINDOW_PX,
+        saturation,
+        _STARS_FOR_SHAPE,
+        table,
+    )
+    shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
+    if settings.follow_trails:
+        return shape
+    return dataclasses.replace(shape, trail_field=np.zeros_like(shape.trail_field), trail_px=0.0)
+
+
+def _measured(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    peaks: npt.NDArray[np.int32],
+    heights: npt.NDArray[np.float32],
+    shape: SpotShape,
+    settings: DetectionSettings,
+    saturation: int,
+) -> Detections:
+    """Fit the candidates and keep the stars."""
+    stars = np.zeros((len(peaks), 9))
+    flags = np.zeros(len(peaks), dtype=np.uint8)
+    gain = settings.gain_e_per_dn
+    per_dn = 0.0 if gain is None else 1.0 / gain
+    typical = background.median_noise
+    sensor = (per_dn, settings.model_error, float(saturation), typical)
+    squares = noise_factor(spot_taps(shape.sigma_px)) ** 2
+    limits = (_RELAX * settings.threshold_sigma, squares)
+    measure(
+        counts,
+        peaks,
+        heights,
+        background.level,
+        background.noise,
+        float(background.block_px),
+        shape.sigma_px,
+        shape.trail_field,
+        sensor,
+        limits,
+        stars,
+        flags,
+        2,
+    )
+    good = np.flatnonzero(stars[:, STATE] == GOOD)
+    if good.size == 0:
+        return _nothing(background, "nothing on the image has the shape of a star")
+    good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
+    fits, marks = stars[good], flags[good]
+    freedom = np.maximum(fits[:, PIXELS] - _FIT_PARAMETERS, 1.0)
+    inflation = np.sqrt(np.maximum(fits[:, CHI2] / freedom, 1.0))
+    unit = 1.0 if gain is None else gain
+    return Detections(
+        fits[:, [X, Y]],
+        fits[:, FLUX] * unit,
+        np.sqrt(fits[:, VAR_FLUX]) * inflation * unit,
+        np.sqrt(fits[:, [VAR_X, VAR_Y]]) * inflation[:, None],
+        (marks & SATURATED) != 0,
+        (marks & AT_EDGE) != 0,
+        background.median_level,
+        typical,
+        shape.sigma_px,
+        shape.trail_px,
+        "",
+    )

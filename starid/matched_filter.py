@@ -1,0 +1,211 @@
+"""Candidates for stars: local maxima of the image smoothed by the star's own profile, above the noise.
+
+Smoothing with the profile of a star is the linear filter with the best signal-to-noise ratio for its detection in
+white noise. One sweep keeps a few rows at a time, so that nothing leaves the processor's first cache.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.jit_loops import compiled_loops
+
+_HALF_WIDTH_SIGMA: Final = 2.2
+_SQRT_HALF: Final = math.sqrt(0.5)
+
+
+def spot_taps(sigma_px: float) -> npt.NDArray[np.float32]:
+    """Right half (r + 1,) of the filter along one axis, centre first: a Gaussian integrated over pixels, sum 1."""
+    reach = max(1, math.floor(_HALF_WIDTH_SIGMA * sigma_px + 0.5))
+    edges = (np.arange(reach + 2) - 0.5) / sigma_px * _SQRT_HALF
+    shares = np.diff([math.erf(edge) for edge in edges])
+    taps: npt.NDArray[np.float32] = (shares / (shares[0] + 2.0 * shares[1:].sum())).astype(np.float32)
+    return taps
+
+
+def noise_factor(taps: npt.NDArray[np.float32]) -> float:
+    """Noise of the smoothed image over that of a pixel."""
+    return float(taps[0] ** 2 + 2.0 * np.sum(taps[1:] ** 2, dtype=np.float64))
+
+
+@compiled_loops
+def _smooth_down(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    y: int,
+    taps: npt.NDArray[np.float32],
+    out: npt.NDArray[np.float32],
+) -> None:
+    """Smooth row y of the image across rows; beyond the first and the last row these go on."""
+    height, width = image.shape
+    reach = taps.size - 1
+    bottom = height - 1
+    centre = image[y]
+    up, down = image[max(y - 1, 0)], image[min(y + 1, bottom)]
+    if reach == 2:
+        up2, down2 = image[max(y - 2, 0)], image[min(y + 2, bottom)]
+        t0, t1, t2 = taps[0], taps[1], taps[2]
+        for x in range(width):
+            near = np.int32(np.int32(up[x]) + np.int32(down[x]))
+            far = np.int32(np.int32(up2[x]) + np.int32(down2[x]))
+            out[x] = t0 * np.float32(centre[x]) + t1 * np.float32(near) + t2 * np.float32(far)
+        return
+    for x in range(width):
+        out[x] = taps[0] * np.float32(centre[x])
+    for k in range(1, reach + 1):
+        up, down = image[max(y - k, 0)], image[min(y + k, bottom)]
+        tap = taps[k]
+        for x in range(width):
+            out[x] += tap * np.float32(np.int32(up[x]) + np.int32(down[x]))
+
+
+@compiled_loops
+def _smooth_along(
+    padded: npt.NDArray[np.float32], taps: npt.NDArray[np.float32], out: npt.NDArray[np.float32]
+) -> None:
+    """Smooth a row that is padded by the reach of the filter at both ends; beyond them it goes on."""
+    width = out.size
+    reach = taps.size - 1
+    for k in range(reach):
+        padded[k] = padded[reach]
+        padded[reach + width + k] = padded[reach + width - 1]
+    if reach == 2:
+        t0, t1, t2 = taps[0], taps[1], taps[2]
+        for x in range(width):
+            out[x] = (
+                t0 * padded[x + 2] + t1 * (padded[x + 1] + padded[x + 3]) + t2 * (padded[x] + padded[x + 4])
+            )
+        return
+    for x in range(width):
+        out[x] = taps[0] * padded[reach + x]
+    for k in range(1, reach + 1):
+        tap = taps[k]
+        left = padded[reach - k : reach - k + width]
+        right = padded[reach + k : reach + k + width]
+        for x in range(width):
+            out[x] += tap * (left[x] + right[x])
+
+
+@compiled_loops
+def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
+    """Values of row i of a grid of blocks at every image column."""
+    columns = grid.shape[1]
+    for x in range(out.size):
+        u = min(max((x + 0.5) / block - 0.5, 0.0), columns - 1.0)
+        j = min(int(u), max(columns - 2, 0))
+        out[x] = grid[i, j] + np.float32(u - j) * (grid[i, min(j + 1, columns - 1)] - grid[i, j])
+
+
+@compiled_loops
+def _mark(
+    row: npt.NDArray[np.float32],
+    upper: npt.NDArray[np.float32],
+    lower: npt.NDArray[np.float32],
+    q: np.float32,
+    above: npt.NDArray[np.uint8],
+) -> int:
+    """Mark what lies above the threshold between two lines of it; return how many pixels do."""
+    found = 0
+    for x in range(row.size):
+        high = row[x] > upper[x] + q * (lower[x] - upper[x])
+        above[x] = high
+        found += high
+    return found
+
+
+@compiled_loops
+def _is_top(
+    row: npt.NDArray[np.float32],
+    before: npt.NDArray[np.float32],
+    after: npt.NDArray[np.float32],
+    x: int,
+    has_before: bool,
+    has_after: bool,
+) -> bool:
+    """Whether no neighbour is higher, nor an earlier one as high."""
+    value = row[x]
+    a, b = max(x - 1, 0), min(x + 1, row.size - 1)
+    if has_before and (before[a] >= value or before[x] >= value or before[b] >= value):
+        return False
+    if has_after and (after[a] > value or after[x] > value or after[b] > value):
+        return False
+    return not ((a < x and row[a] >= value) or row[b] > value)
+
+
+@compiled_loops
+def find_peaks(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    threshold: npt.NDArray[np.float32],
+    block: float,
+    taps: npt.NDArray[np.float32],
+    peaks: npt.NDArray[np.int32],
+    heights: npt.NDArray[np.float32],
+) -> int:
+    """Local maxima of the smoothed image above a threshold.
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts.
+    threshold : ndarray (rows, columns), float32
+        Least smoothed value, on the grid of blocks of `block` pixels.
+    block : float
+        Side of a block, pixels.
+    taps : ndarray (r + 1,)
+        From `spot_taps`.
+    peaks : ndarray (m, 2), int32
+        Filled with column and row of each peak.
+    heights : ndarray (m,), float32
+        Filled with the smoothed value less the threshold.
+
+    Returns
+    -------
+    int
+        Number of peaks; m of them means that there was no room for all, and that rows further down were not seen.
+    """
+    height, width = image.shape
+    reach = taps.size - 1
+    padded = np.empty(width + 2 * reach, np.float32)
+    smooth = np.empty((3, width), np.float32)
+    upper = np.empty(width, np.float32)
+    lower = np.empty(width, np.float32)
+    grid_row = -1
+    above = np.zeros((width + 7) // 8 * 8, np.uint8)
+    words = above.view(np.uint64)
+    count = 0
+    for y in range(height + 1):
+        if y < height:
+            _smooth_down(image, y, taps, padded[reach : reach + width])
+            _smooth_along(padded, taps, smooth[y % 3])
+        if y == 0:
+            continue
+        # row y − 1 has both neighbours now
+        row = smooth[(y - 1) % 3]
+        before = smooth[(y - 2) % 3] if y > 1 else row
+        after = smooth[y % 3] if y < height else row
+        v = min(max((y - 0.5) / block - 0.5, 0.0), threshold.shape[0] - 1.0)
+        i = min(int(v), max(threshold.shape[0] - 2, 0))
+        if i != grid_row:
+            grid_row = i
+            _grid_line(threshold, i, block, upper)
+            _grid_line(threshold, min(i + 1, threshold.shape[0] - 1), block, lower)
+        q = np.float32(v - i)
+        found = _mark(row, upper, lower, q, above)
+        if found == 0:
+            continue
+        for word in range(words.size):
+            if words[word] == 0:
+                continue
+            for x in range(8 * word, min(8 * word + 8, width)):
+                if above[x] == 0 or not _is_top(row, before, after, x, y > 1, y < height):
+                    continue
+                if count == peaks.shape[0]:
+                    return count
+                peaks[count, 0] = x
+                peaks[count, 1] = y - 1
+                heights[count] = row[x] - (upper[x] + q * (lower[x] - upper[x]))
+                count += 1
+    return count
