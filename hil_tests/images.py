@@ -10,25 +10,27 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from hil_tests.errors import BadReplyError, BenchError, NackError
+from protocol.image_transfer import (
+    FRAME_SIZE,
+    MAP_PARTS,
+    MAX_BLOCK,
+    HoleMap,
+    block_checksum,
+    frame_checksum,
+    packet_count,
+    parse_burst_packet,
+)
 from protocol.messages import ErrorCode
 from protocol.values import Value
 
 if TYPE_CHECKING:
     from hil_tests.client import AsyncObcClient
 
-FRAME_SIZE: Final = 128
-"""Bytes of an image frame."""
 FRAME_ATTEMPTS: Final = 3
 """How often a frame with a wrong checksum is read before the download is given up."""
 POLL_S: Final = 0.04
 """Time between two looks at a state, as public flight software polls."""
 
-PACKET_DATA: Final = 20
-"""Bytes of the file in one burst packet."""
-BLOCK_SIZE: Final = 1024 * PACKET_DATA
-"""Bytes of the largest block: one packet for each bit of the hole map."""
-MAP_PART: Final = 128
-"""Packets that one part of the hole map stands for."""
 BURST_ROUNDS: Final = 20
 """How often the missing packets of a block are asked for."""
 BURST_SILENCE_S: Final = 0.5
@@ -110,8 +112,8 @@ async def _read_frame(client: AsyncObcClient, number: int) -> tuple[bytes, int]:
             raise BadReplyError("image_frame.data: not bytes")
         if info["frame"] != number:
             problem = f"the device has loaded frame {info['frame']!r}"
-        elif info["checksum"] != sum(data) % 256:
-            problem = f"checksum {info['checksum']!r}, the bytes give {sum(data) % 256}"
+        elif info["checksum"] != frame_checksum(data):
+            problem = f"checksum {info['checksum']!r}, the bytes give {frame_checksum(data)}"
         else:
             return data, attempt
     raise BadReplyError(f"image frame {number}: {problem}")
@@ -146,7 +148,7 @@ async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: flo
         block, rounds = await _download_block(client, len(data), within_s)
         data += block
         repeats += rounds - 1
-        if len(block) < BLOCK_SIZE:
+        if len(block) < MAX_BLOCK:
             break
     pixels, width, height = decode_bmp(bytes(data))
     return Image(pixels, width, height, len(data), repeats, time.monotonic() - begin)
@@ -158,7 +160,7 @@ async def _download_block(client: AsyncObcClient, offset: int, within_s: float) 
         client,
         "load_file_block",
         within_s,
-        {"file_type": "bmp", "file_counter": 0, "offset": offset, "length": BLOCK_SIZE},
+        {"file_type": "bmp", "file_counter": 0, "offset": offset, "length": MAX_BLOCK},
     )
     deadline = time.monotonic() + within_s
     state = await client.telemetry("file_block")
@@ -170,14 +172,14 @@ async def _download_block(client: AsyncObcClient, offset: int, within_s: float) 
         await asyncio.sleep(POLL_S)
         state = await client.telemetry("file_block")
     length, checksum = int(state["length"]), int(state["checksum"])
-    count = -(-length // PACKET_DATA)
+    count = packet_count(length)
     packets: dict[int, bytes] = {}
     for round_number in range(1, BURST_ROUNDS + 1):
         await client.command("start_burst", ignore_hole_map=round_number == 1)
         await _gather(client, packets, count)
         if len(packets) == count:
             block = b"".join(packets[number] for number in range(count))[:length]
-            if crc16(block) == checksum:
+            if block_checksum(block) == checksum:
                 return block, round_number
             packets.clear()
         await _send_hole_map(client, packets)
@@ -194,29 +196,16 @@ async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int)
                 packet = await client.bursts.get()
         except TimeoutError:
             return
-        number = int.from_bytes(packet[:2], "little")
+        number, data = parse_burst_packet(packet)
         if number < count:
-            packets[number] = packet[2:]
+            packets[number] = data
 
 
 async def _send_hole_map(client: AsyncObcClient, packets: dict[int, bytes]) -> None:
     """Tell the device which packets have arrived."""
-    bits = sum(1 << number for number in packets)
-    whole = bits.to_bytes(BLOCK_SIZE // PACKET_DATA // 8, "little")
-    for part in range(len(whole) * 8 // MAP_PART):
-        piece = whole[part * MAP_PART // 8 : (part + 1) * MAP_PART // 8]
-        await client.command(f"set_hole_map_{part + 1}", map=piece)
-
-
-def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF; "123456789" gives 0x29B1."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = (crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1
-            crc &= 0xFFFF
-    return crc
+    holes = HoleMap(packets)
+    for part in range(1, MAP_PARTS + 1):
+        await client.command(f"set_hole_map_{part}", map=holes.part(part))
 
 
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:

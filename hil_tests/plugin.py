@@ -1,3 +1,87 @@
-"""Pytest plugin of the bench: fixtures that put a star sensor, emulated or real, on a bus."""
+"""Pytest plugin: fixtures that put a star sensor on a serial line or a CAN bus, emulated or real.
+
+    def test_it_tracks(starhil_serial):
+        starhil_serial.command("set_mode", mode="lost_in_space")
+        starhil_serial.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20)
+
+Without options the emulator is started as a process of its own, once a module, and ended in good order. With
+`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is connected there.
+
+pytest loads this module in every run, so it imports the bench only when a fixture is used.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from hil_tests.client import ObcClient
+    from hil_tests.emulator_process import EmulatorProcess
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options that name a unit or the emulator's profile."""
+    group = parser.getgroup("starhil", "star sensor under test")
+    group.addoption("--starhil-serial", metavar="DEV", help="serial port of a unit, in place of an emulator")
+    group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, in place of an emulator")
+    group.addoption(
+        "--starhil-dialect", default="b", metavar="a|b|c", help="form of serial replies (default b)"
+    )
+    group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator that is started")
+    group.addoption(
+        "--starhil-seed", default=1, type=int, metavar="N", help="seed of the emulator (default 1)"
+    )
+
+
+@pytest.fixture(scope="module")
+def starhil_emulator(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[EmulatorProcess]:
+    """Return an emulator that runs as a process on a pty and on a CAN bus (vcan0, else a hub of its own).
+
+    `.ready` holds its ready line. It is ended by SIGTERM after the module's last test; another end than status 0 is
+    an error.
+    """
+    from hil_tests.emulator_process import EmulatorProcess, emulator_command
+
+    folder: Path = tmp_path_factory.mktemp("starhil")
+    command = emulator_command(
+        profile=request.config.getoption("--starhil-profile"),
+        serial="auto",
+        can="auto",
+        seed=request.config.getoption("--starhil-seed"),
+        state_dir=folder / "state",
+        truth_log=folder / "truth.csv",
+    )
+    with EmulatorProcess(command) as emulator:
+        yield emulator
+
+
+def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
+    from hil_tests.client import ObcClient
+
+    spec = request.config.getoption(f"--starhil-{link}")
+    if spec is None:
+        emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
+        spec = emulator.ready[link]
+    if link == "can":
+        return ObcClient.open(can=spec)
+    return ObcClient.open(serial=spec, dialect=request.config.getoption("--starhil-dialect"))
+
+
+@pytest.fixture
+def starhil_serial(request: pytest.FixtureRequest) -> Iterator[ObcClient]:
+    """Return an OBC client on the serial line of the unit or emulator."""
+    with _client(request, "serial") as client:
+        yield client
+
+
+@pytest.fixture
+def starhil_can(request: pytest.FixtureRequest) -> Iterator[ObcClient]:
+    """Return an OBC client on the CAN bus of the unit or emulator."""
+    with _client(request, "can") as client:
+        yield client

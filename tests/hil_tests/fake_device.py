@@ -6,10 +6,10 @@ import asyncio
 import threading
 from dataclasses import dataclass, field
 
-from hil_tests.images import crc16
 from protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
 from protocol.errors import ProtocolError
 from protocol.icd import load_icd
+from protocol.image_transfer import block_checksum
 from protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
 from protocol.transports import open_can, open_serial
@@ -149,7 +149,11 @@ class FakeDevice:
                 "checksum": (sum(self.pixels[self.frame * 128 : self.frame * 128 + 128]) + wrong) % 256,
             }
         if name == "file_block":
-            return {"ready": bool(self.block), "checksum": crc16(self.block), "length": len(self.block)}
+            return {
+                "ready": bool(self.block),
+                "checksum": block_checksum(self.block),
+                "length": len(self.block),
+            }
         return self.telemetry.get(name, {})
 
     def _act(self, name: str, values: dict) -> list[Reply]:

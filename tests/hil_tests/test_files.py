@@ -11,7 +11,7 @@ import pytest
 
 from hil_tests.attitude import attitude_error, from_radec_roll
 from hil_tests.errors import BenchError
-from hil_tests.images import crc16, decode_bmp
+from hil_tests.images import decode_bmp
 from hil_tests.png import encode_png, write_png
 from hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
 from hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
@@ -49,10 +49,6 @@ def test_a_bmp_file_is_read_as_opencv_wrote_it(width):
 def test_what_is_no_bmp_is_refused(data):
     with pytest.raises(BenchError):
         decode_bmp(data)
-
-
-def test_crc_has_its_published_check_value():
-    assert crc16(b"123456789") == 0x29B1
 
 
 def test_the_serial_log_shows_time_direction_and_bytes(tmp_path):

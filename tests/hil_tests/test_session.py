@@ -1,0 +1,338 @@
+"""The session runner on a device of canned answers: what passes, what fails, and what is written."""
+
+from __future__ import annotations
+
+import csv
+import json
+from xml.etree import ElementTree as ET
+
+import pytest
+from typer.testing import CliRunner
+
+from emulator.cli.app import build_app
+from hil_tests.attitude import from_radec_roll
+from hil_tests.bench import Bench, LinkOptions
+from hil_tests.errors import BenchError
+from hil_tests.script import load_script
+from hil_tests.session import SessionRunner
+from protocol.candump import read_candump
+from protocol.icd import load_icd
+from protocol.messages import ErrorCode
+from tests.hil_tests.fake_device import FakeDevice
+
+ICD = load_icd()
+
+
+@pytest.fixture
+def device():
+    with FakeDevice() as fake:
+        yield fake
+
+
+@pytest.fixture
+def play(device, tmp_path):
+    """Run a script on the serial line of the device."""
+    port = device.open_serial()
+
+    def _play(text: str, can: str | None = None):
+        path = tmp_path / "trial.toml"
+        path.write_text("[defaults]\ntimeout_s = 0.2\nkeep_going = true\n" + text, encoding="utf-8")
+        script = load_script(path, ICD)
+        options = LinkOptions(serial=port, can=can, timeout_s=script.timeout_s)
+        with Bench(options, ICD, log_folder=tmp_path) as bench:
+            return SessionRunner(script, bench, tmp_path).run()
+
+    return _play
+
+
+def attitude_values(dec_offset_arcsec: float = 0.0, **more) -> dict:
+    q = from_radec_roll(83.8, -1.2 + dec_offset_arcsec / 3600.0, 30.0)
+    return (
+        dict(zip(("q_x", "q_y", "q_z", "q_w"), q, strict=True))
+        | {"valid": True, "time_of_exposure": 100.5}
+        | more
+    )
+
+
+TRUTH = "[truth]\nra_deg = 83.8\ndec_deg = -1.2\nroll_deg = 30\n"
+
+
+def test_steps_that_hold_pass_and_those_that_do_not_say_why(play, device):
+    device.telemetry["boot_status"] = {"boot_count": 7, "reset_cause": "command"}
+    device.refuse["save_parameters"] = ErrorCode.BUSY
+    result = play(
+        """
+        [[step]]
+        read = "boot_status"
+        expect = { boot_count = 7, reset_cause = "command" }
+        [[step]]
+        read = "boot_status"
+        expect = { boot_count = 8 }
+        [[step]]
+        command = "save_parameters"
+        [[step]]
+        command = "save_parameters"
+        refused = "busy"
+        [[step]]
+        command = "save_parameters"
+        refused = "sequence"
+        [[step]]
+        command = "clear_counters"
+        refused = "busy"
+        [[step]]
+        read = "boot_status"
+        max_latency_s = 0.0
+        """
+    )
+    details = [(item.status, item.detail) for item in result.results]
+    assert details[0] == ("passed", "boot_count=7 reset_cause=command")
+    assert details[1] == ("failed", "boot_count is 7, expected 8")
+    assert details[2] == ("failed", "save_parameters: refused by the device with error 6 (busy)")
+    assert details[3][0] == "passed"
+    assert details[4] == ("failed", "refused with 6 (busy), expected sequence")
+    assert details[5] == ("failed", "accepted, expected to be refused with busy")
+    assert details[6][0] == "failed"
+    assert "latency" in details[6][1]
+    assert not result.passed
+
+
+def test_after_a_failed_step_the_rest_is_skipped_unless_told_otherwise(device, tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text("[[step]]\nread = 'rates'\nexpect = { rate_x = 9 }\n[[step]]\nread = 'rates'\n")
+    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
+        result = SessionRunner(load_script(path, ICD), bench, tmp_path).run()
+    assert [item.status for item in result.results] == ["failed", "skipped"]
+
+
+def test_captured_values_are_used_later(play, device):
+    device.telemetry["device_status"] = {"frames_captured": 10}
+    result = play(
+        """
+        [[step]]
+        read = "device_status"
+        capture = { before = "frames_captured" }
+        [[step]]
+        read = "device_status"
+        expect = { frames_captured = { above = "$before" } }
+        [[step]]
+        command = "set_unix_time"
+        with = { seconds = "$before" }
+        """
+    )
+    assert [item.status for item in result.results] == ["passed", "failed", "passed"]
+    assert device.received == [("set_unix_time", {"seconds": 10, "milliseconds": 0})]
+
+
+def test_the_attitude_is_compared_with_the_truth(play, device):
+    device.telemetry["precise_attitude"] = attitude_values(20.0)
+    result = play(
+        TRUTH
+        + """
+        [[step]]
+        read = "precise_attitude"
+        attitude = { within_arcsec = 21 }
+        [[step]]
+        read = "precise_attitude"
+        attitude = { within_arcsec = 19 }
+        [[step]]
+        read = "precise_attitude"
+        attitude = { within_arcsec = 1, ra_deg = 83.8, dec_deg = -1.1944444444, roll_deg = 30 }
+        """
+    )
+    assert [item.status for item in result.results] == ["passed", "failed", "passed"]
+    # single-precision quaternions carry an attitude to about 0.03 arcsec
+    assert result.results[0].figures["cross_boresight_arcsec"] == pytest.approx(20.0, abs=0.1)
+
+
+def test_the_attitude_is_compared_with_the_truth_of_its_time_in_a_file(play, device, tmp_path):
+    rows = [(100.0, from_radec_roll(83.8, -1.3, 30.0)), (101.0, from_radec_roll(83.8, -1.1, 30.0))]
+    lines = ["time_of_exposure_s,true_qx,true_qy,true_qz,true_qw"]
+    lines += [",".join([str(t), *map(repr, q)]) for t, q in rows]
+    (tmp_path / "truth.csv").write_text("\n".join(lines))
+    device.telemetry["precise_attitude"] = attitude_values()
+    text = (
+        "[truth]\nfile = 'truth.csv'\n[[step]]\nread = 'precise_attitude'\nattitude = { within_arcsec = 1 }"
+    )
+    assert play(text).passed
+    device.telemetry["precise_attitude"] = attitude_values(time_of_exposure=100.6)
+    assert not play(text).passed
+
+
+def test_an_invalid_attitude_never_passes(play, device):
+    device.telemetry["precise_attitude"] = attitude_values(valid=False, reason="no_match")
+    result = play(TRUTH + "[[step]]\nread = 'precise_attitude'\nattitude = { within_arcsec = 1e9 }")
+    assert "no_match" in result.results[0].detail
+    assert not result.passed
+
+
+def test_a_step_is_tried_until_it_holds_or_its_time_is_over(play, device):
+    device.mute = 2
+    result = play(
+        "[[step]]\nread = 'rates'\nwithin_s = 5\nevery_s = 0.01\n"
+        "[[step]]\nread = 'rates'\nexpect = { rate_x = 1 }\nwithin_s = 0.1\nevery_s = 0.01"
+    )
+    assert [item.status for item in result.results] == ["passed", "failed"]
+    assert result.results[1].detail.startswith("not within 0.1 s: rate_x is 0")
+
+
+def test_repeats_must_all_hold(play, device):
+    device.mute = 0
+    result = play("[[step]]\nread = 'rates'\nrepeat = 4\nevery_s = 0.0")
+    assert result.passed
+    device.mute = 1
+    result = play("[[step]]\nread = 'rates'\nrepeat = 4\nevery_s = 0.0")
+    assert "time 1 of 4" in result.results[0].detail
+
+
+def test_parameters_are_set_and_read_back(play, device):
+    result = play(
+        """
+        [[step]]
+        set_parameter = "exposure"
+        value = 250
+        [[step]]
+        get_parameter = "exposure"
+        expect = { value = 250 }
+        [[step]]
+        set_parameter = "exposure"
+        value = -1
+        refused = "invalid_parameter"
+        """
+    )
+    assert [item.status for item in result.results] == ["passed", "passed", "failed"]
+
+
+def test_samples_go_to_a_csv_file_with_all_digits(play, device, tmp_path):
+    device.telemetry["precise_attitude"] = attitude_values(5.0, mode="tracking")
+    result = play(
+        TRUTH
+        + """
+        [[step]]
+        sample = { telemetry = "precise_attitude", every_s = 0.01, for_s = 0.1, file = "a.csv" }
+        attitude = { within_arcsec = 6 }
+        [[step]]
+        sample = "precise_attitude"
+        every_s = 0.01
+        for_s = 0.05
+        at_least = 0.5
+        expect = { mode = "standby" }
+        """
+    )
+    assert [item.status for item in result.results] == ["passed", "failed"]
+    with (tmp_path / "a.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == result.results[0].figures["samples"] >= 5
+    assert float(rows[0]["q_w"]) == pytest.approx(attitude_values(5.0)["q_w"], abs=1e-7)
+    assert (rows[0]["valid"], rows[0]["mode"], float(rows[0]["time_of_exposure"])) == ("1", "tracking", 100.5)
+    assert float(rows[0]["latency_ms"]) > 0.0
+    assert result.results[0].figures["cross_boresight_max_arcsec"] == pytest.approx(5.0, abs=0.1)
+
+
+def test_a_picture_is_written_and_a_blank_one_fails(play, device, tmp_path):
+    assert play("[[step]]\ndownload_image = 'a.png'\nsize = 'size_64'").passed
+    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+    device.pixels = bytes(64 * 64)
+    result = play("[[step]]\ndownload_image = 'b.png'\nsize = 'size_64'")
+    assert "blank" in result.results[0].detail
+
+
+def test_bytes_are_sent_and_the_answer_compared(play, device):
+    device.telemetry["boot_status"] = {"boot_count": 3}
+    result = play(
+        """
+        [[step]]
+        send = "1F 7F 81 1F FF"
+        answer = "1F 7F .. 03 00 00 00 00 1F FF"
+        listen_s = 0.1
+        [[step]]
+        send = "1F 7F 81 1F FF"
+        answer = "1F 7F .. 04 00 00 00 00 1F FF"
+        listen_s = 0.1
+        [[step]]
+        send = "00 01 02"
+        answer = ""
+        listen_s = 0.1
+        """
+    )
+    assert [item.status for item in result.results] == ["passed", "failed", "passed"]
+
+
+def test_links_are_chosen_by_step_and_a_missing_one_is_skipped(play, device, hub):
+    channel = device.open_can(hub)
+    text = "[[step]]\nread = 'rates'\nlink = 'can'\n[[step]]\nread = 'rates'\nlink = 'both'\n"
+    result = play(text, can=channel)
+    assert [(item.link, item.status) for item in result.results] == [
+        ("can", "passed"), ("serial", "passed"), ("can", "passed"),
+    ]  # fmt: skip
+    result = play(text)
+    assert [(item.link, item.status) for item in result.results] == [("can", "skipped"), ("serial", "passed")]
+
+
+def test_only_an_emulator_of_its_own_can_be_restarted(play):
+    result = play("[[step]]\nrestart = 'kill'")
+    assert "use --start" in result.results[0].detail
+
+
+def test_a_link_that_the_bench_lacks_is_refused(device):
+    with (
+        Bench(LinkOptions(serial=device.open_serial()), ICD) as bench,
+        pytest.raises(BenchError, match="no can link"),
+    ):
+        bench.client("can")
+
+
+# --- the command ---
+
+
+def run_command(*words: str):
+    return CliRunner().invoke(build_app(), ["session", *map(str, words)])
+
+
+def test_the_command_prints_steps_and_writes_logs_and_junit(device, tmp_path, hub):
+    script = tmp_path / "s.toml"
+    script.write_text("title = 'Trial'\n[[step]]\nread = 'rates'\nlink = 'both'\n")
+    out = tmp_path / "out"
+    words = [
+        "--serial",
+        device.open_serial(),
+        "--can",
+        device.open_can(hub),
+        "--log",
+        out,
+        "--junit",
+        tmp_path / "j.xml",
+    ]
+    outcome = run_command(script, *words)
+    assert outcome.exit_code == 0, outcome.output
+    assert "Trial" in outcome.output
+    assert "2 passed, 0 failed" in outcome.output
+    lines = (out / "serial.log").read_text().splitlines()
+    assert any(line.endswith("TX 1F 7F E5 1F FF") for line in lines)
+    assert any("step 1: read rates" in line for line in lines)
+    assert [frame.id for _, frame in read_candump(out / "can.log")] == [0x04E50104, 0x05E50401]
+    assert ET.parse(tmp_path / "j.xml").getroot().get("tests") == "2"
+
+
+def test_the_command_prints_json_alone_and_exits_1_when_a_step_fails(device, tmp_path):
+    script = tmp_path / "s.toml"
+    script.write_text("[[step]]\nread = 'rates'\nexpect = { rate_x = 5 }\n")
+    outcome = run_command(script, "--serial", device.open_serial(), "--log", tmp_path, "--json")
+    assert outcome.exit_code == 1
+    data = json.loads(outcome.stdout)
+    assert (data["passed"], data["failed"], data["results"][0]["values"]["rate_x"]) == (False, 1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nothing"], "no such session script"),
+        (["first_light"], "no link given"),
+        (["first_light", "--serial", "auto"], "needs --start"),
+        (["first_light", "--serial", "/dev/ttyS77", "--dialect", "d"], "must be a, b or c"),
+    ],
+)
+def test_bad_input_is_refused(words, message, tmp_path):
+    outcome = run_command(*words, "--log", tmp_path / "log")
+    assert isinstance(outcome.exception, BenchError)
+    assert message in str(outcome.exception)
+    assert not (tmp_path / "log").exists()
