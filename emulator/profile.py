@@ -57,7 +57,7 @@ class CameraConfig(Strict):
     focal_px: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
     centre_px: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
-    distortion: Annotated[list[float], Field(max_length=5)] = []
+    distortion: list[float] = Field(default_factory=list, max_length=5)
     """Brown–Conrady k1, k2, p1, p2, k3."""
 
     def values(self) -> dict[str, Any]:
@@ -137,15 +137,15 @@ class Profile(Strict):
     run: RunConfig = RunConfig()
     catalog: CatalogConfig = CatalogConfig()
     camera: CameraConfig = CameraConfig()
-    sensor: dict[str, Any] = {}
+    sensor: dict[str, Any] = Field(default_factory=dict)
     """Fields of `emulator.sensor_model.SensorModel`, but for those that are parameters of the device."""
-    identifier: dict[str, Any] = {}
+    identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
     device: DeviceConfig = DeviceConfig()
     timing: TimingConfig = TimingConfig()
     links: LinksConfig = LinksConfig()
-    parameters: dict[str, Any] = {}
+    parameters: dict[str, Any] = Field(default_factory=dict)
     """Parameters of the device by the names of the interface definition: its defaults in this profile."""
 
 

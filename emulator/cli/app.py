@@ -17,6 +17,7 @@ EXIT_BAD_INPUT: Final = 2
 """Exit status for input that is refused; 1 says that all worked and that the result is not good."""
 
 COMMANDS: Final[dict[str, str]] = {
+    "run": "run",
     "catalog": "catalog",
     "session": "session",
     "hub": "hub",

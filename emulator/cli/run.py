@@ -1,0 +1,90 @@
+"""`starhil run`: the emulator as a process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    profile: Annotated[str, typer.Argument(help="Name of a profile, or path of a profile file.")] = "cubestar",
+    serial: Annotated[
+        str | None, typer.Option(help="auto (a pty), a device, listen://HOST:PORT, or off.")
+    ] = None,
+    can: Annotated[
+        str | None, typer.Option(help="auto (vcan0, else the TCP hub), a channel, or off.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all noise.")] = None,
+    clock: Annotated[str | None, typer.Option(help="real, scaled:FACTOR or stepped.")] = None,
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Folder of what survives a restart; without it nothing does.")
+    ] = None,
+    symlink: Annotated[Path | None, typer.Option(help="Link to the pty, removed at the end.")] = None,
+    control: Annotated[str, typer.Option(help="Control channel: off, auto, or HOST:PORT.")] = "off",
+    truth_log: Annotated[
+        Path | None, typer.Option(help="CSV file of truth and measurement, a row a frame.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value over the profile; may be repeated.")
+    ] = None,
+    log: Annotated[str, typer.Option(help="debug, info, warning or error; to stderr.")] = "warning",
+) -> None:
+    """Run the emulator until SIGINT or SIGTERM.
+
+    One line on stdout, `ready serial=… can=… seed=…`, tells that it takes commands and where.
+    """
+    import logging
+
+    from emulator.errors import EmulatorError
+    from emulator.profile import load_profile
+
+    levels = ("debug", "info", "warning", "error")
+    if log not in levels:
+        raise EmulatorError(f"--log {log}: must be one of {', '.join(levels)}")
+    logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
+    overrides = list(settings or ())
+    given = {
+        "links.serial.port": serial,
+        "links.can.channel": can,
+        "run.clock": clock,
+        "run.state_dir": None if state_dir is None else str(state_dir.resolve()),
+        "links.serial.symlink": None if symlink is None else str(symlink.absolute()),
+    }
+    overrides += [f"{key}={_quoted(value)}" for key, value in given.items() if value is not None]
+    if seed is not None:
+        overrides.append(f"run.seed={seed}")
+    loaded, folder = load_profile(profile, overrides)
+
+    import asyncio
+
+    from emulator.emulation import Emulation, RunOptions
+
+    async def run() -> None:
+        import signal
+
+        ended = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, ended.set)
+        emulation = Emulation(loaded, RunOptions(folder, truth_log, control))
+        try:
+            await emulation.start()
+            line = asyncio.create_task(emulation.ready())
+            stop = asyncio.create_task(ended.wait())
+            await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
+            if line.done():
+                print(line.result(), flush=True)
+                await stop
+            else:
+                line.cancel()
+        finally:
+            await emulation.close()
+
+    asyncio.run(run())
+
+
+def _quoted(text: str) -> str:
+    """Write a text as TOML."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,297 @@
+"""A run: device, pipeline, links, truth feed and control channel put together, started and ended."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from emulator.clock import Clock, SteppedClock, make_clock
+from emulator.cycle import Measurement
+from emulator.device import Background, Device, do_at_once
+from emulator.errors import EmulatorError
+from emulator.frames import PipelineSetup, Warm
+from emulator.imager import ProcessImager, ThreadImager
+from emulator.links.can import CanLink
+from emulator.links.serial import SerialLink
+from emulator.modes import Mode
+from emulator.profile import Profile
+from emulator.pump import ClockPump, StepPump
+from emulator.state_store import FileStore, MemoryStore, StateStore
+from emulator.truth import TruthSource
+from emulator.truth_config import LiveConfig, TruthConfig
+from emulator.truth_live import LiveFeed, LiveTruth
+from emulator.truth_log import TruthLog
+from protocol.icd import InterfaceDefinition, load_icd
+from protocol.values import Value
+
+log = logging.getLogger("starhil.run")
+
+PIPELINE_RESTART_S = 1.0
+"""Pause before a pipeline that ended by itself is started again, seconds."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run has beside its profile.
+
+    Attributes
+    ----------
+    folder
+        Folder from which the profile's relative paths count.
+    truth_log
+        CSV file of truth and measurement a frame.
+    control
+        `off`, `auto` (a free port on loopback) or HOST:PORT.
+    """
+
+    folder: Path = field(default_factory=Path)
+    truth_log: Path | None = None
+    control: str = "off"
+
+
+class Emulation:
+    """One emulator with all that belongs to it.
+
+    Parameters
+    ----------
+    profile
+        What it is.
+    options
+        What the run has beside.
+    icd
+        Interface definition; by default the product's own.
+    """
+
+    def __init__(
+        self, profile: Profile, options: RunOptions | None = None, icd: InterfaceDefinition | None = None
+    ) -> None:
+        self.profile = profile
+        self.options = options or RunOptions()
+        self.clock: Clock = make_clock(profile.run.clock)
+        self.imager: ProcessImager | ThreadImager = self._make_imager()
+        self._icd = icd
+        self._device: Device | None = None
+        self.serial: SerialLink | None = None
+        self.can: CanLink | None = None
+        self.feed: LiveFeed | None = None
+        self.warm: Warm | None = None
+        self.ready_words: dict[str, str] = {}
+        self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
+        self._closers: list[Callable[[], object]] = []
+        self._pump: ClockPump | None = None
+        self.stepper: StepPump | None = None
+        self._warming: asyncio.Task[None] | None = None
+        self._awake = asyncio.Event()
+        self._closing = False
+
+    @property
+    def device(self) -> Device:
+        """The device.
+
+        Raises
+        ------
+        EmulatorError
+            The run was not started.
+        """
+        if self._device is None:
+            raise EmulatorError("emulation: not started")
+        return self._device
+
+    def _make_imager(self) -> ProcessImager | ThreadImager:
+        setup = pipeline_setup(self.profile, self.options.folder)
+        return ProcessImager(setup) if self.profile.run.worker == "process" else ThreadImager(setup)
+
+    async def start(self) -> None:
+        """Bring up truth, device and links, in this order; the pipeline warms behind.
+
+        Raises
+        ------
+        EmulatorError, ProtocolError
+            A file, port or bus cannot be had; one line.
+        """
+        icd = self._icd or load_icd()
+        store = self._open_store()
+        truth = await self.open_truth(self.profile.truth)
+        stepped = isinstance(self.clock, SteppedClock)
+        background = do_at_once if stepped else self._in_background()
+        device = Device(self.profile, icd, self.clock, self.imager, store, truth, background)
+        self._device = device
+        if self.options.truth_log is not None:
+            truth_log = TruthLog(self.options.truth_log)
+            device.on_frame.append(truth_log.write)
+            self._closers.append(truth_log.close)
+        device.on_frame.append(_log_frame)
+        device.power_on()
+        await self._open_links(device)
+        if isinstance(self.clock, SteppedClock):
+            self.stepper = StepPump(device.scheduler, self.clock, self.imager)
+        else:
+            self._pump = ClockPump(device.scheduler, self.clock)
+            self._pump.start()
+        self._warming = asyncio.create_task(self._warm_up())
+
+    def _open_store(self) -> StateStore:
+        store: StateStore
+        if self.profile.run.state_dir:
+            store = FileStore(self.options.folder / Path(self.profile.run.state_dir).expanduser())
+        else:
+            store = MemoryStore()
+        self._closers.append(store.close)
+        return store
+
+    def _in_background(self) -> Background:
+        loop = asyncio.get_running_loop()
+
+        def background(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
+            def run() -> None:
+                error: EmulatorError | None = None
+                try:
+                    work()
+                except EmulatorError as caught:
+                    error = caught
+                loop.call_soon_threadsafe(done, error)
+
+            self._writer.submit(run)
+
+        return background
+
+    async def open_truth(self, config: TruthConfig) -> TruthSource:
+        """Make a truth source, with its socket if it is a live feed; the feed before it is closed.
+
+        Raises
+        ------
+        EmulatorError
+            A file is bad or a port is busy; the source before it stays.
+        """
+        truth = config.build(self.clock.now_ns() / 1e9, self.options.folder)
+        feed: LiveFeed | None = None
+        if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
+            feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
+            same = self.feed is not None and config.port != 0
+            if same and self.feed is not None:
+                self.feed.close()
+            self.ready_words["truth"] = await feed.start(config.protocol, config.host, config.port)
+        if self.feed is not None:
+            self.feed.close()
+        self.feed = feed
+        return truth
+
+    async def _open_links(self, device: Device) -> None:
+        links, seed = self.profile.links, self.profile.run.seed
+        if links.serial.port != "off":
+            from protocol.transports.serial import open_serial
+
+            baud = int(device.parameters["serial_baud"])
+            symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
+            paced = None if links.serial.pace and not isinstance(self.clock, SteppedClock) else False
+            transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
+            self.serial = SerialLink(device, transport, seed)
+            self.ready_words["serial"] = await self.serial.start()
+        if links.can.channel != "off":
+            from protocol.transports.can import open_can
+
+            self.can = CanLink(device, open_can(links.can.channel), links.can.frame_gap_s, seed)
+            self.ready_words["can"] = await self.can.start()
+
+    async def _warm_up(self) -> None:
+        """Wait for the pipeline, then wait for boot to end; start the pipeline anew when it ends by itself."""
+        self.warm = await self.imager.start()
+        log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
+        self.imager.on_failure = self._pipeline_failed
+        device = self.device
+        device.on_mode.append(lambda transition: self._awake.set() if transition.before is Mode.BOOT else None)
+        device.pipeline_ready(camera_constants(self.warm))
+        if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
+            self._awake.set()
+
+    def _pipeline_failed(self, text: str) -> None:
+        if not self._closing:
+            log.error("%s", text)
+            self.device.pipeline_lost()
+
+    async def ready(self) -> str:
+        """Wait until the device takes commands; return the ready line.
+
+        Raises
+        ------
+        EmulatorError
+            The pipeline cannot be made: a missing catalogue, a camera that cannot be.
+        """
+        awake = asyncio.create_task(self._awake.wait())
+        warming = self._warming
+        if warming is None:
+            raise EmulatorError("emulation: not started")
+        await asyncio.wait({awake, warming}, return_when=asyncio.FIRST_COMPLETED)
+        if warming.done() and (error := warming.exception()) is not None:
+            awake.cancel()
+            raise error
+        await awake
+        words = {**self.ready_words, "seed": str(self.profile.run.seed), "clock": self.clock.name}
+        return "ready " + " ".join(f"{key}={value}" for key, value in words.items())
+
+    async def close(self) -> None:
+        """End everything: links first, so that nothing new comes in, then the pipeline and the files."""
+        self._closing = True
+        if self._pump is not None:
+            self._pump.stop()
+        if self._warming is not None:
+            self._warming.cancel()
+            with contextlib.suppress(asyncio.CancelledError, EmulatorError):
+                await self._warming
+        for link in (self.serial, self.can):
+            if link is not None:
+                await link.close()
+        if self.feed is not None:
+            self.feed.close()
+        await self.imager.close()
+        self._writer.shutdown(wait=True)
+        for close in reversed(self._closers):
+            close()
+        self._closers.clear()
+
+
+def pipeline_setup(profile: Profile, folder: Path) -> PipelineSetup:
+    """What the pipeline of a profile is made of."""
+    path = profile.catalog.path
+    return PipelineSetup(
+        camera=profile.camera.values(),
+        sensor=dict(profile.sensor),
+        identifier=dict(profile.identifier),
+        catalog_path=str(folder / Path(path).expanduser()) if path else "",
+        epoch=profile.catalog.epoch,
+        algorithm=profile.run.algorithm,
+        seed=profile.run.seed,
+    )
+
+
+def camera_constants(warm: Warm) -> dict[str, Value]:
+    """Parameters that say of the camera what its optics are: a calibrated unit."""
+    camera = warm.camera
+    k1, k2, p1, p2, _ = camera["distortion"]
+    focal_x, focal_y = camera["focal_px"]
+    return {
+        "focal_length": (focal_x * focal_y) ** 0.5,
+        "centroid_x": camera["centre_px"][0],
+        "centroid_y": camera["centre_px"][1],
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+    }
+
+
+def _log_frame(measurement: Measurement) -> None:
+    log.debug(
+        "frame %d %s %s: %d detected, %d matched, %.1f ms",
+        measurement.counter,
+        measurement.mode,
+        measurement.reason,
+        measurement.result.detected,
+        measurement.result.matched,
+        measurement.latency_s * 1e3,
+    )

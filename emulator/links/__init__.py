@@ -1,0 +1,1 @@
+"""The links that bind the device to a wire: serial and CAN."""

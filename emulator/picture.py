@@ -1,0 +1,274 @@
+"""The picture pipeline: renders what the sensor sees, detects stars, identifies them. All numerics of a run are here."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.errors import EmulatorError
+from emulator.frames import (
+    Failure,
+    FrameRequest,
+    FrameResult,
+    ImageRequest,
+    ImageResult,
+    MatchedStar,
+    PipelineSetup,
+    SolverSettings,
+    Warm,
+)
+from emulator.sensor import Frame, Renderer
+from emulator.sensor_model import SensorModel
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.catalog import load_catalog
+from starid.detection import Detections, DetectionSettings, detect
+from starid.errors import StaridError
+from starid.interface import StarIdentifier, make_identifier
+from starid.solution import Reason, Solution
+
+STARS_SENT: Final = 16
+"""Identified stars that go back to the device, the brightest."""
+
+BYTE_LEVELS: Final = 8
+"""Bits of an image for download."""
+
+REASONS: Final[dict[Reason, str]] = {
+    Reason.OK: "ok",
+    Reason.TOO_FEW_STARS: "too_few_stars",
+    Reason.NO_MATCH: "no_match",
+    Reason.AMBIGUOUS: "ambiguous",
+    Reason.RESIDUAL: "residual",
+    Reason.PREDICTION_LOST: "tracking_lost",
+    Reason.BAD_INPUT: "processing_error",
+}
+"""Reason of the identification → its name in telemetry."""
+
+
+def make_picture(setup: PipelineSetup) -> tuple[Picture, Warm] | Failure:
+    """Make the pipeline and solve a first frame with it, or say in one line why it cannot be."""
+    begin = time.perf_counter()
+    try:
+        picture = Picture(setup)
+        picture.warm_up()
+    except (EmulatorError, StaridError) as error:
+        return Failure(str(error), fatal=True)
+    warm = Warm(picture.camera.to_dict(), len(picture.catalog), time.perf_counter() - begin)
+    return picture, warm
+
+
+class Picture:
+    """Renderer, detection and identifier of a run, with what they keep between frames."""
+
+    def __init__(self, setup: PipelineSetup) -> None:
+        self._setup = setup
+        self.camera = Camera.from_dict(setup.camera)
+        self.catalog = load_catalog(setup.catalog_path or None, setup.epoch)
+        self._sensor = SensorModel().with_(**setup.sensor)
+        self._renderer = Renderer(self.camera, self.catalog, self._sensor, setup.seed)
+        self._identifier: StarIdentifier | None = None
+        self._identifier_key: object = None
+        self._last: Frame | None = None
+
+    def warm_up(self) -> None:
+        """Make and solve one frame of the default settings, lost in space and tracking, so that no kernel is cold."""
+        camera = self.camera
+        constants = dict(zip(("k1", "k2", "p1", "p2"), camera.distortion, strict=False))
+        settings = SolverSettings(
+            focal_length=math.sqrt(camera.focal_px[0] * camera.focal_px[1]),
+            centroid_x=camera.centre_px[0],
+            centroid_y=camera.centre_px[1],
+            **constants,
+        )
+        here = (0.0, 0.0, 0.0, 1.0)
+        for predicted in (None, here):
+            request = FrameRequest(
+                index=0,
+                attitude_xyzw=here,
+                rate_rad_s=(1e-3, 0.0, 0.0),
+                exposure_s=0.1,
+                gain=self._sensor.gain,
+                predicted_xyzw=predicted,
+                settings=settings,
+            )
+            self._frame(request)
+        self._last = None
+
+    def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
+        """Do one request; what a setting makes impossible comes back as a failure."""
+        try:
+            if isinstance(request, ImageRequest):
+                return self._image(request)
+            return self._frame(request)
+        except (EmulatorError, StaridError) as error:
+            return Failure(str(error), fatal=False)
+
+    def _frame(self, request: FrameRequest) -> FrameResult:
+        begin = time.perf_counter()
+        sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
+        if sensor.gain != self._renderer.sensor.gain:
+            self._renderer = self._renderer.with_sensor(sensor)
+        attitude = Attitude(np.array(request.attitude_xyzw))
+        frame = self._renderer.render(
+            attitude, request.rate_rad_s, request.index, exposure_s=request.exposure_s
+        )
+        self._last = frame
+        rendered = time.perf_counter()
+        if not request.solve:
+            return FrameResult(request.index, solved=False, render_s=rendered - begin)
+        found = detect(frame.image, detection_settings(sensor, request.settings))
+        detected = time.perf_counter()
+        solution = self._solve(found, request)
+        solved = time.perf_counter()
+        return self._result(request, sensor, found, solution, (begin, rendered, detected, solved))
+
+    def _solve(self, found: Detections, request: FrameRequest) -> Solution:
+        settings = request.settings
+        chosen = slice(0, settings.max_stars_matched)
+        xy, flux = found.xy_px[chosen], found.flux[chosen]
+        sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
+        identifier = self._identifier_for(settings)
+        if request.predicted_xyzw is None:
+            solution = identifier.identify(xy, flux, sigma)
+        else:
+            predicted = np.array(request.predicted_xyzw)
+            solution = identifier.track(xy, flux, predicted, sigma, window_px=tracking_window(settings))
+        if solution.valid and self._within_margin(solution, xy, settings) < settings.min_stars_matched:
+            reason = (
+                Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
+            )
+            return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+        return solution
+
+    def _within_margin(self, solution: Solution, xy: NDArray[np.float64], settings: SolverSettings) -> int:
+        """Count the matched stars that lie within the validation margin of their place."""
+        identifier = self._identifier_for(settings)
+        icrs = identifier.catalog.vectors[solution.catalog_index]
+        places, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
+        off = np.hypot(*(places - xy[solution.detection_index]).T)
+        return int(np.count_nonzero(off <= settings.validation_margin))
+
+    def _identifier_for(self, settings: SolverSettings) -> StarIdentifier:
+        """Return the identifier for the device's own idea of its camera, made anew when that changes."""
+        camera = own_camera(self.camera, settings)
+        options: dict[str, Any] = dict(self._setup.identifier)
+        if self._setup.algorithm == "geometric":
+            options.setdefault("limiting_magnitude", settings.limiting_magnitude)
+        key = (camera, settings.error_margin, tuple(sorted(options.items())))
+        if self._identifier is None or key != self._identifier_key:
+            if self._setup.algorithm == "geometric":
+                from starid.identifier import TOLERANCE_PX, Effort
+
+                tolerance_px = TOLERANCE_PX * settings.error_margin / 100.0
+                options["effort"] = Effort(tolerance_px=tolerance_px)
+            try:
+                self._identifier = make_identifier(self._setup.algorithm, camera, self.catalog, **options)
+            except TypeError as error:
+                raise EmulatorError(f"identifier {self._setup.algorithm}: {error}") from None
+            self._identifier_key = key
+        return self._identifier
+
+    def _result(
+        self,
+        request: FrameRequest,
+        sensor: SensorModel,
+        found: Detections,
+        solution: Solution,
+        times: tuple[float, float, float, float],
+    ) -> FrameResult:
+        begin, rendered, detected, solved = times
+        stars = sorted(
+            (
+                MatchedStar(
+                    hip=int(hip),
+                    x=float(found.xy_px[row, 0]),
+                    y=float(found.xy_px[row, 1]),
+                    magnitude=measured_magnitude(float(found.flux[row]), sensor),
+                    snr=float(found.flux[row] / found.flux_sigma[row]),
+                )
+                for row, hip in zip(solution.detection_index, solution.hip, strict=True)
+            ),
+            key=lambda star: (star.magnitude, star.hip),
+        )
+        valid = solution.valid
+        x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
+        reason = REASONS[solution.reason]
+        if not valid and found.reason and len(found.flux) == 0:
+            reason = "detection_failed"
+        rate = solution.rate_rad_s
+        return FrameResult(
+            index=request.index,
+            valid=valid,
+            reason=reason,
+            tracked=solution.mode == "tracking",
+            quaternion_xyzw=(x, y, z, w),
+            sigma_cross_arcsec=solution.cross_boresight_sigma_arcsec if valid else 0.0,
+            sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
+            rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
+            detected=len(found.flux),
+            refused=int(getattr(found, "refused", 0)),
+            matched=solution.star_count,
+            stars=tuple(stars[:STARS_SENT]),
+            probability_false=solution.probability_false if valid else 1.0,
+            rms_px=solution.rms_px if valid else 0.0,
+            background_dn=float(found.background),
+            noise_dn=float(found.noise),
+            render_s=rendered - begin,
+            detect_s=detected - rendered,
+            identify_s=solved - detected,
+        )
+
+    def _image(self, request: ImageRequest) -> ImageResult:
+        if self._last is None:
+            return ImageResult(request.edge, -1, b"")
+        pixels = square_image(self._last.image, self._sensor.bits, request.edge)
+        return ImageResult(request.edge, self._last.frame_index, pixels)
+
+
+def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
+    """Detection as the device's parameters set it."""
+    return sensor.detection_settings(threshold_sigma=settings.detection_threshold)
+
+
+def own_camera(optics: Camera, settings: SolverSettings) -> Camera:
+    """Return the camera as the device's parameters describe it; what they do not tell is that of the optics."""
+    return Camera(
+        optics.width,
+        optics.height,
+        (settings.focal_length, settings.focal_length * optics.focal_px[1] / optics.focal_px[0]),
+        (settings.centroid_x, settings.centroid_y),
+        optics.model,
+        (settings.k1, settings.k2, settings.p1, settings.p2, optics.distortion[4]),
+    )
+
+
+def tracking_window(settings: SolverSettings) -> float:
+    """How far a star may be from its prediction, pixels: the margin, within the windows that are searched and read."""
+    return float(min(settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0))
+
+
+def measured_magnitude(electrons: float, sensor: SensorModel) -> float:
+    """Magnitude of a star that gave so many electrons in the exposure."""
+    return -2.5 * math.log10(max(electrons, 1.0) / (sensor.zero_magnitude_e_s * sensor.exposure_s))
+
+
+def square_image(image: NDArray[Any], bits: int, edge: int) -> bytes:
+    """Return an image as a square of `edge` pixels of 8 bit, row by row.
+
+    The frame stands at the top left of a black square of the next power of two, so that its pixel positions hold; a
+    smaller one is the mean over squares of pixels, a larger one is refused by the caller's choice of sizes.
+    """
+    height, width = image.shape
+    full = 1 << (max(height, width) - 1).bit_length()
+    full = max(full, edge)
+    square = np.zeros((full, full), dtype=np.uint32)
+    square[:height, :width] = image >> max(0, bits - BYTE_LEVELS)
+    step = full // edge
+    if step > 1:
+        summed = square.reshape(edge, step, edge, step).sum(axis=(1, 3), dtype=np.uint64)
+        square = ((summed + step * step // 2) // (step * step)).astype(np.uint32)
+    return square.astype(np.uint8).tobytes()

@@ -1,0 +1,109 @@
+"""The truth log: one CSV row a frame, with what the sensor looked at and what it measured."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from emulator.clock import NANOSECONDS
+from emulator.cycle import Measurement, as_quaternion
+from emulator.errors import EmulatorError
+from starid.attitude import Attitude
+
+COLUMNS: Final = (
+    "frame", "time_of_exposure_s", "run_time_s", "mode", "valid", "reason",
+    "truth_qx", "truth_qy", "truth_qz", "truth_qw", "truth_wx_deg_s", "truth_wy_deg_s", "truth_wz_deg_s", "truth_status",
+    "measured_qx", "measured_qy", "measured_qz", "measured_qw", "measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s",
+    "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
+    "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
+)  # fmt: skip
+"""Columns: time of exposure on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured attitude.
+
+`latency_ms` is run time from mid-exposure to publication; `processing_ms` and the three after it are the machine's own time.
+"""
+
+
+def compare(measurement: Measurement) -> dict[str, Any]:
+    """Return truth, measurement and error of a frame by the names of `COLUMNS`; errors are None where invalid."""
+    result = measurement.result
+    truth = measurement.truth
+    row: dict[str, Any] = {
+        "frame": measurement.counter,
+        "time_of_exposure_s": measurement.mid_unix_ns / NANOSECONDS,
+        "run_time_s": measurement.mid_ns / NANOSECONDS,
+        "mode": measurement.mode.value,
+        "valid": measurement.valid,
+        "reason": measurement.reason,
+        "truth_status": truth.status.value,
+        "stars_detected": result.detected,
+        "stars_matched": result.matched,
+        "latency_ms": measurement.latency_s * 1e3,
+        "processing_ms": (result.render_s + result.detect_s + result.identify_s) * 1e3,
+        "render_ms": result.render_s * 1e3,
+        "detect_ms": result.detect_s * 1e3,
+        "identify_ms": result.identify_s * 1e3,
+        "late": measurement.late,
+    }
+    row |= zip(("truth_qx", "truth_qy", "truth_qz", "truth_qw"), as_quaternion(truth.attitude), strict=True)
+    true_rate = np.degrees(truth.rate_rad_s).tolist()
+    row |= zip(("truth_wx_deg_s", "truth_wy_deg_s", "truth_wz_deg_s"), true_rate, strict=True)
+    if measurement.rate_valid:
+        rate = np.degrees(measurement.rate_rad_s).tolist()
+        row |= zip(("measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s"), rate, strict=True)
+    if measurement.valid:
+        measured = Attitude(np.array(result.quaternion_xyzw))
+        error = measured.error_to(truth.attitude)
+        row |= zip(
+            ("measured_qx", "measured_qy", "measured_qz", "measured_qw"), as_quaternion(measured), strict=True
+        )
+        row |= {
+            "cross_boresight_arcsec": error.cross_boresight_arcsec,
+            "roll_arcsec": error.roll_arcsec,
+            "total_arcsec": error.total_arcsec,
+            "sigma_cross_arcsec": result.sigma_cross_arcsec,
+            "sigma_roll_arcsec": result.sigma_roll_arcsec,
+            "rms_px": result.rms_px,
+        }
+    return {name: row.get(name) for name in COLUMNS}
+
+
+class TruthLog:
+    """A CSV file that gets a row a frame, each on the disk before the next.
+
+    Raises
+    ------
+    EmulatorError
+        The file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._file = path.open("w", encoding="utf-8", newline="")
+        except OSError as error:
+            raise EmulatorError(f"truth log {path}: cannot be written ({error.strerror}); choose another file") from None
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(COLUMNS)
+        self._file.flush()
+
+    def write(self, measurement: Measurement) -> None:
+        """Add a frame."""
+        self._writer.writerow([_cell(name, value) for name, value in compare(measurement).items()])
+        self._file.flush()
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, float):
+        exact = name.startswith(("truth_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
+        return repr(value) if exact else f"{value:.6g}"
+    return str(value)
