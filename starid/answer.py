@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from starid.jit import compiled
 from starid.pattern_index import IndexArrays
 from starid.refinement import solve_symmetric
-from starid.search import SCALE_TOLERANCE, Outcome, search
+from starid.search import SCALE_TOLERANCE, SIGMAS_KNOWN, Outcome, search
 from starid.tracking import track_near
 
 PRIOR_FREEDOM: Final = 10.0
@@ -121,12 +121,11 @@ def identify_kernel(
     xy: NDArray[np.float64],
     flux: NDArray[np.float64],
     sigmas: NDArray[np.float64],
-    sigmas_known: bool,
     settings: NDArray[np.float64],
 ) -> Answer:
     """Lost in space, whole: see `starid.search.search` and `finish`."""
     outcome = search(index, params, xy, flux, sigmas, settings)
-    return finish(outcome, sigmas, sigmas_known, 4 if settings[SCALE_TOLERANCE] > 0.0 else 3)
+    return finish(outcome, sigmas, settings[SIGMAS_KNOWN] > 0.0, 4 if settings[SCALE_TOLERANCE] > 0.0 else 3)
 
 
 @compiled
@@ -136,11 +135,10 @@ def track_kernel(
     xy: NDArray[np.float64],
     flux: NDArray[np.float64],
     sigmas: NDArray[np.float64],
-    sigmas_known: bool,
     settings: NDArray[np.float64],
     predicted: NDArray[np.float64],
     window_rad: float,
 ) -> Answer:
     """Tracking, whole: see `starid.tracking.track_near` and `finish`."""
     outcome = track_near(index, params, xy, flux, sigmas, settings, predicted, window_rad)
-    return finish(outcome, sigmas, sigmas_known, 3)
+    return finish(outcome, sigmas, settings[SIGMAS_KNOWN] > 0.0, 3)

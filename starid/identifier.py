@@ -36,7 +36,6 @@ from starid.search import (
     ACCEPTED,
     FIELD_PX,
     LARGEST_SIGMA,
-    LEAST_PX_PER_RAD,
     LOG_CHANCE,
     LOG_CHANCE_TRACKING,
     MAGNITUDE_GATE,
@@ -46,6 +45,8 @@ from starid.search import (
     SCALE_TOLERANCE,
     SEARCH_TOLERANCE,
     SETTING_COUNT,
+    SIGMAS_KNOWN,
+    TEST_WINDOW,
     TOO_FEW,
     WINDOW,
 )
@@ -57,8 +58,9 @@ STARS_PER_FIELD: Final = 200
 BRIGHTEST_LIMIT: Final = 6.0
 FAINTEST_LIMIT: Final = 9.0
 BLEND_PX: Final = 2.0
-TOLERANCE_PX: Final = 8.0
-WINDOW_PX: Final = 14.0
+TOLERANCE_PX: Final = 5.0
+WINDOW_PX: Final = 12.0
+TEST_WINDOW_PX: Final = 10.0
 TRACKING_WINDOW_PX: Final = 20.0
 _REASONS: Final = {TOO_FEW: Reason.TOO_FEW_STARS, NOISY: Reason.RESIDUAL}
 
@@ -93,6 +95,8 @@ class Effort:
         Largest error of a triangle's side, pixels.
     window_px : float
         First matching window, pixels.
+    test_window_px : float
+        Window in which a candidate attitude is tested, pixels.
     magnitude_gate : float
         Largest deviation of a star's magnitude from what its flux says.
     max_triangles : int
@@ -105,10 +109,11 @@ class Effort:
 
     tolerance_px: float = TOLERANCE_PX
     window_px: float = WINDOW_PX
+    test_window_px: float = TEST_WINDOW_PX
     magnitude_gate: float = 1.5
     max_triangles: int = 1500
-    max_false_probability: float = 1e-9
-    max_false_probability_tracking: float = 1e-6
+    max_false_probability: float = 1e-5
+    max_false_probability_tracking: float = 1e-5
 
 
 class Identifier:
@@ -172,13 +177,15 @@ class Identifier:
         self._kernel_settings[MAGNITUDE_GATE] = self._effort.magnitude_gate
         self._kernel_settings[MAX_TRIANGLES] = self._effort.max_triangles
         self._kernel_settings[SCALE_TOLERANCE] = fov_tolerance
-        self._kernel_settings[WINDOW] = self._effort.window_px / least
+        self._kernel_settings[WINDOW] = self._effort.window_px
+        self._kernel_settings[TEST_WINDOW] = self._effort.test_window_px / least
         self._kernel_settings[LARGEST_SIGMA] = 0.3 * self._effort.window_px
         self._kernel_settings[LOG_CHANCE] = math.log(self._effort.max_false_probability)
         self._kernel_settings[LOG_CHANCE_TRACKING] = math.log(self._effort.max_false_probability_tracking)
         self._kernel_settings[PX_PER_RAD] = least
-        self._kernel_settings[LEAST_PX_PER_RAD] = least
         self._kernel_settings[FIELD_PX] = camera.width * camera.height
+        self._settings_with_errors = self._kernel_settings.copy()
+        self._settings_with_errors[SIGMAS_KNOWN] = 1.0
 
     def _load(self, stars: StarCatalog, cache: bool | str | Path) -> IndexArrays:
         settings = self._settings_of_index
@@ -226,8 +233,7 @@ class Identifier:
             xy,
             brightness,
             sigmas,
-            xy_sigma_px is not None,
-            self._kernel_settings,
+            self._kernel_settings if xy_sigma_px is None else self._settings_with_errors,
         )
         return self._solution(answer, "lost_in_space", begin)
 
@@ -263,8 +269,8 @@ class Identifier:
             raise StaridError(f"tracking window_px: {window} given, a positive number of pixels needed")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         answer = track_kernel(
-            self._index, self._camera.params, xy, brightness, sigmas, xy_sigma_px is not None,
-            self._kernel_settings, attitude.matrix, window / self._kernel_settings[LEAST_PX_PER_RAD],
+            self._index, self._camera.params, xy, brightness, sigmas,
+            self._kernel_settings if xy_sigma_px is None else self._settings_with_errors, attitude.matrix, window / self._kernel_settings[PX_PER_RAD],
         )  # fmt: skip
         return self._solution(answer, "tracking", begin)
 

@@ -19,10 +19,12 @@ from starid.jit import compiled
 from starid.observation import Observations, rescaled
 from starid.pattern_index import GRID_CELLS, GRID_MARGIN, IndexArrays
 from starid.sky_grid import cell_of
-from starid.verification import to_sky
 
 MAX_ROUNDS: Final = 12
 """Rounds of matching and solving."""
+
+FIRST_MATCHED: Final = 40
+"""Detections used in the first round, the brightest, while the attitude is still coarse."""
 
 WINDOW_SIGMAS: Final = 4.0
 """Half-width of the final matching window in units of the centroid noise."""
@@ -53,10 +55,10 @@ class Refined(NamedTuple):
         Mean square of residual over given error per degree of freedom.
     rms_px : float
         Root mean square distance of the matched stars, pixels.
-    window_px : float
-        Final matching window for a star with unit error, pixels.
-    faintest : float
-        Catalogue magnitude of the faintest match.
+    zero_point, magnitude_sigma : float
+        Catalogue minus instrumental magnitude, and its scatter.
+    scale_variance : float
+        Variance of the logarithm of the scale in units of the given errors (0 where it is fixed).
     """
 
     matched: int
@@ -66,8 +68,9 @@ class Refined(NamedTuple):
     normal: NDArray[np.float64]
     variance: float
     rms_px: float
-    window_px: float
-    faintest: float
+    zero_point: float
+    magnitude_sigma: float
+    scale_variance: float
 
 
 @compiled
@@ -75,7 +78,9 @@ def nothing_refined() -> Refined:
     """Return the outcome of a refinement that never was."""
     none = math.nan
     stars = np.empty(0, dtype=np.int64)
-    return Refined(0, np.empty((0, 0)), 1.0, stars, np.empty((0, 0)), none, none, none, none)
+    return Refined(
+        0, np.empty((0, 0)), 1.0, stars, np.empty((0, 0)), none, none, none, none, 0.0
+    )  # fmt: skip
 
 
 @compiled
@@ -111,6 +116,17 @@ def turned(rotation: NDArray[np.float64], vx: float, vy: float, vz: float) -> ND
 
 
 @compiled
+def to_sky(rotation: NDArray[np.float64], direction: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Direction of the sensor frame expressed in ICRS, by the ICRS→sensor matrix."""
+    x, y, z = direction[0], direction[1], direction[2]
+    return (
+        rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
+        rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z,
+        rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z,
+    )
+
+
+@compiled
 def residual(
     index: IndexArrays,
     observations: Observations,
@@ -141,7 +157,7 @@ def match_detections(
     observations: Observations,
     rotation: NDArray[np.float64],
     count: int,
-    window: float,
+    reach_px: float,
     sigma: float,
     zero_point: float,
     magnitude_sigma: float,
@@ -157,8 +173,10 @@ def match_detections(
 
     Parameters
     ----------
-    window, sigma : float
-        Window and noise for a star of unit error, pixels.
+    reach_px : float
+        Window, pixels; 0 for `WINDOW_SIGMAS` times each detection's noise.
+    sigma : float
+        Noise of a detection of unit error, pixels (all of them equal while the window is).
     zero_point, magnitude_sigma, magnitude_gate : float
         Catalogue minus instrumental magnitude, its scatter, and the largest deviation from it.
     px_per_rad : float
@@ -175,7 +193,8 @@ def match_detections(
     for i in range(observations.directions.shape[0]):
         stars[i] = -1
     for i in range(count):
-        reach = window * observations.sigmas[i]
+        error = reach_px / 3.0 if reach_px > 0.0 else sigma * observations.sigmas[i]
+        reach = reach_px if reach_px > 0.0 else max(WINDOW_SIGMAS * error, SMALLEST_WINDOW_PX)
         limit = min(reach / px_per_rad, index.numbers[GRID_MARGIN])
         limit2 = limit * limit
         x, y, z = to_sky(rotation, observations.directions[i])
@@ -199,7 +218,6 @@ def match_detections(
             distance2 = rx * rx + ry * ry
             if distance2 > reach * reach:
                 continue
-            error = sigma * observations.sigmas[i]
             cost = distance2 / (error * error) + (deviation / magnitude_sigma) ** 2
             if cost < best_cost:
                 best, best_cost = star, cost
@@ -343,17 +361,61 @@ def typical_distance(
 
 
 @compiled
+def _same(stars: NDArray[np.int64], previous: NDArray[np.int64]) -> bool:
+    """Whether the matches stand still; `previous` is brought up to date."""
+    same = True
+    for i in range(stars.shape[0]):
+        if stars[i] != previous[i]:
+            same = False
+            previous[i] = stars[i]
+    return same
+
+
+@compiled
+def _rms(
+    index: IndexArrays, observations: Observations, rotation: NDArray[np.float64], stars: NDArray[np.int64]
+) -> float:
+    """Root mean square distance of the matched detections from their stars, pixels."""
+    total, count = 0.0, 0
+    for i in range(stars.shape[0]):
+        if stars[i] >= 0:
+            rx, ry, _, _, _ = residual(index, observations, rotation, i, stars[i])
+            total += rx * rx + ry * ry
+            count += 1
+    return math.sqrt(total / max(count, 1))
+
+
+@compiled
+def _marginal(normal: NDArray[np.float64], free_scale: bool) -> NDArray[np.float64]:
+    """Normal matrix (3, 3) of the rotation, whatever the scale is."""
+    marginal = normal[:3, :3].copy()
+    if free_scale:
+        for a in range(3):
+            for b in range(3):
+                marginal[a, b] -= normal[a, 3] * normal[3, b] / normal[3, 3]
+    return marginal
+
+
+@compiled
+def _scale_weight(normal: NDArray[np.float64]) -> float:
+    """Weight of the logarithm of the scale, marginal over the rotation."""
+    unit = normal[:3, 3].copy()
+    shift, _ = solve_symmetric(normal, unit, 3)
+    return float(normal[3, 3] - shift[0] * unit[0] - shift[1] * unit[1] - shift[2] * unit[2])
+
+
+@compiled
 def refine(
     index: IndexArrays,
     given: Observations,
     rotation: NDArray[np.float64],
     scale: float,
     free_scale: bool,
-    window: float,
+    reach_px: float,
     zero_point: float,
     magnitude_gate: float,
     px_per_rad: float,
-    first_count: int,
+    least_matched: int,
 ) -> Refined:
     """Match and solve until the matches stand still.
 
@@ -365,82 +427,63 @@ def refine(
         Where to begin.
     free_scale : bool
         Whether the scale is an unknown.
-    window : float
-        First matching window, pixels for a star of unit error; it only shrinks.
+    reach_px : float
+        Window of the first matching, pixels.
     zero_point, magnitude_gate : float
         First guess of catalogue minus instrumental magnitude, and the largest deviation from it.
     px_per_rad : float
         Least pixels per radian in the field.
-    first_count : int
-        Detections used in the first rounds (the brightest).
+    least_matched : int
+        Fewer matches are a failure.
     """
     n = given.directions.shape[0]
-    stars = np.full(n, -1, dtype=np.int64)
-    previous = np.full(n, -1, dtype=np.int64)
-    costs = np.empty(n)
-    scratch = np.empty(n)
+    stars, previous = np.full(n, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
+    costs, scratch = np.empty(n), np.empty(n)
     size = 16
     while size < 4 * n:
         size *= 2
     owners = np.empty(size, dtype=np.int64)
-    normal = np.empty((4, 4))
-    right = np.empty(4)
+    normal, right = np.empty((4, 4)), np.empty(4)
     unknowns = 4 if free_scale else 3
-    failed = Refined(0, rotation, scale, stars, normal[:3, :3].copy(), math.nan, math.nan, math.nan, math.nan)
     observations = rescaled(given, scale) if scale != 1.0 else given
-    count = min(first_count, n)
-    sigma = window / 3.0
+    count = min(FIRST_MATCHED, n)
+    sigma = 1.0
     magnitude_sigma = magnitude_gate
     matched = 0
     variance = math.nan
-    chi2 = math.nan
     for step in range(MAX_ROUNDS):
         matched = match_detections(
-            index, observations, rotation, count, window, sigma, zero_point, magnitude_sigma, magnitude_gate,
+            index, observations, rotation, count, reach_px, sigma, zero_point, magnitude_sigma, magnitude_gate,
             px_per_rad, stars, costs, owners,
         )  # fmt: skip
-        if matched < 3:
-            return failed
-        stable = step > 1 and count == n
-        for i in range(n):
-            if stars[i] != previous[i]:
-                stable = False
-            previous[i] = stars[i]
-        normal_equations(index, observations, rotation, count, stars, normal, right)
+        if matched < least_matched:
+            return nothing_refined()
+        stable = _same(stars, previous) and step > 0
+        chi2 = normal_equations(index, observations, rotation, count, stars, normal, right)
         step_vector, solved = solve_symmetric(normal, right, unknowns)
         if not solved:
-            return failed
+            return nothing_refined()
+        for k in range(unknowns):
+            chi2 -= right[k] * step_vector[k]
         rotation = turned(rotation, step_vector[0], step_vector[1], step_vector[2])
         if free_scale:
             scale *= math.exp(step_vector[3])
             observations = rescaled(given, scale)
-        chi2 = normal_equations(index, observations, rotation, count, stars, normal, right)
         freedom = max(2 * matched - unknowns, 1)
-        variance = chi2 / freedom
-        if stable:
-            break
-        if step < 2:
+        variance = max(chi2, 1e-12) / freedom
+        sigma = math.sqrt(variance)
+        if step == 0:
+            # wrong pairs may be among the first matches: robust estimates
             sigma = typical_distance(index, observations, rotation, count, stars, scratch)
             sigma *= math.sqrt(2.0 * matched / freedom)
             zero_point, magnitude_sigma = photometry(index, observations, count, stars, scratch)
             magnitude_gate = min(magnitude_gate, max(5.0 * magnitude_sigma, 0.75))
-        else:
-            sigma = math.sqrt(variance)
-        window = min(window, max(WINDOW_SIGMAS * sigma, SMALLEST_WINDOW_PX))
+            reach_px = 0.0
+        if stable:
+            break
         count = n
-    marginal = np.empty((3, 3))
-    for a in range(3):
-        for b in range(3):
-            marginal[a, b] = normal[a, b]
-            if free_scale:
-                marginal[a, b] -= normal[a, 3] * normal[3, b] / normal[3, 3]
-    rms2 = 0.0
-    faintest = -99.0
-    for i in range(n):
-        if stars[i] >= 0:
-            rx, ry, _, _, _ = residual(index, observations, rotation, i, stars[i])
-            rms2 += rx * rx + ry * ry
-            faintest = max(faintest, index.magnitudes[stars[i]])
     return Refined(
-        matched, rotation, scale, stars, marginal, variance, math.sqrt(rms2 / matched), window, faintest
-    )
+        matched, rotation, scale, stars, _marginal(normal, free_scale), variance,
+        _rms(index, observations, rotation, stars), zero_point, magnitude_sigma,
+        1.0 / _scale_weight(normal) if free_scale else 0.0,
+    )  # fmt: skip

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.jit import compiled
-from starid.observation import Observations, observe
+from starid.observation import Observations, observe, rescaled
 from starid.pattern_index import (
-    COUNT_CELLS,
     SHORTEST_SIDE,
     SIDE_BINS,
     SIDE_STEP,
@@ -24,12 +23,10 @@ from starid.pattern_index import (
     IndexArrays,
     chord,
     handedness,
-    magnitude_bin,
     sorted_triangle,
 )
 from starid.refinement import Refined, nothing_refined, refine
-from starid.sky_grid import cell_of
-from starid.verification import hit_odds, log_chance, worth_refining
+from starid.verification import ROTATIONS, hit_odds, log_false_probability, test_order, worth_refining
 
 SEARCH_TOLERANCE: Final = 0
 """Largest error of a side, radians."""
@@ -40,20 +37,22 @@ MAX_TRIANGLES: Final = 2
 SCALE_TOLERANCE: Final = 3
 """Relative error of the focal length (0 where it is known)."""
 WINDOW: Final = 4
-"""First matching window, radians at the centre of the field."""
+"""First matching window, pixels."""
 LARGEST_SIGMA: Final = 5
-"""Largest centroid noise believed, pixels for a star of unit error."""
+"""Largest centroid noise believed, pixels per axis."""
 LOG_CHANCE: Final = 6
 """Logarithm of the largest probability of a false answer."""
 PX_PER_RAD: Final = 7
-"""Pixels per radian at the centre."""
-LEAST_PX_PER_RAD: Final = 8
 """Least pixels per radian in the field."""
+SIGMAS_KNOWN: Final = 8
+"""Not 0 where the errors of the positions are given."""
 FIELD_PX: Final = 9
 """Pixels in the field."""
 LOG_CHANCE_TRACKING: Final = 10
 """The same as `LOG_CHANCE` for an answer near a predicted attitude."""
-SETTING_COUNT: Final = 11
+TEST_WINDOW: Final = 11
+"""Window of the sequential test, radians."""
+SETTING_COUNT: Final = 12
 
 SYSTEMATIC: Final = 14
 """Brightest detections of which every triangle is tried first."""
@@ -61,11 +60,8 @@ SYSTEMATIC: Final = 14
 DRAWN_FROM: Final = 60
 """Brightest detections from which further triangles are drawn."""
 
-FIRST_MATCHED: Final = 40
-"""Detections used while the attitude is still coarse."""
-
-LOOK_ELSEWHERE: Final = 10.0
-"""Factor on the number of hypotheses for the freedom that the refinement takes."""
+LEAST_MATCHED: Final = 4
+"""Matches that an answer needs."""
 
 NOTHING: Final = 0
 ACCEPTED: Final = 1
@@ -127,30 +123,21 @@ def rotation_between(sensor: NDArray[np.float64], sky: NDArray[np.float64]) -> N
 
 
 @compiled
-def accept(
+def judged(
     index: IndexArrays,
+    observations: Observations,
     refined: Refined,
-    tested: int,
-    hypotheses: float,
-    consumed: int,
+    prior_volume: float,
     settings: NDArray[np.float64],
 ) -> float:
-    """Logarithm of the bound on the probability that a refined attitude is chance; 0 where it is worthless.
-
-    The stars that the attitude was made from, `consumed`, do not count. The field's star density down to
-    the faintest match times the final window is the chance of a single accidental match.
-    """
-    if refined.matched <= consumed:
+    """`log_false_probability` of a refined attitude under the settings."""
+    if refined.matched == 0 or refined.rms_px > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
         return 0.0
-    boresight = refined.rotation[2]
-    cell = cell_of(boresight[0], boresight[1], boresight[2], COUNT_CELLS)
-    depth = magnitude_bin(refined.faintest + 0.5, index.counts.shape[1])
-    density = max(float(index.counts[cell, depth]), 1.0) / settings[FIELD_PX]
-    chance = min(density * math.pi * refined.window_px * refined.window_px, 0.5)
-    bound = math.log(hypotheses * LOOK_ELSEWHERE) + log_chance(
-        refined.matched - consumed, tested - consumed, chance
+    seen = rescaled(observations, refined.scale) if refined.scale != 1.0 else observations
+    spread = 2.0 * settings[SCALE_TOLERANCE]
+    return log_false_probability(
+        index, seen, refined, settings[SIGMAS_KNOWN] > 0.0, prior_volume, spread, settings[FIELD_PX]
     )
-    return min(bound, 0.0)
 
 
 @compiled
@@ -159,6 +146,7 @@ def _try_triangle(
     observations: Observations,
     corners: tuple[int, int, int],
     odds: NDArray[np.float64],
+    order: NDArray[np.int64],
     settings: NDArray[np.float64],
     work: NDArray[np.int64],
 ) -> tuple[Refined, float, bool]:
@@ -190,7 +178,6 @@ def _try_triangle(
     ) / 3.0
     gate = settings[MAGNITUDE_GATE]
     sensor_frame = frame_of(directions[i], directions[j], directions[k])
-    n = directions.shape[0]
     for bin0 in range(first_bin, last_bin + 1):
         ratio_low = max(bin0 * longest / bins - tolerance, low0) / s0 if spread > 0.0 else 1.0
         ratio_high = min((bin0 + 1) * longest / bins + tolerance, high0) / s0 if spread > 0.0 else 1.0
@@ -225,16 +212,22 @@ def _try_triangle(
                 sensor_frame, frame_of(index.vectors[a], index.vectors[b], index.vectors[c])
             )
             if not worth_refining(
-                index, observations, rotation, scale, zero_point + gate, settings[WINDOW], odds, (i, j, k)
+                index,
+                observations,
+                rotation,
+                scale,
+                zero_point + gate,
+                settings[TEST_WINDOW],
+                odds,
+                order,
+                (i, j, k),
             ):
                 continue
             refined = refine(
-                index, observations, rotation, scale, spread > 0.0, settings[WINDOW] * settings[PX_PER_RAD],
-                zero_point, gate, settings[LEAST_PX_PER_RAD], FIRST_MATCHED,
+                index, observations, rotation, scale, spread > 0.0, settings[WINDOW],
+                zero_point, gate, settings[PX_PER_RAD], LEAST_MATCHED,
             )  # fmt: skip
-            if refined.matched == 0:
-                continue
-            bound = accept(index, refined, n, float(work[1]), 3, settings)
+            bound = judged(index, observations, refined, ROTATIONS, settings)
             if bound < settings[LOG_CHANCE]:
                 return refined, bound, True
     return none, 0.0, False
@@ -269,13 +262,15 @@ def search(
     work = np.zeros(2, dtype=np.int64)
     if n < 4:
         return Outcome(TOO_FEW, refined, observations.source, 0.0, 0, 0)
-    odds = hit_odds(index, settings[WINDOW])
+    odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
     limit = int(settings[MAX_TRIANGLES])
     systematic = min(n, SYSTEMATIC)
     for k in range(2, systematic):
         for j in range(1, k):
             for i in range(j):
-                refined, bound, found = _try_triangle(index, observations, (i, j, k), odds, settings, work)
+                refined, bound, found = _try_triangle(
+                    index, observations, (i, j, k), odds, order, settings, work
+                )
                 if found:
                     return Outcome(ACCEPTED, refined, observations.source, bound, work[0], work[1])
                 if work[0] >= limit:
@@ -294,7 +289,7 @@ def search(
         if drawn[0] == drawn[1] or drawn[0] == drawn[2] or drawn[1] == drawn[2]:
             continue
         refined, bound, found = _try_triangle(
-            index, observations, (drawn[0], drawn[1], drawn[2]), odds, settings, work
+            index, observations, (drawn[0], drawn[1], drawn[2]), odds, order, settings, work
         )
         if found:
             return Outcome(ACCEPTED, refined, observations.source, bound, work[0], work[1])

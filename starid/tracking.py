@@ -8,6 +8,7 @@ window, roll included, is followed; anything else is refused.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -16,25 +17,26 @@ from numpy.typing import NDArray
 from starid.jit import compiled
 from starid.observation import Observations, observe
 from starid.pattern_index import GRID_CELLS, GRID_MARGIN, SHORTEST_SIDE, IndexArrays, chord
-from starid.refinement import Refined, nothing_refined, refine
+from starid.refinement import Refined, nothing_refined, refine, to_sky
 from starid.search import (
     ACCEPTED,
-    FIRST_MATCHED,
-    LEAST_PX_PER_RAD,
+    FIELD_PX,
+    LEAST_MATCHED,
     LOG_CHANCE_TRACKING,
     MAGNITUDE_GATE,
     NOTHING,
     PX_PER_RAD,
     SEARCH_TOLERANCE,
+    TEST_WINDOW,
     TOO_FEW,
     WINDOW,
     Outcome,
-    accept,
     frame_of,
+    judged,
     rotation_between,
 )
 from starid.sky_grid import cell_of
-from starid.verification import hit_odds, to_sky, worth_refining
+from starid.verification import ROTATIONS, hit_odds, test_order, worth_refining
 
 PAIRED: Final = 16
 """Brightest detections that pairs are made of."""
@@ -80,7 +82,8 @@ def _try_pair(
     detections: tuple[int, int],
     stars: tuple[int, int],
     odds: NDArray[np.float64],
-    hypotheses: float,
+    order: NDArray[np.int64],
+    prior_volume: float,
     settings: NDArray[np.float64],
 ) -> tuple[Refined, float]:
     """Refine the attitude of two pairs if it stands the tests; the bound is 0 where it does not."""
@@ -96,14 +99,22 @@ def _try_pair(
     u, c = observations.directions, index.vectors
     rotation = rotation_between(frame_of(u[i], u[j], u[j]), frame_of(c[a], c[b], c[b]))
     if not worth_refining(
-        index, observations, rotation, 1.0, zero_point + gate, settings[WINDOW], odds, (i, j, j)
+        index,
+        observations,
+        rotation,
+        1.0,
+        zero_point + gate,
+        settings[TEST_WINDOW],
+        odds,
+        order,
+        (i, j, j),
     ):
         return nothing, 0.0
     refined = refine(
-        index, observations, rotation, 1.0, False, settings[WINDOW] * settings[PX_PER_RAD],
-        zero_point, gate, settings[LEAST_PX_PER_RAD], FIRST_MATCHED,
+        index, observations, rotation, 1.0, False, settings[WINDOW],
+        zero_point, gate, settings[PX_PER_RAD], LEAST_MATCHED,
     )  # fmt: skip
-    return refined, accept(index, refined, u.shape[0], hypotheses, 2, settings)
+    return refined, judged(index, observations, refined, prior_volume, settings)
 
 
 @compiled
@@ -129,9 +140,12 @@ def track_near(
     observations = observe(params, xy, flux, sigmas)
     n = observations.directions.shape[0]
     refined = nothing_refined()
-    if n < 3:  # noqa: PLR2004 - two stars, and one to check them
+    if n < 3:
         return Outcome(TOO_FEW, refined, observations.source, 0.0, 0, 0)
-    odds = hit_odds(index, settings[WINDOW])
+    odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
+    # a star at the border of the field still lies within the window after a turn of window/(field's radius)
+    roll = min(window_rad * settings[PX_PER_RAD] / math.sqrt(settings[FIELD_PX] / math.pi), math.pi)
+    prior_volume = min(2.0 * math.pi * window_rad**2 * roll, ROTATIONS)
     paired = min(n, PAIRED)
     near = np.empty((paired, CANDIDATES), dtype=np.int64)
     counts = np.empty(paired, dtype=np.int64)
@@ -151,7 +165,7 @@ def track_near(
                         continue
                     hypotheses += 1
                     refined, bound = _try_pair(
-                        index, observations, (i, j), (a, b), odds, float(hypotheses), settings
+                        index, observations, (i, j), (a, b), odds, order, prior_volume, settings
                     )
                     if refined.matched > 0 and bound < settings[LOG_CHANCE_TRACKING]:
                         return Outcome(ACCEPTED, refined, observations.source, bound, pairs, hypotheses)
