@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from starid.jit_loops import compiled_loops
 
-COLUMNS: Final = 9
-X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(COLUMNS)
+FIT_COLUMNS: Final = 9
+X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
 """Columns of a table of fits; STATE is one of the numbers below."""
 
 GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
@@ -36,15 +36,6 @@ _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _FAR: Final = 5.0
 SHORT_TRAIL_PX: Final = 0.5
 """A shorter trail is fitted as a round spot."""
-
-
-@compiled_loops
-def window_radius(sigma: float, flux: float, noise: float, largest: int) -> int:
-    """Half-width of the window in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
-    peak = flux / (2.0 * math.pi * sigma * sigma)
-    ratio = max(peak / (0.33 * noise), 1.0)
-    reach = max(2.5, min(math.sqrt(2.0 * math.log(ratio)), 6.0))
-    return min(max(math.ceil(reach * sigma + 0.5), 2), largest)
 
 
 @compiled_loops
@@ -149,7 +140,7 @@ def fit_star(
     top: int,
     start: tuple[float, float],
     shape: tuple[float, float, float],
-    noise: tuple[float, float, float, float],
+    noise: tuple[float, float, float],
     model: npt.NDArray[np.float64],
     result: npt.NDArray[np.float64],
 ) -> None:
@@ -158,25 +149,24 @@ def fit_star(
     Parameters
     ----------
     pixels : ndarray (rows, columns), float32
-        Counts above the background.
+        Counts above the background; infinite ones are not used.
     left, top : int
         Image column and row of the window's first pixel.
     start : (float, float)
         First guess of the position, image pixels.
     shape : (float, float, float)
         Standard deviation of the spot, and the trail along x and y, pixels.
-    noise : (float, float, float, float)
+    noise : (float, float, float)
         Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
-        unknown); share of its light by which the model may be wrong in a pixel; counts above the background from
-        which a pixel is saturated.
+        unknown); share of its light by which the model may be wrong in a pixel.
     model : ndarray (3, rows, columns)
         Left with the model at the result.
-    result : ndarray (COLUMNS,)
+    result : ndarray (FIT_COLUMNS,)
         Filled; CHI2 is the sum of weighted squares over PIXELS pixels.
     """
     rows, columns = pixels.shape
     sigma, trail_x, trail_y = shape
-    variance, per_dn, model_error, saturation = noise
+    variance, per_dn, model_error = noise
     trailed = math.hypot(trail_x, trail_y) > SHORT_TRAIL_PX
     x, y = start
     flux = -1.0
@@ -188,7 +178,7 @@ def fit_star(
         else:
             spot_model(x, y, sigma, left, top, model)
         if flux <= 0.0:
-            flux = _best_flux(pixels, model, saturation)
+            flux = _best_flux(pixels, model)
         a_xx = a_xy = a_yy = a_xf = a_yf = a_ff = 0.0
         b_x = b_y = b_f = 0.0
         chi2 = 0.0
@@ -196,7 +186,7 @@ def fit_star(
         for j in range(rows):
             for i in range(columns):
                 value = pixels[j, i]
-                if value >= saturation:
+                if math.isinf(value):
                     continue
                 share = model[0, j, i]
                 light = flux * share
@@ -252,34 +242,40 @@ def fit_star(
 
 
 @compiled_loops
-def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64], saturation: float) -> float:
+def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) -> float:
     """Flux that fits a window best at a given place, all pixels weighted alike."""
     above = 0.0
     below = 1e-12
     for j in range(pixels.shape[0]):
         for i in range(pixels.shape[1]):
-            if pixels[j, i] < saturation:
+            if not math.isinf(pixels[j, i]):
                 above += model[0, j, i] * pixels[j, i]
                 below += model[0, j, i] * model[0, j, i]
     return max(above / below, _FLOOR_FLUX)
 
 
 @compiled_loops
-def explained(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) -> tuple[float, float, float]:
-    """Drop in the sum of squares of a window that the fitted shape makes, that its highest pixel alone makes, and all.
+def explained(
+    pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]
+) -> tuple[float, float, float, int]:
+    """Drop in the sum of squares of a window that the fitted shape makes, and that its highest pixel alone makes.
 
     Each with its best brightness. Where the highest pixel explains more than the shape of a star does, it is a hot
-    pixel or a particle's hit.
+    pixel or a particle's hit. Returned beside them: the sum of squares itself, and the number of pixels in it.
     """
     highest = 0.0
     product = 0.0
     shape2 = 1e-12
     total = 0.0
+    used = 0
     for j in range(pixels.shape[0]):
         for i in range(pixels.shape[1]):
-            value = pixels[j, i]
+            value = float(pixels[j, i])
+            if math.isinf(value):
+                continue
             highest = max(highest, value)
             product += model[0, j, i] * value
             shape2 += model[0, j, i] * model[0, j, i]
             total += value * value
-    return product * product / shape2, highest * highest, total
+            used += 1
+    return product * product / shape2, highest * highest, total, used

@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.background import Background, estimate_background
-from starid.centroid import CHI2, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
+from starid.centroid import CHI2, FIT_COLUMNS, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
 from starid.errors import StaridError
 from starid.matched_filter import find_peaks, noise_factor, spot_taps
-from starid.measurement import AT_EDGE, SATURATED, measure
+from starid.measurement import AT_EDGE, SATURATED, find_neighbours, measure
 from starid.spot_shape import SpotShape, moments_of, shape_from_moments
+from starid.windows import WINDOW_COLUMNS, cut_windows, lay_windows
 
 LEAST_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
@@ -24,6 +25,7 @@ _SHAPE_WINDOW_PX: Final = 24
 _OTHER_WIDTH: Final = 0.3
 _FIT_PARAMETERS: Final = 3
 _RELAX: Final = 0.8
+_MOST_NEIGHBOURS: Final = 64
 
 
 @dataclass(frozen=True)
@@ -242,29 +244,27 @@ def _measured(
     saturation: int,
 ) -> Detections:
     """Fit the candidates and keep the stars."""
-    stars = np.zeros((len(peaks), 9))
-    flags = np.zeros(len(peaks), dtype=np.uint8)
     gain = settings.gain_e_per_dn
     per_dn = 0.0 if gain is None else 1.0 / gain
     typical = background.median_noise
-    sensor = (per_dn, settings.model_error, float(saturation), typical)
-    squares = noise_factor(spot_taps(shape.sigma_px)) ** 2
-    limits = (_RELAX * settings.threshold_sigma, squares)
-    measure(
-        counts,
-        peaks,
-        heights,
-        background.level,
-        background.noise,
-        float(background.block_px),
-        shape.sigma_px,
-        shape.trail_field,
-        sensor,
-        limits,
-        stars,
-        flags,
-        2,
+    spot = (shape.sigma_px, float(saturation), typical)
+    grid = (background.level, background.noise, float(background.block_px))
+    flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
+    count = len(peaks)
+    windows = np.zeros((count, WINDOW_COLUMNS))
+    pixels = np.empty(
+        lay_windows(counts, peaks, flux, *grid, spot, shape.trail_field, windows), dtype=np.float32
     )
+    cut_windows(counts, windows, background.level, grid[2], float(saturation), pixels)
+    first = np.empty(count + 1, dtype=np.int32)
+    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
+    find_neighbours(windows, first, neighbours)
+    stars = np.zeros((count, FIT_COLUMNS))
+    flags = np.zeros(count, dtype=np.uint8)
+    ratio = _RELAX * settings.threshold_sigma
+    core_dn = saturation - background.median_level
+    sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, core_dn)
+    measure(windows, pixels, first, neighbours, sensor, (counts.shape[1], counts.shape[0]), stars, flags)
     good = np.flatnonzero(stars[:, STATE] == GOOD)
     if good.size == 0:
         return _nothing(background, "nothing on the image has the shape of a star")

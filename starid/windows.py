@@ -1,0 +1,269 @@
+"""Windows around candidates: how large each must be, what the sky is under it, and its pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.background import LEAST_NOISE_DN, interpolate_at
+from starid.jit_loops import compiled_loops
+from starid.spot_shape import trail_at
+
+WINDOW_COLUMNS: Final = 14
+(
+    LEFT,
+    TOP,
+    COLUMNS,
+    ROWS,
+    OFFSET,
+    START_X,
+    START_Y,
+    BASE,
+    NOISE,
+    PATCH,
+    TRAIL_X,
+    TRAIL_Y,
+    RADIUS_X,
+    RADIUS_Y,
+) = range(WINDOW_COLUMNS)
+"""Columns of a table of windows: place and size; where the pixels begin in the packed array; first guess of the star;
+sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
+
+LARGEST_HALF_WIDTH: Final = 40
+"""Half-width of a window at most, pixels."""
+
+MOST_SATURATED: Final = 400
+"""Connected saturated pixels from which on an object is no star."""
+
+EXTENDED: Final = -1.0
+SEEN_BEFORE: Final = -2.0
+NO_ROOM: Final = -3.0
+"""Values of COLUMNS that say why a candidate has no window."""
+
+_RING_PIXELS: Final = 48
+_RING_SHIFT_SIGMA: Final = 0.6
+_BLOCK_OF_MORE_THAN_SKY: Final = 1.5
+_RING_OF_MORE_THAN_SKY: Final = 2.0
+_QUARTILE_SIGMA: Final = 1.349
+_LEAST_REACH_SIGMA: Final = 2.5
+_MOST_REACH_SIGMA: Final = 6.0
+_VISIBLE_NOISE: Final = 0.33
+
+
+@compiled_loops
+def light_radius(sigma: float, flux: float, noise: float) -> int:
+    """Half-width of the square in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
+    peak = flux / (2.0 * math.pi * sigma * sigma)
+    ratio = max(peak / (_VISIBLE_NOISE * noise), 1.0)
+    reach = max(_LEAST_REACH_SIGMA, min(math.sqrt(2.0 * math.log(ratio)), _MOST_REACH_SIGMA))
+    return min(max(math.ceil(reach * sigma + 0.5), 2), LARGEST_HALF_WIDTH)
+
+
+@compiled_loops
+def _ring(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    x: int,
+    y: int,
+    radius_x: int,
+    radius_y: int,
+    values: npt.NDArray[np.float64],
+) -> tuple[float, float]:
+    """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window."""
+    height, width = image.shape
+    count = 0
+    for k in range(_RING_PIXELS):
+        angle = 2.0 * math.pi * k / _RING_PIXELS
+        out = 1.0 if k % 2 == 0 else 2.5
+        column = x + round((radius_x + out) * math.cos(angle))
+        row = y + round((radius_y + out) * math.sin(angle))
+        if 0 <= column < width and 0 <= row < height:
+            key = float(image[row, column])
+            j = count - 1
+            while j >= 0 and values[j] > key:
+                values[j + 1] = values[j]
+                j -= 1
+            values[j + 1] = key
+            count += 1
+    if count < _RING_PIXELS // 4:
+        return math.nan, math.nan
+    low, high = count // 4, (3 * count) // 4
+    total = 0.0
+    for k in range(low, high):
+        total += values[k]
+    return total / (high - low), (values[high] - values[low]) / _QUARTILE_SIGMA
+
+
+@compiled_loops
+def _saturated_patch(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    x: int,
+    y: int,
+    saturation: float,
+    visited: npt.NDArray[np.uint8],
+    stack: npt.NDArray[np.int32],
+    patch: npt.NDArray[np.float64],
+) -> int:
+    """Follow the connected saturated pixels from (x, y), marking them.
+
+    Fills `patch` (3,) with their mean column and row and half their larger extent. Returns their number, −1 if the
+    pixel was visited before; counting stops at `MOST_SATURATED`.
+    """
+    height, width = image.shape
+    if visited[y, x] != 0:
+        return -1
+    visited[y, x] = 1
+    stack[0, 0], stack[0, 1] = x, y
+    waiting, count = 1, 0
+    total_x = total_y = 0.0
+    left, right, top, bottom = x, x, y, y
+    while waiting > 0 and count < MOST_SATURATED:
+        waiting -= 1
+        column, row = stack[waiting, 0], stack[waiting, 1]
+        count += 1
+        total_x += column
+        total_y += row
+        left, right = min(left, column), max(right, column)
+        top, bottom = min(top, row), max(bottom, row)
+        for b in range(max(row - 1, 0), min(row + 2, height)):
+            for a in range(max(column - 1, 0), min(column + 2, width)):
+                if visited[b, a] == 0 and image[b, a] >= saturation and waiting < stack.shape[0]:
+                    visited[b, a] = 1
+                    stack[waiting, 0], stack[waiting, 1] = a, b
+                    waiting += 1
+    patch[0], patch[1] = total_x / count, total_y / count
+    patch[2] = 0.5 * (max(right - left, bottom - top) + 1)
+    return count
+
+
+@compiled_loops
+def _sky(
+    around: float, spread: float, base: float, noise: float, typical_noise: float
+) -> tuple[float, float]:
+    """Sky and noise under a star, from its ring (NaN if there is none) and from the grid of blocks.
+
+    The grid has the smaller error; the ring wins where it contradicts the grid, as in glare or by a bright limb.
+    """
+    if spread != spread:
+        return base, noise
+    if noise > _BLOCK_OF_MORE_THAN_SKY * typical_noise:
+        noise = max(spread, typical_noise)
+    elif spread > _RING_OF_MORE_THAN_SKY * noise:
+        noise = spread
+    if abs(around - base) > _RING_SHIFT_SIGMA * noise + 0.5 * LEAST_NOISE_DN:
+        base = around
+    return base, noise
+
+
+@compiled_loops
+def lay_windows(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    peaks: npt.NDArray[np.int32],
+    flux: npt.NDArray[np.float32],
+    level: npt.NDArray[np.float32],
+    noise: npt.NDArray[np.float32],
+    block: float,
+    spot: tuple[float, float, float],
+    field: npt.NDArray[np.float64],
+    windows: npt.NDArray[np.float64],
+) -> int:
+    """Lay a window around every candidate.
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts.
+    peaks : ndarray (n, 2)
+        Column and row of each candidate, the brightest first.
+    flux : ndarray (n,)
+        First guess of their light, counts.
+    level, noise, block
+        Grid of the background, and the side of its blocks.
+    spot : (float, float, float)
+        Standard deviation of the spot, pixels; saturation and the typical noise of a pixel, counts.
+    field : ndarray (6, 3)
+        Field of trails (`SpotShape`).
+    windows : ndarray (n, WINDOW_COLUMNS)
+        Filled; COLUMNS tells where there is none, and why.
+
+    Returns
+    -------
+    int
+        Pixels in all windows together.
+    """
+    height, width = image.shape
+    sigma, saturation, typical_noise = spot
+    ring = np.empty(_RING_PIXELS)
+    visited = np.zeros((height, width), np.uint8)
+    stack = np.empty((2 * MOST_SATURATED, 2), np.int32)
+    patch = np.zeros(3)
+    total = 0
+    for k in range(peaks.shape[0]):
+        window = windows[k]
+        column, row = peaks[k, 0], peaks[k, 1]
+        patch[0], patch[1], patch[2] = column, row, 0.0
+        if image[row, column] >= saturation:
+            count = _saturated_patch(image, column, row, saturation, visited, stack, patch)
+            if count < 0 or count >= MOST_SATURATED:
+                window[COLUMNS] = SEEN_BEFORE if count < 0 else EXTENDED
+                continue
+        x, y, extra = patch[0], patch[1], patch[2]
+        trail_x, trail_y = trail_at(field, x, y, width, height)
+        radius = light_radius(sigma, float(flux[k]), typical_noise)
+        radius_x = min(math.ceil(radius + 0.5 * abs(trail_x) + extra), LARGEST_HALF_WIDTH)
+        radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
+        centre_x, centre_y = round(x), round(y)
+        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, ring)
+        window[BASE], window[NOISE] = _sky(
+            around,
+            spread,
+            interpolate_at(level, block, x, y),
+            interpolate_at(noise, block, x, y),
+            typical_noise,
+        )
+        left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)
+        columns = min(centre_x + radius_x, width - 1) - left + 1
+        rows = min(centre_y + radius_y, height - 1) - top + 1
+        window[LEFT], window[TOP] = left, top
+        window[START_X], window[START_Y], window[PATCH] = x, y, extra
+        window[TRAIL_X], window[TRAIL_Y] = trail_x, trail_y
+        window[RADIUS_X], window[RADIUS_Y] = radius_x, radius_y
+        window[OFFSET] = total
+        if min(columns, rows) < 3:
+            window[COLUMNS] = NO_ROOM
+            continue
+        window[COLUMNS], window[ROWS] = columns, rows
+        total += columns * rows
+    return total
+
+
+@compiled_loops
+def cut_windows(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    windows: npt.NDArray[np.float64],
+    level: npt.NDArray[np.float32],
+    block: float,
+    saturation: float,
+    pixels: npt.NDArray[np.float32],
+) -> None:
+    """Copy the windows' pixels, one window after the other, less the sky; saturated ones become infinite.
+
+    The sky is a plane: `BASE` at the first guess of the star, sloped as the grid of blocks.
+    """
+    position = 0
+    for k in range(windows.shape[0]):
+        window = windows[k]
+        if window[COLUMNS] <= 0.0:
+            continue
+        x, y, base = window[START_X], window[START_Y], window[BASE]
+        slope_x = 0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y))
+        slope_y = 0.5 * (interpolate_at(level, block, x, y + 1.0) - interpolate_at(level, block, x, y - 1.0))
+        left, top = int(window[LEFT]), int(window[TOP])
+        for j in range(top, top + int(window[ROWS])):
+            for i in range(left, left + int(window[COLUMNS])):
+                value = float(image[j, i])
+                sky = base + slope_x * (i - x) + slope_y * (j - y)
+                pixels[position] = np.float32(value - sky if value < saturation else math.inf)
+                position += 1
