@@ -138,11 +138,11 @@ def add_communication(
     information.order_code = ""
     information.simple_boot_up_master = False
     information.simple_boot_up_slave = True
-    information.granularity = 8  # type: ignore[assignment]
+    information.granularity = 8
     information.dynamic_channels_supported = False
     information.group_messaging = False
     information.nr_of_RXPDO = len(rpdos)  # type: ignore[assignment]
-    information.nr_of_TXPDO = len(tpdos)
+    information.nr_of_TXPDO = len(tpdos)  # type: ignore[assignment]
     information.LSS_supported = True
     information.allowed_baudrates = set(identity.bit_rates)
     _add_general(od, identity)
@@ -186,7 +186,7 @@ def _add_messages(od: ObjectDictionary) -> None:
         variable("Guard time", 0x100C, 0, U16, "rw", 0),
         variable("Life time factor", 0x100D, 0, U8, "rw", 0),
         variable("COB-ID time stamp message", 0x1012, 0, U32, "rw", INVALID | TIME),
-        variable("High resolution time stamp", 0x1013, 0, U32, "rw", 0, mappable=True),
+        variable("High resolution time stamp", 0x1013, 0, U32, "rw", mappable=True),
         variable("COB-ID emergency message", 0x1014, 0, U32, "rw", EMERGENCY, relative=True),
         variable("Inhibit time emergency", 0x1015, 0, U16, "rw", 0),
         variable("Producer heartbeat time", 0x1017, 0, U16, "rw", HEARTBEAT_MS),

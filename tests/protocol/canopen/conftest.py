@@ -1,0 +1,142 @@
+"""A slave on the table: frames go in and out by hand, and the `canopen` library is its master."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import canopen
+import pytest
+
+from protocol.can_framing import CanFrame
+from protocol.canopen import CanopenSlave, DeviceDictionary, StandInApplication, build_dictionary
+from protocol.canopen.storage import ParameterStorage
+
+NODE = 0x2C
+
+
+class Bench:
+    """One slave, a clock that is moved by hand, and what came out."""
+
+    def __init__(self, node_id: int = NODE, storage: ParameterStorage | None = None, **options) -> None:
+        self.dictionary: DeviceDictionary = build_dictionary()
+        self.application = StandInApplication(self.dictionary.icd)
+        self.dictionary.application = self.application
+        self.storage = storage
+        self.slave = CanopenSlave(self.dictionary, node_id, storage=storage, **options)
+        self.now = 100.0
+        self.sent: list[CanFrame] = []
+        self.node = node_id
+
+    def power_on(self) -> Bench:
+        self.sent += self.slave.start(self.now)
+        return self
+
+    def frame(
+        self, identifier: int, data: bytes | Iterable[int] | str = b"", **fields
+    ) -> list[tuple[int, bytes]]:
+        """Give the slave a frame; return what it sends as (identifier, data)."""
+        data = bytes.fromhex(data) if isinstance(data, str) else bytes(data)
+        frames = self.slave.receive(
+            CanFrame(
+                identifier,
+                data,
+                extended=fields.get("extended", False),
+                **{key: value for key, value in fields.items() if key != "extended"},
+            ),
+            self.now,
+        )
+        self.sent += frames
+        return [(frame.id, frame.data) for frame in frames]
+
+    def sdo(self, request: str | bytes) -> str:
+        """Give an SDO request (spaces allowed, padded to 8 bytes); return the answers as hexadecimal text."""
+        data = bytes.fromhex(request) if isinstance(request, str) else request
+        answers = self.frame(0x600 + self.node, data.ljust(8, b"\0"))
+        assert all(identifier == 0x580 + self.node for identifier, _ in answers)
+        return " ".join(data.hex() for _, data in answers)
+
+    def read(self, index: int, subindex: int = 0) -> bytes:
+        """Read by SDO, expedited or segmented."""
+        mux = index.to_bytes(2, "little").hex() + f"{subindex:02x}"
+        answer = bytes.fromhex(self.sdo(f"40{mux}"))
+        if answer[0] == 0x80:
+            raise canopen.SdoAbortedError(int.from_bytes(answer[4:], "little"))
+        if answer[0] & 2:
+            return answer[4 : 8 - (answer[0] >> 2 & 3)]
+        size, data, toggle = int.from_bytes(answer[4:], "little"), b"", 0
+        while len(data) < size or not size:
+            part = bytes.fromhex(self.sdo(bytes([0x60 | toggle])))
+            data += part[1 : 8 - (part[0] >> 1 & 7)]
+            toggle ^= 0x10
+            if part[0] & 1:
+                break
+        assert len(data) == size
+        return data
+
+    def number(self, index: int, subindex: int = 0) -> int:
+        return int.from_bytes(self.read(index, subindex), "little")
+
+    def write(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> int:
+        """Write by expedited SDO; return 0 or the abort code."""
+        data = value if isinstance(value, bytes) else value.to_bytes(size, "little")
+        command = 0x23 | (4 - len(data)) << 2
+        answer = bytes.fromhex(
+            self.sdo(bytes([command]) + index.to_bytes(2, "little") + bytes([subindex]) + data)[:16]
+        )
+        return 0 if answer[0] == 0x60 else int.from_bytes(answer[4:], "little")
+
+    def nmt(self, command: int, node: int | None = None) -> list[tuple[int, bytes]]:
+        return self.frame(0, bytes([command, self.node if node is None else node]))
+
+    def operational(self) -> list[tuple[int, bytes]]:
+        return self.nmt(1)
+
+    def advance(self, seconds: float) -> list[tuple[float, int, bytes]]:
+        """Let time pass, calling `tick` whenever the slave asks for it; return (time, identifier, data)."""
+        end, result = self.now + seconds, []
+        while (deadline := self.slave.next_deadline()) is not None and deadline <= end + 1e-9:
+            self.now = max(self.now, deadline)
+            frames = self.slave.tick(self.now)
+            self.sent += frames
+            result += [(self.now, frame.id, frame.data) for frame in frames]
+        self.now = end
+        return result
+
+    def events(self) -> list[tuple[str, float]]:
+        return [(event.kind.value, event.value) for event in self.slave.take_events()]
+
+
+class DirectNetwork(canopen.Network):
+    """The master of the `canopen` library with a slave at the other end of a function call: no bus, no thread."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__()
+        self._bench = bench
+        self.frames = 0
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self.frames += 1
+        answers = self._bench.slave.receive(
+            CanFrame(can_id, bytes(data), extended=False, remote=remote), self._bench.now
+        )
+        for frame in answers:
+            self.frames += 1
+            self.notify(frame.id, bytearray(frame.data), self._bench.now)
+
+
+@pytest.fixture
+def new_bench() -> type[Bench]:
+    return Bench
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench().power_on()
+
+
+@pytest.fixture
+def master(bench: Bench) -> canopen.RemoteNode:
+    network = DirectNetwork(bench)
+    node = canopen.RemoteNode(bench.node, bench.dictionary.od)
+    network.add_node(node)
+    return node

@@ -1,0 +1,174 @@
+"""The interface definition in the object dictionary: places, types, limits, handlers, bad layouts."""
+
+from __future__ import annotations
+
+import pytest
+
+from protocol.canopen import AbortCode, DeviceDictionary, SdoAbortError, build_dictionary, check_status
+from protocol.canopen.layout import CanopenModel, load_layout
+from protocol.icd import load_icd
+from protocol.values import IcdError
+
+ICD = load_icd()
+
+
+def test_every_row_stands_at_its_identifier():
+    entries = build_dictionary().entries
+    assert {subindex for index, subindex in entries if index == 0x2000} == {0, *(row.id for row in ICD.rows)}
+
+
+def test_every_parameter_stands_at_its_identifier(bench):
+    for parameter in ICD.parameters.values():
+        entry = bench.dictionary.find(0x6020, parameter.id)
+        assert entry.variable.name == parameter.name
+        assert entry.variable.description == parameter.doc
+        assert entry.variable.unit == parameter.unit
+        assert bench.read(0x6020, parameter.id) == entry.read()
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in ICD.rows if row.kind == "telemetry"], ids=lambda row: row.name
+)
+def test_telemetry_rows_are_those_of_the_other_links(bench, row):
+    values = row.example()
+    bench.application.rows[row.name] = values
+    assert bench.read(0x2000, row.id) == row.encode(values)
+
+
+@pytest.mark.parametrize(
+    "index", [0x6001, 0x6002, 0x6003, 0x6010, 0x6030, 0x6031, 0x6032, 0x6033, 0x6041, 0x6050]
+)
+def test_fields_of_a_record_are_the_rows_bytes(bench, index):
+    name = next(item.telemetry for item in load_layout().object if item.index == index)
+    row = ICD.telemetry[name]
+    bench.application.rows[name] = row.example()
+    data = row.encode(row.example())
+    used = [
+        slot
+        for slot in row.slots
+        if any(field.slot.index == slot.index for field in row.named_fields.values())
+    ]
+    assert bench.number(index) == len(used)
+    for subindex, slot in enumerate(used, 1):
+        assert bench.read(index, subindex) == data[slot.offset : slot.offset + slot.size]
+
+
+def test_telecommand_without_data_is_executed_by_writing_1(bench):
+    assert bench.write(0x6051, 0, 0, 1) == AbortCode.VALUE_LOW
+    assert bench.write(0x6051, 0, 2, 1) == AbortCode.VALUE_HIGH
+    assert bench.write(0x6051, 0, 1, 1) == 0
+    assert bench.application.commands == [("clear_counters", {})]
+
+
+def test_telecommand_with_one_value(bench):
+    import struct
+
+    assert bench.write(0x6060, 0, struct.pack("<f", 5.0)) == 0
+    assert bench.write(0x6060, 0, struct.pack("<f", 50.0)) == AbortCode.VALUE_HIGH
+    assert bench.application.commands == [("set_update_rate", {"rate": 5.0})]
+
+
+def test_mode_is_read_and_commanded_at_one_place(bench):
+    bench.application.rows["device_status"] = {"mode": "boot"}
+    assert bench.number(0x6000) == 0
+    assert bench.write(0x6000, 0, 2, 1) == 0
+    assert bench.application.commands == [("set_mode", {"mode": "lost_in_space"})]
+
+
+def test_float_limits_do_not_refuse_what_they_name(bench):
+    import struct
+
+    for parameter in (item for item in ICD.parameters.values() if item.type == "f32"):
+        for limit in (parameter.minimum, parameter.maximum):
+            assert bench.write(0x6020, parameter.id, struct.pack("<f", limit)) == 0
+
+
+@pytest.mark.parametrize(
+    ("status", "code"),
+    [
+        (1, AbortCode.NO_OBJECT),
+        (2, AbortCode.LENGTH),
+        (3, AbortCode.VALUE_RANGE),
+        (5, AbortCode.UNSUPPORTED_ACCESS),
+        (6, AbortCode.DEVICE_STATE),
+        (7, AbortCode.DEVICE_STATE),
+        (8, AbortCode.GENERAL),
+    ],
+)
+def test_published_error_codes_as_abort_codes(status, code):
+    with pytest.raises(SdoAbortError) as caught:
+        check_status(status, "set_mode")
+    assert caught.value.code is code
+    assert "set_mode" in str(caught.value)
+
+
+def test_status_ok_passes():
+    check_status(0, "set_mode")
+
+
+def layout(**changes) -> CanopenModel:
+    document = load_layout().model_dump(by_alias=True)
+    return CanopenModel.model_validate(document | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"object": [{"index": 0x6000, "name": "x", "telemetry": "no_such_row"}]}, "no_such_row"),
+        (
+            {"object": [{"index": 0x6000, "name": "x", "value": "rates.no_field"}], "tpdo": [], "rpdo": []},
+            "no_field",
+        ),
+        ({"tpdo": [{"name": "x", "objects": ["6000.nothing"]}]}, "6000.nothing"),
+        (
+            {
+                "object": [{"index": 0x6000, "name": n, "telemetry": "rates"} for n in "ab"],
+                "tpdo": [],
+                "rpdo": [],
+            },
+            "6000h is used twice",
+        ),
+        (
+            {
+                "object": [
+                    {"index": 0x6000, "name": "x", "value": "unix_time.seconds", "telecommand": "set_mode"}
+                ],
+                "tpdo": [],
+                "rpdo": [],
+            },
+            "differ in type",
+        ),
+    ],
+)
+def test_layouts_that_do_not_fit_the_definition(changes, text):
+    from protocol.errors import ProtocolError
+
+    with pytest.raises(ProtocolError, match=text):
+        DeviceDictionary(ICD, layout(**changes))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[canopen\n", "not valid TOML"),
+        ("[canopen]\n", "device_type"),
+        ("[canopen]\ndevice_type = 'x'\n", "device_type"),
+    ],
+)
+def test_layout_files_that_cannot_be_read(tmp_path, text, reason):
+    path = tmp_path / "canopen.toml"
+    path.write_text(text, encoding="ascii")
+    with pytest.raises(IcdError, match=reason):
+        load_layout(path)
+    with pytest.raises(IcdError, match=reason):
+        load_layout(tmp_path)
+
+
+def test_layout_file_that_is_not_there(tmp_path):
+    with pytest.raises(IcdError, match="No such file"):
+        load_layout(tmp_path / "other.toml")
+
+
+def test_object_of_two_kinds():
+    with pytest.raises(ValueError, match="just one of"):
+        layout(object=[{"index": 0x6000, "name": "x", "telemetry": "rates", "domain": "image"}])

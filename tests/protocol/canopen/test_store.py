@@ -1,0 +1,247 @@
+"""Store and restore (1010h, 1011h) and the file that they are kept in."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from unittest.mock import Mock
+
+import pytest
+
+from protocol.canopen import AbortCode, FileStorage, MemoryStorage, SdoAbortError, StorageError
+
+SAVE = b"save"
+LOAD = b"load"
+
+
+@pytest.fixture(params=["memory", "file"])
+def storage(request, tmp_path):
+    return MemoryStorage() if request.param == "memory" else FileStorage(tmp_path / "sub" / "node.json")
+
+
+@pytest.fixture
+def stored(new_bench, storage):
+    return new_bench(storage=storage).power_on()
+
+
+def changed(bench):
+    """Change one communication parameter, and a PDO."""
+    assert bench.write(0x1017, 0, 250, 2) == 0
+    assert bench.write(0x1801, 2, 5, 1) == 0
+
+
+def values(bench):
+    return bench.number(0x1017), bench.number(0x1801, 2)
+
+
+@pytest.mark.parametrize("subindex", [1, 2])
+def test_what_was_saved_survives_the_power_cycle(stored, new_bench, storage, subindex):
+    changed(stored)
+    assert stored.write(0x1010, subindex, SAVE) == 0
+    stored.write(0x1017, 0, 333, 2)
+    assert values(new_bench(storage=storage).power_on()) == (250, 5)
+
+
+@pytest.mark.parametrize("command", [129, 130])
+def test_what_was_saved_is_back_after_a_reset(stored, command):
+    changed(stored)
+    stored.write(0x1010, 1, SAVE)
+    stored.write(0x1017, 0, 333, 2)
+    stored.nmt(command)
+    assert values(stored) == (250, 5)
+
+
+def test_what_was_not_saved_does_not_survive(stored, new_bench, storage):
+    changed(stored)
+    stored.write(0x1010, 3, SAVE)  # the application's only
+    assert values(new_bench(storage=storage).power_on()) == (1000, 254)
+
+
+@pytest.mark.parametrize("subindex", [1, 2])
+def test_restore_counts_from_the_next_reset_on(stored, new_bench, storage, subindex):
+    changed(stored)
+    stored.write(0x1010, 1, SAVE)
+    assert stored.write(0x1011, subindex, LOAD) == 0
+    assert values(stored) == (250, 5)
+    stored.nmt(130)
+    assert values(stored) == (1000, 254)
+    assert values(new_bench(storage=storage).power_on()) == (1000, 254)
+
+
+def test_restore_of_the_application_leaves_communication(stored):
+    changed(stored)
+    stored.write(0x1010, 1, SAVE)
+    stored.write(0x1011, 3, LOAD)
+    stored.nmt(129)
+    assert values(stored) == (250, 5)
+
+
+def test_default_that_follows_the_node_id_goes_on_doing_so(stored, new_bench, storage):
+    stored.write(0x1010, 1, SAVE)
+    other = new_bench(0x30, storage=storage).power_on()
+    assert other.number(0x1014) == 0xB0
+    assert other.number(0x1800, 1) == 0x4000_01B0
+
+
+@pytest.mark.parametrize("index", [0x1010, 0x1011])
+@pytest.mark.parametrize("signature", [b"SAVE", b"LOAD", b"evas", b"daol", b"\0\0\0\0", b"\1\0\0\0"])
+def test_wrong_signature(stored, index, signature):
+    assert stored.write(index, 1, signature) == AbortCode.NOT_STORED
+
+
+def test_signatures_are_not_exchangeable(stored):
+    assert stored.write(0x1010, 1, LOAD) == AbortCode.NOT_STORED
+    assert stored.write(0x1011, 1, SAVE) == AbortCode.NOT_STORED
+
+
+@pytest.mark.parametrize("index", [0x1010, 0x1011])
+def test_what_it_can_do(stored, index):
+    assert [stored.number(index, subindex) for subindex in range(4)] == [3, 1, 1, 1]
+
+
+def test_application_is_asked_for_its_own_parameters(stored):
+    stored.slave.store.on_save = save = Mock()
+    stored.slave.store.on_restore = restore = Mock()
+    stored.write(0x1010, 2, SAVE)
+    stored.write(0x1011, 2, LOAD)
+    assert (save.call_count, restore.call_count) == (0, 0)
+    stored.write(0x1010, 3, SAVE)
+    stored.write(0x1010, 1, SAVE)
+    stored.write(0x1011, 3, LOAD)
+    assert (save.call_count, restore.call_count) == (2, 1)
+    stored.slave.store.on_save = Mock(side_effect=SdoAbortError(AbortCode.DEVICE_STATE))
+    assert stored.write(0x1010, 3, SAVE) == AbortCode.DEVICE_STATE
+
+
+def test_storage_that_fails(new_bench):
+    storage = MemoryStorage()
+    storage.save = Mock(side_effect=StorageError("disk full"))
+    storage.clear = Mock(side_effect=StorageError("disk full"))
+    storage.load = Mock(side_effect=StorageError("damaged"))
+    bench = new_bench(storage=storage).power_on()
+    assert values(bench) == (1000, 254)
+    assert ("storage_error", 0) in bench.events()
+    assert bench.write(0x1010, 1, SAVE) == AbortCode.HARDWARE
+    assert bench.write(0x1011, 1, LOAD) == AbortCode.HARDWARE
+
+
+def test_stored_mapping_that_no_longer_fits_gives_way_to_the_defaults(new_bench):
+    storage = MemoryStorage()
+    storage.save("communication", {"1017:00": b"\x05\x00", "1A00:01": (0x5FFF_0008).to_bytes(4, "little")})
+    bench = new_bench(storage=storage).power_on()
+    assert values(bench) == (1000, 254)
+    assert ("storage_error", 0) in bench.events()
+
+
+@pytest.mark.parametrize("name", ["1017:00", "1000:00", "5FFF:01", "1001:00"])
+def test_stored_values_of_wrong_size_or_unknown_objects_are_left_out(new_bench, name):
+    storage = MemoryStorage()
+    storage.save("communication", {name: b"\x01\x02\x03"})
+    assert values(new_bench(storage=storage).power_on()) == (1000, 254)
+
+
+# The file
+
+
+def test_file_keeps_groups_apart(tmp_path):
+    storage = FileStorage(tmp_path / "node.json")
+    assert storage.load("a") == {}
+    storage.save("a", {"x": b"\x01"})
+    storage.save("b", {"y": b"\x02\x03"})
+    storage.save("a", {"z": b""})
+    again = FileStorage(tmp_path / "node.json")
+    assert (again.load("a"), again.load("b")) == ({"z": b""}, {"y": b"\x02\x03"})
+    again.clear("a")
+    assert (storage.load("a"), storage.load("b")) == ({}, {"y": b"\x02\x03"})
+    assert [path.name for path in tmp_path.iterdir()] == ["node.json"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        "\xff",
+        '{"crc32": 0, "groups": {"a": {"x": "01"}}}',
+        '{"groups": {}}',
+        '{"crc32": 0}',
+    ],
+)
+def test_damaged_file_is_an_error_that_a_save_ends(tmp_path, text):
+    path = tmp_path / "node.json"
+    path.write_text(text, encoding="latin-1")
+    storage = FileStorage(path)
+    with pytest.raises(StorageError, match=r"node\.json"):
+        storage.load("a")
+    storage.save("a", {"x": b"\x01"})
+    assert storage.load("a") == {"x": b"\x01"}
+
+
+def test_damaged_file_ends_with_a_restore_too(tmp_path):
+    path = tmp_path / "node.json"
+    path.write_text("{", encoding="ascii")
+    storage = FileStorage(path)
+    storage.clear("a")
+    assert storage.load("a") == {}
+
+
+def test_one_flipped_bit_is_found(tmp_path):
+    path = tmp_path / "node.json"
+    storage = FileStorage(path)
+    storage.save("a", {"x": b"\x10"})
+    path.write_text(path.read_text(encoding="ascii").replace('"10"', '"11"'), encoding="ascii")
+    with pytest.raises(StorageError, match="checksum"):
+        storage.load("a")
+
+
+def test_folder_that_cannot_be_written(tmp_path):
+    blocker = tmp_path / "file"
+    blocker.write_text("", encoding="ascii")
+    with pytest.raises(StorageError, match="cannot be written"):
+        FileStorage(blocker / "node.json").save("a", {})
+
+
+def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+    storage = FileStorage(tmp_path / "node.json")
+    storage.save("a", {"x": b"\x01"})
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(StorageError, match="No space left"):
+        storage.save("a", {"x": b"\x02"})
+    assert storage.load("a") == {"x": b"\x01"}
+    assert [path.name for path in tmp_path.iterdir()] == ["node.json"]
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from protocol.canopen import FileStorage
+storage = FileStorage(Path(sys.argv[1]))
+number = 0
+while True:
+    storage.save("a", {str(key): bytes([number & 255]) * 64 for key in range(50)})
+    number += 1
+    print(number, flush=True)
+"""
+
+
+@pytest.mark.process
+def test_killed_in_the_midst_of_saving_the_file_is_whole(tmp_path):
+    path = tmp_path / "node.json"
+    for delay in (0.0, 0.003, 0.01, 0.02, 0.05):
+        writer = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE)
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        time.sleep(delay)
+        writer.send_signal(signal.SIGKILL)
+        writer.wait()
+        writer.stdout.close()
+        values = FileStorage(path).load("a")
+        assert len(values) == 50
+        assert len(set(values.values())) == 1
+        json.loads(path.read_text(encoding="ascii"))
