@@ -28,7 +28,7 @@ def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
         nodes = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
         return nodes, np.full(count, 1.0 / count)
     gauss_nodes, gauss_weights = np.polynomial.legendre.leggauss(count)
-    return gauss_nodes.astype(np.float64), 0.5 * gauss_weights.astype(np.float64)
+    return gauss_nodes.astype(np.float64), np.asarray(0.5 * gauss_weights, dtype=np.float64)
 
 
 def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

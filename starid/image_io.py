@@ -1,109 +1,161 @@
-"""Reading and writing images of counts: PNG, TIFF and JPEG, one channel of 8 or 16 bits."""
+"""Image files: PNG, TIFF and JPEG of 8 or 16 bit, read only if grey and whole, written whole."""
 
 from __future__ import annotations
 
-import os
-import tempfile
+import zlib
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import cv2
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
+from starid.cache import write_atomically
 from starid.errors import StaridError
 
-READABLE: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".bmp")
-_WRITABLE_8: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".bmp")
-_WRITABLE_16: Final = (".png", ".tif", ".tiff", ".pgm")
-_MOST_BYTES: Final = 1 << 30
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG: Final = b"\xff\xd8\xff"
+_TIFFS: Final = (b"II*\x00", b"MM\x00*")
+_SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+_CHUNK_FRAME: Final = 12
+_GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
+"""Weights of blue, green and red in the luma of ITU-R BT.601."""
 
 
-def read_image(path: str | Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Read a grey image.
+def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Read a grey PNG, TIFF or JPEG of 8 or 16 bits.
 
     Parameters
     ----------
-    path : str or Path
-        PNG, TIFF, JPEG, PGM or BMP file. Three equal channels are taken for the grey that they are.
+    path : path
+        The file.
+    allow_colour : bool
+        Turn a colour image into grey (luma of BT.601, alpha dropped) instead of refusing it.
 
     Returns
     -------
-    ndarray (h, w), uint8 or uint16
+    ndarray (height, width) of uint8 or uint16
+        Row 0 is the top.
 
     Raises
     ------
     StaridError
-        The file is missing, unreadable, no image, in colour, or of other than 8 or 16 bits.
+        The file is missing, not such an image, truncated, in colour, of another depth, or every pixel has
+        the same value.
     """
     source = Path(path)
     try:
-        size = source.stat().st_size
-        if size > _MOST_BYTES:
-            raise StaridError(f"{source}: {size} bytes is more than an image of counts can have")
-        data = np.fromfile(source, dtype=np.uint8)
+        content = source.read_bytes()
+    except FileNotFoundError:
+        raise StaridError(f"image {source}: no such file; give a PNG, TIFF or JPEG") from None
     except OSError as error:
-        raise StaridError(f"{source}: cannot read the image: {error.strerror or error}") from None
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise StaridError(f"{source}: not an image that can be read; give a PNG, TIFF or JPEG file")
-    if image.ndim == 3:
-        colours = image[:, :, : min(image.shape[2], 3)]
-        if not np.all(colours == colours[:, :, :1]):
-            raise StaridError(f"{source}: image is in colour; convert it to grey (one channel) first")
-        image = np.ascontiguousarray(colours[:, :, 0])
-    if image.dtype == np.uint8:
-        return image.astype(np.uint8, copy=False)
-    if image.dtype != np.uint16:
-        raise StaridError(f"{source}: image has values of type {image.dtype}; 8 or 16 bits unsigned needed")
-    return image.astype(np.uint16, copy=False)
+        raise StaridError(
+            f"image {source}: cannot be read ({error.strerror}); give a readable file"
+        ) from None
+    _check_whole(source, content)
+    pixels = _decode(source, content)
+    if pixels.ndim == 3:
+        if not allow_colour:
+            raise StaridError(
+                f"image {source}: has {pixels.shape[2]} channels; a star sensor's frame is grey, "
+                "convert it or allow colour"
+            )
+        grey = np.rint(pixels[:, :, :3] @ _GREY_WEIGHTS)
+        pixels = grey.astype(pixels.dtype)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise StaridError(f"image {source}: pixels of type {pixels.dtype}; 8 or 16 bit whole numbers needed")
+    low, high = int(pixels.min()), int(pixels.max())
+    if low == high:
+        look = {0: "all black", 256**pixels.dtype.itemsize - 1: "all white"}.get(low, "without any contrast")
+        raise StaridError(f"image {source}: {look}, every pixel is {low}; give a frame that shows stars")
+    return np.ascontiguousarray(pixels)
 
 
-def write_image(path: str | Path, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
-    """Write an image of counts, whole or not at all.
+def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write a grey or colour image, whole or not at all.
 
     Parameters
     ----------
-    path : str or Path
-        The suffix chooses the format; 16 bits need PNG, TIFF or PGM.
-    image : ndarray (h, w) or (h, w, 3), uint8 or uint16
-        Grey, or blue-green-red.
+    path : path
+        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy).
+    image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
+        Colour in the order blue, green, red.
 
     Raises
     ------
     StaridError
-        The suffix is unknown, or the file cannot be written.
+        The suffix is none of these, or the file cannot be written.
     """
+    import cv2
+
     target = Path(path)
-    known = _WRITABLE_8 if image.dtype == np.uint8 else _WRITABLE_16
     suffix = target.suffix.lower()
-    if suffix not in known:
-        bits = 8 * image.dtype.itemsize
+    if suffix not in _SUFFIXES:
+        raise StaridError(f"image {target}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
         raise StaridError(
-            f"{target}: cannot write {bits}-bit images as {suffix or 'a file without suffix'!r}; use .png"
+            f"image {target}: JPEG holds 8 bits a pixel, this frame has 16; write a PNG or TIFF"
         )
-    encoded, data = cv2.imencode(suffix, image)
-    if not encoded:
-        raise StaridError(f"{target}: the image cannot be encoded as {suffix}")
+    done, packed = cv2.imencode(suffix, image)
+    if not done:
+        raise StaridError(
+            f"image {target}: shape {image.shape} of {image.dtype} cannot be written as {suffix}"
+        )
     try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                stream.write(data.tobytes())
-            Path(temporary).chmod(0o666 & ~_umask())
-            Path(temporary).replace(target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        write_atomically(target, lambda part: part.write_bytes(packed.tobytes()))
     except OSError as error:
-        raise StaridError(f"{target}: cannot write the image: {error.strerror or error}") from None
+        raise StaridError(
+            f"image {target}: cannot be written ({error.strerror}); choose another place"
+        ) from None
 
 
-def _umask() -> int:
-    """Return the process's file mode mask."""
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
+def _check_whole(source: Path, content: bytes) -> None:
+    """Refuse what is no PNG, TIFF or JPEG, and PNG or JPEG files that break off."""
+    if content.startswith(_PNG):
+        whole = _png_is_whole(content)
+    elif content.startswith(_JPEG):
+        whole = content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
+    elif content.startswith(_TIFFS):
+        whole = True
+    else:
+        what = "is empty" if not content else "is no PNG, TIFF or JPEG"
+        raise StaridError(f"image {source}: {what}; give a grey image of 8 or 16 bit")
+    if not whole:
+        raise _truncated(source)
+
+
+def _truncated(source: Path) -> StaridError:
+    return StaridError(f"image {source}: truncated or damaged; write or fetch the file again")
+
+
+def _png_is_whole(content: bytes) -> bool:
+    """Walk the chunks: every checksum right, and the end chunk there."""
+    at = len(_PNG)
+    while at + _CHUNK_FRAME <= len(content):
+        size = int.from_bytes(content[at : at + 4], "big")
+        end = at + _CHUNK_FRAME + size
+        if end > len(content):
+            return False
+        body = content[at + 4 : end - 4]
+        if zlib.crc32(body) != int.from_bytes(content[end - 4 : end], "big"):
+            return False
+        if body[:4] == b"IEND":
+            return True
+        at = end
+    return False
+
+
+def _decode(source: Path, content: bytes) -> NDArray[Any]:
+    """Pixels (height, width) or (height, width, channels) as they are stored."""
+    import cv2
+
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise StaridError(f"image {source}: cannot be decoded ({error.err}); convert it to PNG") from None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if pixels is None or pixels.size == 0:
+        raise _truncated(source)
+    return np.asarray(pixels)
