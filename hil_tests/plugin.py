@@ -47,18 +47,20 @@ def starhil_emulator(
     an error.
     """
     from hil_tests.emulator_process import EmulatorProcess, emulator_command
+    from hil_tests.own_hub import OwnBus
 
     folder: Path = tmp_path_factory.mktemp("starhil")
-    command = emulator_command(
-        profile=request.config.getoption("--starhil-profile"),
-        serial="auto",
-        can="auto",
-        seed=request.config.getoption("--starhil-seed"),
-        state_dir=folder / "state",
-        truth_log=folder / "truth.csv",
-    )
-    with EmulatorProcess(command) as emulator:
-        yield emulator
+    with OwnBus() as channel:
+        command = emulator_command(
+            profile=request.config.getoption("--starhil-profile"),
+            serial="auto",
+            can=channel,
+            seed=request.config.getoption("--starhil-seed"),
+            state_dir=folder / "state",
+            truth_log=folder / "truth.csv",
+        )
+        with EmulatorProcess(command) as emulator:
+            yield emulator
 
 
 def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:

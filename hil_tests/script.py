@@ -322,6 +322,7 @@ class _Checker:
             place.number("for_s", minimum=0.0),
             self._file_name(place, "file", f"{row.name}.csv"),
             at_least,
+            place.count("min_samples", 1),
         )
         if place is not reader:
             place.finish()
@@ -411,7 +412,7 @@ ACTIONS: Final[Mapping[str, Callable[[_Checker, TableReader], tuple[Action, str]
 STEP_KEYS: Final = (
     *ACTIONS,
     "name", "with", "with_hex", "refused", "expect", "attitude", "capture", "link", "repeat", "every_s", "within_s",
-    "timeout_s", "retries", "max_latency_s", "count", "for_s", "file", "at_least", "value", "size", "method", "answer",
+    "timeout_s", "retries", "max_latency_s", "count", "for_s", "file", "at_least", "min_samples", "value", "size", "method", "answer",
     "listen_s",
 )  # fmt: skip
 

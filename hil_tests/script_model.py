@@ -57,6 +57,8 @@ class Sample:
     file: str
     at_least: float
     """Part of the samples for which the expectations must hold, 0 to 1."""
+    min_samples: int
+    """Fewest samples that must have come."""
 
 
 @dataclass(frozen=True)

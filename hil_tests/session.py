@@ -334,6 +334,10 @@ class SessionRunner:
         problem = None
         if good < action.at_least:
             problem = f"{len(problems)} of {count} samples not as expected; the last one: {problems[-1]}"
+        elif count < action.min_samples:
+            problem = (
+                f"only {count} samples came in {action.for_s:g} s, expected at least {action.min_samples}"
+            )
         return Outcome(problem, detail, last.values, figures, max(latencies))
 
     def _download(self, action: DownloadImage, client: ObcClient) -> Outcome:

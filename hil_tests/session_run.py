@@ -15,6 +15,7 @@ from rich.text import Text
 from hil_tests.bench import Bench, LinkOptions
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.errors import BenchError, ScriptError, near_matches
+from hil_tests.own_hub import OwnBus
 from hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, junit_cases, write_junit
 from hil_tests.script import load_script
 from hil_tests.script_model import Script
@@ -85,6 +86,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     with ExitStack() as stack:
         emulator = None
         if request.start:
+            if options.can == "auto":
+                options = replace(options, can=stack.enter_context(OwnBus()))
             state = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-session-")))
             emulator = _emulator(request, script, options, folder, state)
         bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))

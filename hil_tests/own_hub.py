@@ -1,0 +1,76 @@
+"""A CAN bus of the bench's own: vcan0 where the kernel has it, else a TCP hub at a free port for as long as it lives."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from types import TracebackType
+from typing import Self
+
+from protocol.hub import DEFAULT_BUS, CanHub
+from protocol.transports.can import kernel_can_is_up
+
+
+class OwnHub:
+    """A TCP hub at a free port in a thread; a context manager. `channel` is what clients open."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="can-hub", daemon=True)
+        self._hub: CanHub | None = None
+        self.channel = ""
+
+    def start(self, port: int = 0) -> Self:
+        """Start listening; port 0 takes a free one."""
+        if not self._thread.is_alive():
+            self._thread.start()
+        hub = CanHub(port=port)
+        asyncio.run_coroutine_threadsafe(hub.start(), self._loop).result()
+        self._hub = hub
+        self.channel = f"socketcand:127.0.0.1:{hub.port}/{DEFAULT_BUS}"
+        return self
+
+    @property
+    def port(self) -> int:
+        """The port that the hub listens at, 0 while it does not."""
+        return 0 if self._hub is None else self._hub.port
+
+    def stop(self) -> None:
+        """End the hub; `start` may follow."""
+        if self._hub is not None:
+            asyncio.run_coroutine_threadsafe(self._hub.close(), self._loop).result()
+            self._hub = None
+
+    def close(self) -> None:
+        """End the hub and its thread."""
+        self.stop()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class OwnBus:
+    """A bus that nobody else is on, as far as the machine allows: vcan0, or a hub of its own; a context manager."""
+
+    def __init__(self) -> None:
+        self._hub: OwnHub | None = None
+
+    def __enter__(self) -> str:
+        if kernel_can_is_up(DEFAULT_BUS):
+            return DEFAULT_BUS
+        self._hub = OwnHub().start()
+        return self._hub.channel
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._hub is not None:
+            self._hub.close()
