@@ -17,7 +17,7 @@ from typing import Final, TextIO, cast
 from protocol.can_framing import CanFrame
 from protocol.candump import format_candump
 from protocol.errors import ProtocolError
-from protocol.socketcand import CommandError, CommandSplitter, format_identifier, parse_send
+from protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 29536
@@ -81,7 +81,7 @@ class _Client(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         if self._held is not None:
             self._release()
-        frames: list[tuple[CanFrame, bytes]] = []
+        frames: list[CanFrame] = []
         for command in self._splitter.feed(data):
             if command is not None and command.startswith(b"send "):
                 try:
@@ -129,7 +129,7 @@ class _Client(asyncio.Protocol):
 
     def _need_bus(self) -> None:
         if self.bus is None:
-            raise CommandError("no bus is open; send < open NAME > first")
+            raise CommandError("no bus is open; send open NAME first")
 
     def _command(self, command: bytes | None) -> None:
         match command.split() if command is not None else []:
@@ -149,7 +149,7 @@ class _Client(asyncio.Protocol):
             case [b"open", _]:
                 self._refuse("a bus is open already")
             case [b"rawmode"] | [b"remote"]:
-                self._refuse("no bus is open; send < open NAME > first")
+                self._refuse("no bus is open; send open NAME first")
             case []:
                 self._refuse("malformed command")
             case _:
@@ -243,14 +243,11 @@ class CanHub:
         self._clients.remove(client)
         self.statistics.clients -= 1
 
-    def distribute(self, sender: _Client, frames: list[tuple[CanFrame, bytes]]) -> None:
+    def distribute(self, sender: _Client, frames: list[CanFrame]) -> None:
         """Hand frames to every other client of the sender's bus."""
         seconds = self._now()
         stamp = f"{seconds:.6f}".encode()
-        lines = [
-            (b"< frame %b %b %b >" % (format_identifier(frame), stamp, digits), frame.remote)
-            for frame, digits in frames
-        ]
+        lines = [(format_frame(frame, stamp), frame.remote) for frame in frames]
         self.statistics.frames += len(lines)
         plain = [line for line, remote in lines if not remote]
         for client in self._clients:
@@ -262,7 +259,7 @@ class CanHub:
             self.statistics.dropped += dropped
         if self._log is not None:
             bus = sender.bus or DEFAULT_BUS
-            for frame, _ in frames:
+            for frame in frames:
                 self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
 
     def _flush_log(self) -> None:

@@ -48,11 +48,8 @@ class CommandSplitter:
         return commands
 
 
-def parse_send(command: bytes) -> tuple[CanFrame, bytes]:
-    """Read `send ID LEN B B …`; return the frame and the form in which other clients get it, without the time.
-
-    Raises CommandError naming what is wrong.
-    """
+def parse_send(command: bytes) -> CanFrame:
+    """Read `send ID LEN B B …`. Raises CommandError naming what is wrong."""
     words = command.split()
     if len(words) < 3 or command[5:].translate(None, _NOT_HEX):
         raise CommandError("malformed send: must be send ID LENGTH BYTES in hexadecimal")
@@ -65,7 +62,7 @@ def parse_send(command: bytes) -> tuple[CanFrame, bytes]:
         if len(data) != 2 * length:
             raise CommandError("send with a byte of more than two digits")
     extended, remote, number = parse_identifier(identifier)
-    return CanFrame(number, bytes.fromhex(data.decode()), extended, remote), data
+    return CanFrame(number, bytes.fromhex(data.decode()), extended, remote)
 
 
 def parse_identifier(digits: bytes) -> tuple[bool, bool, int]:
@@ -91,6 +88,11 @@ def format_send(frame: CanFrame) -> bytes:
     """Write the command that sends a frame."""
     data = frame.data
     return b"< send %b %d %b >" % (format_identifier(frame), len(data), data.hex(" ").encode())
+
+
+def format_frame(frame: CanFrame, stamp: bytes) -> bytes:
+    """Write a frame as a server tells it to clients; `stamp` is the time, as `seconds.microseconds`."""
+    return b"< frame %b %b %b >" % (format_identifier(frame), stamp, frame.data.hex().upper().encode())
 
 
 def parse_frame(command: bytes) -> CanFrame:
