@@ -59,7 +59,7 @@ class Measurement:
     capture_s, detect_s, identify_s
         Modelled times of the steps.
     late
-        The machine took longer than the model, or a frame was left out before it.
+        The machine took longer than the model, or had no time for the frame at all.
     """
 
     counter: int
@@ -135,8 +135,10 @@ class _Frame:
     tracking: bool
     result: FrameResult | None = None
     failure: str = ""
-    waiting: bool = False
-    """Its time of publication has passed without a result."""
+    waiting_since_ns: int | None = None
+    """When a result without stars would have been known, if none had come by then."""
+    late: bool = False
+    """The machine took longer than the model."""
     finished_ns: int | None = None
     """When its result became known."""
 
@@ -172,7 +174,6 @@ class FrameCycle:
         self._next: Event | None = None
         self._generation = 0
         self._in_flight: deque[_Frame] = deque()
-        self._late = False
         self._grid_ns = 0
         self.truth: TruthSource = FixedTruth(Attitude.identity())
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
@@ -202,7 +203,6 @@ class FrameCycle:
             self._next = None
         self._generation += 1
         self._in_flight.clear()
-        self._late = False
 
     def reset(self) -> None:
         """Stop and forget all attitudes, as a restart of the device does."""
@@ -260,7 +260,7 @@ class FrameCycle:
         request = self.request(truth, exposure_s, predicted)
         self._in_flight.append(frame)
         if self._imager.pending >= MAX_PENDING:
-            self._late = True
+            frame.late = True
             self.left_out += 1
             frame.result = FrameResult(request.index, reason="processing_error")
             self._finish(frame, end_ns)
@@ -322,26 +322,29 @@ class FrameCycle:
         else:
             frame.failure = answer.text if isinstance(answer, Failure) else "unexpected answer"
             frame.result = FrameResult(frame.index, reason="processing_error")
-        if frame.waiting:
-            self._late = True
-            self._ready(frame, self._now_ns())
+        if frame.waiting_since_ns is not None:
+            self._ready(frame, frame.waiting_since_ns)
 
     def _ready(self, frame: _Frame, due_ns: int) -> None:
-        """Publish when the modelled detection of all stars is done, or wait for the result."""
+        """Publish when the modelled detection of all stars is done, or as soon as the result comes after that."""
         if frame.result is None:
-            frame.waiting = True
+            frame.waiting_since_ns = due_ns
             return
-        extra_ns = round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
-        if extra_ns > 0 and not frame.waiting:
+        known_ns = due_ns + round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
+        now_ns = self._now_ns()
+        if known_ns > now_ns:
             generation = self._generation
 
             def finish(finish_ns: int) -> None:
                 if generation == self._generation:
                     self._finish(frame, finish_ns)
 
-            self._scheduler.at(due_ns + extra_ns, finish)
-        else:
-            self._finish(frame, due_ns)
+            self._scheduler.at(known_ns, finish)
+            return
+        if frame.waiting_since_ns is not None:
+            frame.late = True
+            known_ns = now_ns
+        self._finish(frame, known_ns)
 
     def _finish(self, frame: _Frame, known_ns: int) -> None:
         """Publish a frame, after those that were exposed before it."""
@@ -357,7 +360,6 @@ class FrameCycle:
         identify_s = timing.identify_tracking_s if frame.tracking else timing.identify_lost_s
         valid, reason, rate = self._judge(frame, result, detect_s + identify_s)
         self.published += 1
-        late, self._late = self._late, False
         self._publish(
             Measurement(
                 counter=self.published,
@@ -375,7 +377,7 @@ class FrameCycle:
                 detect_s=detect_s,
                 identify_s=identify_s,
                 period_s=frame.period_s,
-                late=late,
+                late=frame.late,
             )
         )
 

@@ -43,8 +43,8 @@ REASONS: Final[dict[Reason, str]] = {
     Reason.NO_MATCH: "no_match",
     Reason.AMBIGUOUS: "ambiguous",
     Reason.RESIDUAL: "residual",
-    Reason.PREDICTION_LOST: "tracking_lost",
-    Reason.BAD_INPUT: "processing_error",
+    Reason.PREDICTION_LOST: "prediction_lost",
+    Reason.BAD_INPUT: "bad_input",
 }
 """Reason of the identification → its name in telemetry."""
 

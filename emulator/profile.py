@@ -85,10 +85,10 @@ class TimingConfig(Strict):
     """How long the unit takes for a frame; reported in telemetry and kept before a result is published."""
 
     readout_s: NotNegative = 0.020
-    detect_s: NotNegative = 0.010
-    detect_per_star_s: NotNegative = 0.0001
+    detect_s: NotNegative = 0.040
+    detect_per_star_s: NotNegative = 0.00005
     identify_lost_s: NotNegative = 0.020
-    identify_tracking_s: NotNegative = 0.005
+    identify_tracking_s: NotNegative = 0.010
 
 
 class SerialConfig(Strict):

@@ -223,7 +223,7 @@ def precise_attitude(device: Device) -> Values:
 def device_status(device: Device) -> Values:
     """161: state of the device."""
     last = device.fresh
-    values: Values = {
+    return {
         "mode": device.modes.mode.value,
         "error": device.modes.error or "none",
         "reset_cause": device.reset_cause,
@@ -237,10 +237,8 @@ def device_status(device: Device) -> Values:
         "frames_captured": device.cycle.published,
         "frames_valid": device.frames_valid,
         "mode_changes": device.mode_changes,
+        "store_fault": device.store.corrupt,
     }
-    if "store_fault" in device.icd.telemetry["device_status"].named_fields:
-        values["store_fault"] = device.store.corrupt
-    return values
 
 
 def parameter(device: Device) -> Values:

@@ -15,7 +15,7 @@ from starid.attitude import Attitude
 
 COLUMNS: Final = (
     "frame", "time_of_exposure_s", "run_time_s", "mode", "valid", "reason",
-    "truth_qx", "truth_qy", "truth_qz", "truth_qw", "truth_wx_deg_s", "truth_wy_deg_s", "truth_wz_deg_s", "truth_status",
+    "true_qx", "true_qy", "true_qz", "true_qw", "true_wx_deg_s", "true_wy_deg_s", "true_wz_deg_s", "truth_status",
     "measured_qx", "measured_qy", "measured_qz", "measured_qw", "measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s",
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
@@ -47,9 +47,9 @@ def compare(measurement: Measurement) -> dict[str, Any]:
         "identify_ms": result.identify_s * 1e3,
         "late": measurement.late,
     }
-    row |= zip(("truth_qx", "truth_qy", "truth_qz", "truth_qw"), as_quaternion(truth.attitude), strict=True)
+    row |= zip(("true_qx", "true_qy", "true_qz", "true_qw"), as_quaternion(truth.attitude), strict=True)
     true_rate = np.degrees(truth.rate_rad_s).tolist()
-    row |= zip(("truth_wx_deg_s", "truth_wy_deg_s", "truth_wz_deg_s"), true_rate, strict=True)
+    row |= zip(("true_wx_deg_s", "true_wy_deg_s", "true_wz_deg_s"), true_rate, strict=True)
     if measurement.rate_valid:
         rate = np.degrees(measurement.rate_rad_s).tolist()
         row |= zip(("measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s"), rate, strict=True)
@@ -104,6 +104,6 @@ def _cell(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float):
-        exact = name.startswith(("truth_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
+        exact = name.startswith(("true_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
         return repr(value) if exact else f"{value:.6g}"
     return str(value)
