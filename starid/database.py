@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, Self
 
 import numpy as np
@@ -170,7 +171,7 @@ class FeatureDatabase:
         )
         return np.asarray((vector - self.minimum) * self.scale, dtype=np.float64)
 
-    @property
+    @cached_property
     def scale(self) -> NDArray[np.float64]:
         """Normalised units per unit of each feature, (5,); 0 for a feature that is the same everywhere."""
         return normalising_scale(self.minimum, self.maximum)
