@@ -31,6 +31,8 @@ FRAME_ATTEMPTS: Final = 3
 POLL_S: Final = 0.04
 """Time between two looks at a state, as public flight software polls."""
 
+BMP_HEADER_SIZE: Final = 54
+"""Bytes of a BMP file's two headers."""
 BURST_ROUNDS: Final = 20
 """How often the missing packets of a block are asked for."""
 BURST_SILENCE_S: Final = 0.5
@@ -139,52 +141,60 @@ async def _when_not_busy(
 
 
 async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
-    """Save an image and download its file by bursts: blocks of up to 1024 numbered packets, holes asked for again."""
+    """Save an image and download its file by bursts: blocks of up to 1024 numbered packets, holes asked for again.
+
+    The file's own header, loaded first, tells how long it is.
+    """
     await save_image(client, size, within_s=within_s)
     begin = time.monotonic()
+    header, repeats = await _download_block(client, 0, BMP_HEADER_SIZE, within_s)
+    length = bmp_file_size(header)
     data = bytearray()
-    repeats = 0
-    while True:
-        block, rounds = await _download_block(client, len(data), within_s)
+    while len(data) < length:
+        block, rounds = await _download_block(client, len(data), min(MAX_BLOCK, length - len(data)), within_s)
         data += block
-        repeats += rounds - 1
-        if len(block) < MAX_BLOCK:
-            break
+        repeats += rounds
     pixels, width, height = decode_bmp(bytes(data))
     return Image(pixels, width, height, len(data), repeats, time.monotonic() - begin)
 
 
-async def _download_block(client: AsyncObcClient, offset: int, within_s: float) -> tuple[bytes, int]:
-    """Load one block of the file and gather its packets; return it and the number of bursts."""
+async def _download_block(
+    client: AsyncObcClient, offset: int, length: int, within_s: float
+) -> tuple[bytes, int]:
+    """Load one block of the file and gather its packets; return it and how often packets were asked for again."""
     await _when_not_busy(
         client,
         "load_file_block",
         within_s,
-        {"file_type": "bmp", "file_counter": 0, "offset": offset, "length": MAX_BLOCK},
+        {"file_type": "bmp", "file_counter": 0, "offset": offset, "length": length},
     )
     deadline = time.monotonic() + within_s
     state = await client.telemetry("file_block")
     while not state["ready"]:
         if state["parameter_error"]:
-            return b"", 1
+            raise BadReplyError(f"load_file_block: the device has no {length} bytes at {offset} of the file")
         if time.monotonic() > deadline:
             raise BenchError(f"load_file_block: offset {offset} not ready within {within_s:g} s")
         await asyncio.sleep(POLL_S)
         state = await client.telemetry("file_block")
-    length, checksum = int(state["length"]), int(state["checksum"])
+    if state["length"] != length:
+        raise BadReplyError(f"file block at {offset}: {state['length']!r} bytes loaded, {length} asked for")
     count = packet_count(length)
     packets: dict[int, bytes] = {}
-    for round_number in range(1, BURST_ROUNDS + 1):
-        await client.command("start_burst", ignore_hole_map=round_number == 1)
+    for repeats in range(BURST_ROUNDS):
+        while not client.bursts.empty():
+            client.bursts.get_nowait()
+        await client.command("start_burst", ignore_hole_map=repeats == 0)
         await _gather(client, packets, count)
         if len(packets) == count:
             block = b"".join(packets[number] for number in range(count))[:length]
-            if block_checksum(block) == checksum:
-                return block, round_number
+            if block_checksum(block) == state["checksum"]:
+                return block, repeats
             packets.clear()
         await _send_hole_map(client, packets)
     raise BadReplyError(
-        f"file block at {offset}: {count - len(packets)} of {count} packets missing or wrong after {BURST_ROUNDS} bursts"
+        f"file block at {offset}: {count - len(packets)} of {count} packets missing or wrong "
+        f"after {BURST_ROUNDS} bursts"
     )
 
 
@@ -208,6 +218,19 @@ async def _send_hole_map(client: AsyncObcClient, packets: dict[int, bytes]) -> N
         await client.command(f"set_hole_map_{part}", map=holes.part(part))
 
 
+def bmp_file_size(header: bytes) -> int:
+    """Return the length of a BMP file from its header.
+
+    Raises
+    ------
+    BadReplyError
+        Not the header of a BMP file.
+    """
+    if len(header) < BMP_HEADER_SIZE or header[:2] != b"BM":
+        raise BadReplyError(f"the downloaded file is no BMP picture: it begins with {header[:8].hex(' ')}")
+    return int(struct.unpack_from("<I", header, 2)[0])
+
+
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     """Return pixels (row by row from the top), width and height of an uncompressed grey BMP file of 8 bits a pixel.
 
@@ -216,7 +239,7 @@ def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     BadReplyError
         Not such a file, or cut short.
     """
-    if len(data) < 54 or data[:2] != b"BM":
+    if len(data) < BMP_HEADER_SIZE or data[:2] != b"BM":
         raise BadReplyError(f"the downloaded file of {len(data)} bytes is no BMP picture")
     (start,) = struct.unpack_from("<I", data, 10)
     width, signed_height, _planes, depth, compression = struct.unpack_from("<iiHHI", data, 18)

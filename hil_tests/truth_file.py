@@ -11,7 +11,7 @@ from hil_tests.attitude import Quaternion, interpolate, unit
 from hil_tests.errors import BenchError
 
 TIME_COLUMN: Final = "time_of_exposure_s"
-QUATERNION_COLUMNS: Final = ("truth_qx", "truth_qy", "truth_qz", "truth_qw")
+QUATERNION_COLUMNS: Final = ("true_qx", "true_qy", "true_qz", "true_qw")
 SLACK_S: Final = 0.0005
 """A time that lies this little outside the file still counts: telemetry rounds."""
 

@@ -98,7 +98,7 @@ def test_the_junit_file_counts_and_carries_what_went_wrong(tmp_path):
 
 def test_the_truth_lies_between_the_rows_of_the_file_while_it_grows(tmp_path):
     path = tmp_path / "truth.csv"
-    head = "frame,time_of_exposure_s,truth_qx,truth_qy,truth_qz,truth_qw\n"
+    head = "frame,time_of_exposure_s,true_qx,true_qy,true_qz,true_qw\n"
     rows = [
         f"{n},{100 + n}," + ",".join(repr(v) for v in from_radec_roll(10.0 + n, 0.0, 0.0)) + "\n"
         for n in range(3)

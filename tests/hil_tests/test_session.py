@@ -146,7 +146,7 @@ def test_the_attitude_is_compared_with_the_truth(play, device):
 
 def test_the_attitude_is_compared_with_the_truth_of_its_time_in_a_file(play, device, tmp_path):
     rows = [(100.0, from_radec_roll(83.8, -1.3, 30.0)), (101.0, from_radec_roll(83.8, -1.1, 30.0))]
-    lines = ["time_of_exposure_s,truth_qx,truth_qy,truth_qz,truth_qw"]
+    lines = ["time_of_exposure_s,true_qx,true_qy,true_qz,true_qw"]
     lines += [",".join([str(t), *map(repr, q)]) for t, q in rows]
     (tmp_path / "truth.csv").write_text("\n".join(lines))
     device.telemetry["precise_attitude"] = attitude_values()
