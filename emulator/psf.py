@@ -25,10 +25,10 @@ _SQRT_HALF: Final = math.sqrt(0.5)
 def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Nodes on (−1, 1) and weights that sum to 1: Gauss–Legendre, or midpoints where there are very many."""
     if count > MOST_GAUSS_NODES:
-        nodes = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
-        return nodes, np.full(count, 1.0 / count)
-    gauss_nodes, gauss_weights = np.polynomial.legendre.leggauss(count)
-    return gauss_nodes.astype(np.float64), np.asarray(0.5 * gauss_weights, dtype=np.float64)
+        nodes = np.linspace(-1.0, 1.0, count, endpoint=False, dtype=np.float64) + 1.0 / count
+        return nodes, np.full(count, 1.0 / count, dtype=np.float64)
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return nodes, np.asarray(0.5 * weights, dtype=np.float64)
 
 
 def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

@@ -113,6 +113,11 @@ class Detections:
     trail_px: float
     reason: str
 
+    @property
+    def sigma_px(self) -> npt.NDArray[np.float64]:
+        """Errors (n,) of the position, root mean square of both axes."""
+        return np.asarray(np.sqrt(np.mean(self.xy_sigma_px**2, axis=1)), dtype=np.float64)
+
     def __len__(self) -> int:
         """Return the number of stars."""
         return len(self.flux)

@@ -18,7 +18,10 @@ EXIT_BAD_INPUT: Final = 2
 
 COMMANDS: Final[dict[str, str]] = {
     "run": "run",
+    "render": "render",
+    "campaign": "campaign",
     "catalog": "catalog",
+    "calibrate": "calibrate",
     "session": "session",
     "hub": "hub",
     "features": "features",

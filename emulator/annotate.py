@@ -1,0 +1,209 @@
+"""Frames for people: stretched, in colour, with circles and names at stars."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+MARK_BGR: Final = (80, 220, 120)
+MISS_BGR: Final = (70, 90, 240)
+_TEXT_BGR: Final = (235, 215, 160)
+_SHADOW_BGR: Final = (20, 16, 12)
+_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
+_SUB_PIXEL_BITS: Final = 4
+
+STAR_NAMES: Final[dict[int, str]] = {
+    677: "Alpheratz",
+    746: "Caph",
+    1067: "Algenib",
+    2081: "Ankaa",
+    3179: "Schedar",
+    3419: "Diphda",
+    5447: "Mirach",
+    6686: "Ruchbah",
+    7588: "Achernar",
+    9640: "Almach",
+    9884: "Hamal",
+    10826: "Mira",
+    11767: "Polaris",
+    13847: "Acamar",
+    14135: "Menkar",
+    14576: "Algol",
+    15863: "Mirfak",
+    17702: "Alcyone",
+    21421: "Aldebaran",
+    24436: "Rigel",
+    24608: "Capella",
+    25336: "Bellatrix",
+    25428: "Elnath",
+    25930: "Mintaka",
+    25985: "Arneb",
+    26311: "Alnilam",
+    26727: "Alnitak",
+    27366: "Saiph",
+    27989: "Betelgeuse",
+    28360: "Menkalinan",
+    30324: "Mirzam",
+    30438: "Canopus",
+    31681: "Alhena",
+    32349: "Sirius",
+    33579: "Adhara",
+    34444: "Wezen",
+    35904: "Aludra",
+    36850: "Castor",
+    37279: "Procyon",
+    37826: "Pollux",
+    39429: "Naos",
+    41037: "Avior",
+    44816: "Suhail",
+    45238: "Miaplacidus",
+    46390: "Alphard",
+    49669: "Regulus",
+    50583: "Algieba",
+    53910: "Merak",
+    54061: "Dubhe",
+    54872: "Zosma",
+    57632: "Denebola",
+    58001: "Phecda",
+    59774: "Megrez",
+    59803: "Gienah",
+    60718: "Acrux",
+    61084: "Gacrux",
+    62434: "Mimosa",
+    62956: "Alioth",
+    63608: "Vindemiatrix",
+    65378: "Mizar",
+    65474: "Spica",
+    67301: "Alkaid",
+    68702: "Hadar",
+    68756: "Thuban",
+    68933: "Menkent",
+    69673: "Arcturus",
+    71683: "Rigil Kentaurus",
+    72105: "Izar",
+    72607: "Kochab",
+    72622: "Zubenelgenubi",
+    74785: "Zubeneschamali",
+    76267: "Alphecca",
+    77070: "Unukalhai",
+    78401: "Dschubba",
+    80763: "Antares",
+    82273: "Atria",
+    84012: "Sabik",
+    84345: "Rasalgethi",
+    85927: "Shaula",
+    86032: "Rasalhague",
+    86228: "Sargas",
+    87833: "Eltanin",
+    90185: "Kaus Australis",
+    91262: "Vega",
+    92855: "Nunki",
+    95947: "Albireo",
+    97649: "Altair",
+    100453: "Sadr",
+    100751: "Peacock",
+    102098: "Deneb",
+    102488: "Aljanah",
+    105199: "Alderamin",
+    107315: "Enif",
+    109268: "Alnair",
+    113368: "Fomalhaut",
+    113881: "Scheat",
+    113963: "Markab",
+}
+"""Proper names of bright stars by Hipparcos number (IAU Catalog of Star Names)."""
+
+
+def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
+    """Bring an image (h, w) to 8 bits so that faint stars are seen: black a little below the sky, gamma 2.5."""
+    sky, high = np.percentile(image, (50.0, 99.98))
+    low = sky - 0.1 * max(high - sky, 1.0)
+    scaled = np.clip((image.astype(np.float32) - low) / max(high - low, 1.0), 0.0, 1.0)
+    return np.asarray(255.0 * scaled**0.4 + 0.5, dtype=np.uint8)
+
+
+def star_label(hip: int, magnitude: float, numbers_to: float) -> str:
+    """Label of a star: its name, else its Hipparcos number down to a magnitude, else nothing."""
+    if hip in STAR_NAMES:
+        return STAR_NAMES[hip]
+    return f"HIP {hip}" if magnitude <= numbers_to else ""
+
+
+def annotate(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    xy_px: npt.NDArray[np.float64],
+    labels: Sequence[str],
+    *,
+    radius_px: float = 8.0,
+    missed_xy_px: npt.NDArray[np.float64] | None = None,
+) -> npt.NDArray[np.uint8]:
+    """Draw circles and names on a frame.
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts; stretched for display.
+    xy_px : ndarray (n, 2)
+        Where the circles go, pixels.
+    labels : sequence of n str
+        What is written beside them; empty for nothing.
+    radius_px : float
+        Radius of the circles.
+    missed_xy_px : ndarray (m, 2), optional
+        Places to mark in another colour, such as detections without an identity.
+
+    Returns
+    -------
+    ndarray (h, w, 3), uint8
+        Blue-green-red.
+    """
+    canvas: npt.NDArray[np.uint8] = np.repeat(stretch(image)[:, :, None], 3, axis=2)
+    height, width = image.shape
+    size = max(0.32, min(width, height) / 2600.0)
+    taken: list[tuple[int, int, int, int]] = []
+    for (x, y), label in zip(xy_px, labels, strict=True):
+        _circle(canvas, x, y, radius_px, MARK_BGR)
+        if not label:
+            continue
+        (text_width, text_height), _ = cv2.getTextSize(label, _FONT, size, 1)
+        for left, base in _places(x, y, radius_px, text_width, text_height):
+            box = (left, base - text_height, left + text_width, base + 2)
+            inside = box[0] >= 0 and box[1] >= 0 and box[2] < width and box[3] < height
+            if inside and not any(_overlap(box, other) for other in taken):
+                taken.append(box)
+                cv2.putText(canvas, label, (left, base), _FONT, size, _SHADOW_BGR, 3, cv2.LINE_AA)
+                cv2.putText(canvas, label, (left, base), _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
+                break
+    for x, y in missed_xy_px if missed_xy_px is not None else ():
+        _circle(canvas, x, y, radius_px, MISS_BGR)
+    return canvas
+
+
+def _circle(
+    canvas: npt.NDArray[np.uint8], x: float, y: float, radius: float, colour: tuple[int, int, int]
+) -> None:
+    """Draw a smooth circle at a sub-pixel place."""
+    scale = 1 << _SUB_PIXEL_BITS
+    centre = (round(x * scale), round(y * scale))
+    cv2.circle(canvas, centre, round(radius * scale), colour, 1, cv2.LINE_AA, _SUB_PIXEL_BITS)
+
+
+def _places(x: float, y: float, radius: float, width: int, height: int) -> list[tuple[int, int]]:
+    """Left ends and baselines to try for a label: right, left, below, above."""
+    gap = radius + 3.0
+    middle = round(y + height / 2.0)
+    return [
+        (round(x + gap), middle),
+        (round(x - gap - width), middle),
+        (round(x - width / 2.0), round(y + gap + height)),
+        (round(x - width / 2.0), round(y - gap)),
+    ]
+
+
+def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
+    """Whether two boxes (left, top, right, bottom) share a pixel."""
+    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]

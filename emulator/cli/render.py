@@ -1,0 +1,154 @@
+"""`starhil render`: one frame of the sky as a PNG, with the truth of what is on it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from emulator.errors import EmulatorError
+
+if TYPE_CHECKING:
+    from emulator.sensor import Frame, SensorModel
+    from starid.camera import Camera
+
+_NUMBERED_TO_MAGNITUDE = 3.6
+
+
+def command(
+    ra: Annotated[float, typer.Option(help="Right ascension of the boresight, degrees.")],
+    dec: Annotated[float, typer.Option(help="Declination of the boresight, degrees.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Image to write: .png, or .tiff.")],
+    roll: Annotated[
+        float, typer.Option(help="Celestial north counter-clockwise from image up, degrees.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    rate: Annotated[
+        tuple[float, float, float],
+        typer.Option(metavar="X Y Z", help="Body rate during the exposure, sensor frame, degrees/s."),
+    ] = (0.0, 0.0, 0.0),
+    exposure: Annotated[float | None, typer.Option(help="Exposure, seconds.")] = None,
+    limit: Annotated[float | None, typer.Option(help="Faintest stars that are drawn, V.")] = None,
+    bits: Annotated[int | None, typer.Option(help="8, 12 or 16.")] = None,
+    gain: Annotated[float | None, typer.Option(help="Analog gain, times.")] = None,
+    fov: Annotated[float | None, typer.Option(help="Full width of the field, degrees.")] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WIDTH[xHEIGHT]", help="Pixels, such as 1024x768.")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="Projection: pinhole or equidistant.")] = None,
+    profile: Annotated[str | None, typer.Option(help="Take camera and sensor from this profile.")] = None,
+    as_annotated: Annotated[
+        bool, typer.Option("--annotate", help="Stretch the image and mark the stars on it.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the truth of the frame as one JSON object.")
+    ] = False,
+) -> None:
+    """Render one frame of the sky; the same options give the same bytes."""
+    from emulator.sensor import Renderer
+    from starid.attitude import Attitude
+    from starid.catalog import load_catalog
+    from starid.image_io import write_image
+
+    for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
+        if not math.isfinite(value):
+            raise EmulatorError(f"--{name} {value}: a finite number of degrees is needed")
+    if not -90.0 <= dec <= 90.0:
+        raise EmulatorError(f"--dec {dec}: degrees from -90 to 90 are needed")
+    camera, sensor = _equipment(profile, fov, size, model)
+    changes = {
+        "exposure_s": exposure,
+        "limiting_magnitude": limit,
+        "bits": bits,
+        "gain": gain,
+    }
+    sensor = sensor.with_(**{name: value for name, value in changes.items() if value is not None})
+    renderer = Renderer(camera, load_catalog(), sensor, seed)
+    frame = renderer.render(Attitude.from_radec_roll(ra, dec, roll), [math.radians(value) for value in rate])
+    write_image(output, _marked(frame) if as_annotated else frame.image)
+    if as_json:
+        typer.echo(json.dumps(_truth(frame, camera, sensor, output)))
+    else:
+        typer.echo(
+            f"{output}: {camera.width}×{camera.height} of {sensor.bits} bits, {len(frame.stars.hip)} stars "
+            f"to V {sensor.limiting_magnitude:g}, {frame.exposure_s:g} s"
+        )
+
+
+def _equipment(
+    profile: str | None, fov: float | None, size: str | None, model: str | None
+) -> tuple[Camera, SensorModel]:
+    """Camera and sensor from a profile or the defaults, with the options put over them."""
+    from emulator.sensor_model import SensorModel
+    from starid.camera import Camera
+
+    values: dict[str, Any] = {}
+    sensor = SensorModel()
+    if profile is not None:
+        from emulator.profile import load_profile
+
+        loaded, _ = load_profile(profile)
+        values = loaded.camera.values()
+        sensor = sensor.with_(**loaded.sensor)
+    if fov is not None or size is not None or model is not None:
+        old = Camera.from_dict(values) if values else Camera.from_fov()
+        width, height = (old.width, old.height) if size is None else _size(size)
+        values = {
+            "fov_deg": old.fov_deg if fov is None else fov,
+            "width": width,
+            "height": height,
+            "model": old.model if model is None else model,
+            "distortion": old.distortion,
+        }
+    return (Camera.from_dict(values) if values else Camera.from_fov()), sensor
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Read `1024` or `1024x768`."""
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) not in (1, 2) or not all(part.isdecimal() for part in parts):
+        raise EmulatorError(f"--size {text}: WIDTH or WIDTHxHEIGHT in pixels is needed, such as 1024x768")
+    width, height = int(parts[0]), int(parts[-1])
+    if not (16 <= width <= 8192 and 16 <= height <= 8192):
+        raise EmulatorError(f"--size {text}: 16 to 8192 pixels a side are needed")
+    return width, height
+
+
+def _marked(frame: Frame) -> Any:
+    """Mark the stars of a frame: names and Hipparcos numbers for the bright ones."""
+    from emulator.annotate import annotate, star_label
+
+    stars = frame.stars
+    labels = [
+        star_label(int(hip), float(magnitude), _NUMBERED_TO_MAGNITUDE)
+        for hip, magnitude in zip(stars.hip, stars.magnitude, strict=True)
+    ]
+    return annotate(frame.image, stars.xy_px, labels)
+
+
+def _truth(frame: Frame, camera: Camera, sensor: SensorModel, output: Path) -> dict[str, Any]:
+    """What is on a frame, as plain values."""
+    stars = frame.stars
+    return {
+        "image": str(output),
+        "width": camera.width,
+        "height": camera.height,
+        "bits": sensor.bits,
+        "fov_deg": camera.fov_deg,
+        "ra_deg": frame.attitude.ra_deg,
+        "dec_deg": frame.attitude.dec_deg,
+        "roll_deg": frame.attitude.roll_deg,
+        "quaternion_xyzw": frame.attitude.quaternion_xyzw.tolist(),
+        "rate_deg_s": [math.degrees(value) for value in frame.rate_rad_s],
+        "exposure_s": frame.exposure_s,
+        "seed": frame.seed,
+        "stars": [
+            {"hip": int(hip), "x_px": float(x), "y_px": float(y), "v": float(v), "electrons": float(e)}
+            for hip, (x, y), v, e in zip(
+                stars.hip, stars.xy_px, stars.magnitude, stars.electrons, strict=True
+            )
+        ],
+    }
