@@ -1,0 +1,301 @@
+"""Accuracy campaigns: from photons to attitude at random attitudes, in seeded, resumable, parallel chunks.
+
+Every frame of a campaign depends on the plan and its own number only, so a chunk gives the same frames whichever
+process works on it, and a campaign that was interrupted continues where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from emulator.errors import EmulatorError
+from starid.attitude import Attitude, random_attitude
+
+if TYPE_CHECKING:
+    from emulator.sensor import Renderer
+    from starid.interface import StarIdentifier
+    from starid.solution import Solution
+
+WRONG_DEG: Final = 0.1
+"""A valid answer is wrong when boresight or roll is further than this from the truth, in degrees."""
+
+RECORD: Final = np.dtype(
+    [
+        ("frame", np.int64),
+        ("dec_deg", np.float64),
+        ("ra_deg", np.float64),
+        ("roll_deg", np.float64),
+        ("valid", np.bool_),
+        ("reason", "U24"),
+        ("cross_arcsec", np.float64),
+        ("roll_arcsec", np.float64),
+        ("normalised_squared_error", np.float64),
+        ("detected", np.int32),
+        ("matched", np.int32),
+        ("render_ms", np.float64),
+        ("detect_ms", np.float64),
+        ("identify_ms", np.float64),
+    ]
+)
+"""One row a frame; errors are NaN where the answer is invalid."""
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignPlan:
+    """What a campaign does; two campaigns with equal plans give equal answers.
+
+    Parameters
+    ----------
+    frames : number of frames.
+    seed : the seed of the attitudes and of the sensor's noise.
+    fov_deg : full width of the field of view in degrees.
+    rate_deg_s : body rate during the exposure, degrees per second about a random axis of each frame.
+    blocked : share of the image (0 … 0.9) hidden by a dark body at a random side of each frame.
+    algorithm : the identifier, as in a device profile.
+    chunk : frames a chunk, the unit of work and of resumption.
+    """
+
+    frames: int
+    seed: int
+    fov_deg: float = 42.0
+    rate_deg_s: float = 0.0
+    blocked: float = 0.0
+    algorithm: str = "geometric"
+    chunk: int = 50
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise EmulatorError(f"campaign: frames is {self.frames}: give at least 1")
+        if not 0 <= self.blocked <= 0.9:
+            raise EmulatorError(f"campaign: blocked is {self.blocked}: give a share from 0 to 0.9")
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks, the last of which may be shorter."""
+        return -(-self.frames // self.chunk)
+
+
+class CampaignStore:
+    """The folder of a campaign: its plan and one file a finished chunk; a file is complete or absent."""
+
+    def __init__(self, folder: Path, plan: CampaignPlan) -> None:
+        self.folder = folder
+        plan_file = folder / "plan.json"
+        text = json.dumps(asdict(plan), indent=1, sort_keys=True)
+        if plan_file.exists():
+            if plan_file.read_text() != text:
+                raise EmulatorError(
+                    f"campaign: {plan_file} holds another plan: give another folder, or the same options"
+                )
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            plan_file.write_text(text)
+
+    def _file(self, chunk: int) -> Path:
+        return self.folder / f"chunk-{chunk:06d}.npy"
+
+    def load(self, chunk: int) -> npt.NDArray[np.void] | None:
+        """Rows of a finished chunk (RECORD), or None if it is still to do."""
+        file = self._file(chunk)
+        if not file.exists():
+            return None
+        try:
+            rows = np.load(file)
+        except (OSError, ValueError) as error:
+            raise EmulatorError(
+                f"campaign: {file} cannot be read ({error}): remove it to have it made again"
+            ) from error
+        if rows.dtype != RECORD:
+            raise EmulatorError(f"campaign: {file} was made by another version: give another folder")
+        return np.asarray(rows)
+
+    def save(self, chunk: int, rows: npt.NDArray[np.void]) -> None:
+        """Write a finished chunk under a temporary name and move it into place."""
+        part = self._file(chunk).with_suffix(".part")
+        with part.open("wb") as stream:
+            np.save(stream, rows)
+        part.replace(self._file(chunk))
+
+
+class FrameMaker:
+    """What one process needs to make and solve the frames of a plan; made once a process."""
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        from emulator.sensor import Renderer, SensorModel
+        from starid.camera import Camera
+        from starid.catalog import load_catalog
+        from starid.interface import make_identifier
+
+        self.plan = plan
+        sensor = SensorModel()
+        self.camera = Camera.from_fov(plan.fov_deg)
+        self.renderer: Renderer = Renderer(self.camera, load_catalog(), sensor, seed=plan.seed)
+        self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera)
+        self.settings = sensor.detection_settings()
+
+    def solve(self, frame: int) -> tuple[Any, ...]:
+        """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
+        from starid.detection import detect
+
+        rng = np.random.default_rng((self.plan.seed, frame))
+        truth = random_attitude(rng)
+        axis = rng.normal(size=3)
+        rate = np.deg2rad(self.plan.rate_deg_s) * axis / np.linalg.norm(axis)
+        start = time.perf_counter()
+        picture = self.renderer.render(truth, rate, frame)
+        image = block_side(picture.image, self.plan.blocked, rng)
+        rendered = time.perf_counter()
+        found = detect(image, self.settings)
+        detected = time.perf_counter()
+        answer = self.identifier.identify(
+            found.xy_px, found.flux, np.sqrt((found.xy_sigma_px**2).mean(axis=1))
+        )
+        identified = time.perf_counter()
+        cross, roll, squared = error_of(answer, truth)
+        return (
+            frame,
+            truth.dec_deg,
+            truth.ra_deg,
+            truth.roll_deg,
+            answer.valid,
+            str(answer.reason),
+            cross,
+            roll,
+            squared,
+            len(found.flux),
+            len(answer.detection_index),
+            1e3 * (rendered - start),
+            1e3 * (detected - rendered),
+            1e3 * (identified - detected),
+        )
+
+
+def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:
+    """Error of an answer: boresight and roll in arcseconds, and the squared error over its covariance, divided by 3.
+
+    All three are NaN for an invalid answer. The last has mean 1 when the covariance is honest.
+    """
+    if not answer.valid:
+        return float("nan"), float("nan"), float("nan")
+    error = answer.attitude.error_to(truth)
+    vector = error.rotation_vector_rad
+    squared = float(vector @ np.linalg.solve(answer.covariance, vector)) / 3
+    return error.cross_boresight_arcsec, error.roll_arcsec, squared
+
+
+def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) -> npt.NDArray[Any]:
+    """Blacken the share of the image that lies beyond a straight edge of random direction (a dark body's limb)."""
+    if share == 0:
+        return image
+    height, width = image.shape
+    angle = rng.uniform(0, 2 * np.pi)
+    rows, columns = np.indices(image.shape)
+    depth = (columns - (width - 1) / 2) * np.cos(angle) + (rows - (height - 1) / 2) * np.sin(angle)
+    blocked = image.copy()
+    blocked[depth > np.quantile(depth, 1 - share)] = 0
+    return blocked
+
+
+@lru_cache(maxsize=1)
+def _maker(plan: CampaignPlan) -> FrameMaker:
+    import cv2
+
+    cv2.setNumThreads(1)
+    return FrameMaker(plan)
+
+
+def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
+    """Make and solve all frames of a chunk: rows of RECORD."""
+    maker = _maker(plan)
+    numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, plan.frames))
+    return np.array([maker.solve(number) for number in numbers], RECORD)
+
+
+def _run_numbered(plan: CampaignPlan, chunk: int) -> tuple[int, npt.NDArray[np.void]]:
+    return chunk, run_chunk(plan, chunk)
+
+
+def run_campaign(
+    plan: CampaignPlan, *, folder: Path | None = None, jobs: int = 1
+) -> Iterator[npt.NDArray[np.void]]:
+    """Run a campaign and yield the rows of each chunk as it ends; finished chunks in `folder` are not made again.
+
+    Parameters
+    ----------
+    plan : what to do.
+    folder : where finished chunks are kept, or None to keep nothing.
+    jobs : processes; a joblib backend chosen by the caller (a Dask cluster, say) is respected.
+
+    Raises
+    ------
+    EmulatorError : `folder` holds another campaign or a file that cannot be read.
+    """
+    from joblib import Parallel, delayed
+
+    store = None if folder is None else CampaignStore(folder, plan)
+    todo = []
+    for chunk in range(plan.chunks):
+        rows = None if store is None else store.load(chunk)
+        if rows is None:
+            todo.append(chunk)
+        else:
+            yield rows
+    work = (delayed(_run_numbered)(plan, chunk) for chunk in todo)
+    for chunk, rows in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
+        if store is not None:
+            store.save(chunk, rows)
+        yield rows
+
+
+def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
+    """Figures of a campaign from its rows (RECORD): counts, errors in arcseconds, times in milliseconds.
+
+    `wrong` counts valid answers with boresight or roll more than 0.1° from the truth; `pole_frames` and
+    `ra_wrap_frames` count the frames with a celestial pole, or the hour circle RA 0°, inside the field.
+    """
+    valid = rows[rows["valid"]]
+    limit = 3600 * WRONG_DEG
+    wrong = valid[(valid["cross_arcsec"] > limit) | (valid["roll_arcsec"] > limit)]
+    half = fov_deg / 2
+    away = np.abs((rows["ra_deg"] + 180) % 360 - 180) * np.cos(np.deg2rad(rows["dec_deg"]))
+    total = rows["render_ms"] + rows["detect_ms"] + rows["identify_ms"]
+
+    def of_valid(name: str, percent: float) -> float | None:
+        return float(np.percentile(valid[name], percent)) if len(valid) else None
+
+    def median(values: npt.NDArray[np.float64]) -> float:
+        return float(np.median(values))
+
+    return {
+        "frames": len(rows),
+        "valid": len(valid),
+        "valid_pct": 100 * len(valid) / len(rows),
+        "wrong": len(wrong),
+        "wrong_frames": [int(frame) for frame in np.sort(wrong["frame"])],
+        "invalid_reasons": dict(Counter(str(reason) for reason in rows["reason"][~rows["valid"]])),
+        "pole_frames": int(np.sum(np.abs(rows["dec_deg"]) > 90 - half)),
+        "ra_wrap_frames": int(np.sum(away < half)),
+        "median_arcsec": of_valid("cross_arcsec", 50),
+        "p99_arcsec": of_valid("cross_arcsec", 99),
+        "max_arcsec": of_valid("cross_arcsec", 100),
+        "roll_median_arcsec": of_valid("roll_arcsec", 50),
+        "roll_p99_arcsec": of_valid("roll_arcsec", 99),
+        "normalised_squared_error": float(np.mean(valid["normalised_squared_error"])) if len(valid) else None,
+        "stars_median": median(rows["detected"]),
+        "matched_median": of_valid("matched", 50),
+        "median_ms_render": median(rows["render_ms"]),
+        "median_ms_detect": median(rows["detect_ms"]),
+        "median_ms_identify": median(rows["identify_ms"]),
+        "p99_ms_identify": float(np.percentile(rows["identify_ms"], 99)),
+        "median_ms_frame": median(total),
+    }

@@ -1,0 +1,100 @@
+"""`starhil campaign`: how accurate and how fast, over many seeded frames."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+group = typer.Typer(help="Accuracy over many seeded frames of random attitude.", no_args_is_help=True)
+
+
+@group.callback()
+def _campaigns() -> None:
+    """Accuracy over many seeded frames of random attitude."""
+
+
+@group.command("lost-in-space")
+def lost_in_space(
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
+    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0,
+    rate: Annotated[
+        float, typer.Option(min=0, help="Body rate during the exposure, deg/s, about a random axis.")
+    ] = 0.0,
+    blocked: Annotated[float, typer.Option(help="Share of the field hidden by a dark body, 0 to 0.9.")] = 0.0,
+    algorithm: Annotated[str, typer.Option(help="Identifier: geometric, lsi or rsi.")] = "geometric",
+    require_valid: Annotated[
+        float, typer.Option(help="Exit 1 when fewer per cent of the frames are valid.")
+    ] = 99.5,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    dask: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, or `local` for one of our own.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Folder that keeps finished chunks; a second run goes on there."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Render, detect and identify full images at uniformly random attitude and roll.
+
+    A frame is wrong when its answer is valid and more than 0.1° off. Exit status 1 when any is wrong, or too few are valid.
+    """
+    import numpy as np
+
+    from emulator.campaign import CampaignPlan, run_campaign, summarise
+
+    plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm)
+    with _backend(dask):
+        chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
+    rows = np.concatenate(chunks)
+    figures: dict[str, Any] = {"seed": seed, **summarise(rows, fov)}
+    if as_json:
+        print(json.dumps(figures))
+    else:
+        _print_table(figures)
+    if figures["wrong"] or figures["valid_pct"] < require_valid:
+        raise typer.Exit(1)
+
+
+def _backend(dask: str | None) -> Any:
+    """The joblib backend that `--dask` asks for; without it the caller's processes."""
+    if dask is None:
+        return nullcontext()
+    from emulator.errors import EmulatorError
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise EmulatorError(
+            "campaign: --dask needs the `cluster` extra: pip install 'starhil[cluster]'"
+        ) from error
+    from joblib import parallel_config
+
+    try:
+        client = Client() if dask == "local" else Client(dask, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise EmulatorError(f"campaign: no Dask scheduler at {dask!r}: {error}") from error
+    return parallel_config(backend="dask", client=client)
+
+
+def _with_progress(chunks: Any, total: int) -> Any:
+    """Show a progress bar on stderr while the chunks come in."""
+    from rich.console import Console
+    from rich.progress import track
+
+    return track(chunks, "campaign", total=total, console=Console(stderr=True))
+
+
+def _print_table(figures: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("figure", "value", title="lost in space, full images")
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    Console().print(table)
