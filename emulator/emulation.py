@@ -7,7 +7,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from emulator.clock import Clock, SteppedClock, make_clock
@@ -26,6 +26,7 @@ from emulator.truth import TruthSource
 from emulator.truth_config import LiveConfig, TruthConfig
 from emulator.truth_live import LiveFeed, LiveTruth
 from emulator.truth_log import TruthLog
+from emulator.worker_process import WorkerProcess
 from protocol.icd import InterfaceDefinition, load_icd
 from protocol.values import Value
 
@@ -41,15 +42,12 @@ class RunOptions:
 
     Attributes
     ----------
-    folder
-        Folder from which the profile's relative paths count.
     truth_log
         CSV file of truth and measurement a frame.
     control
         `off`, `auto` (a free port on loopback) or HOST:PORT.
     """
 
-    folder: Path = field(default_factory=Path)
     truth_log: Path | None = None
     control: str = "off"
 
@@ -65,15 +63,21 @@ class Emulation:
         What the run has beside.
     icd
         Interface definition; by default the product's own.
+    worker
+        A picture worker that was started before; by default one is started here.
     """
 
     def __init__(
-        self, profile: Profile, options: RunOptions | None = None, icd: InterfaceDefinition | None = None
+        self,
+        profile: Profile,
+        options: RunOptions | None = None,
+        icd: InterfaceDefinition | None = None,
+        worker: WorkerProcess | None = None,
     ) -> None:
         self.profile = profile
         self.options = options or RunOptions()
         self.clock: Clock = make_clock(profile.run.clock)
-        self.imager: ProcessImager | ThreadImager = self._make_imager()
+        self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._icd = icd
         self._device: Device | None = None
         self.serial: SerialLink | None = None
@@ -102,9 +106,13 @@ class Emulation:
             raise EmulatorError("emulation: not started")
         return self._device
 
-    def _make_imager(self) -> ProcessImager | ThreadImager:
-        setup = pipeline_setup(self.profile, self.options.folder)
-        return ProcessImager(setup) if self.profile.run.worker == "process" else ThreadImager(setup)
+    def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
+        setup = pipeline_setup(self.profile)
+        if self.profile.run.worker == "process":
+            return ProcessImager(setup, worker or WorkerProcess())
+        if worker is not None:
+            worker.end()
+        return ThreadImager(setup)
 
     async def start(self) -> None:
         """Bring up truth, device and links, in this order; the pipeline warms behind.
@@ -138,7 +146,7 @@ class Emulation:
     def _open_store(self) -> StateStore:
         store: StateStore
         if self.profile.run.state_dir:
-            store = FileStore(self.options.folder / Path(self.profile.run.state_dir).expanduser())
+            store = FileStore(self.profile.folder / Path(self.profile.run.state_dir).expanduser())
         else:
             store = MemoryStore()
         self._closers.append(store.close)
@@ -168,7 +176,7 @@ class Emulation:
         EmulatorError
             A file is bad or a port is busy; the source before it stays.
         """
-        truth = config.build(self.clock.now_ns() / 1e9, self.options.folder)
+        truth = config.build(self.clock.now_ns() / 1e9, self.profile.folder)
         feed: LiveFeed | None = None
         if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
@@ -204,7 +212,9 @@ class Emulation:
         log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
         self.imager.on_failure = self._pipeline_failed
         device = self.device
-        device.on_mode.append(lambda transition: self._awake.set() if transition.before is Mode.BOOT else None)
+        device.on_mode.append(
+            lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
+        )
         device.pipeline_ready(camera_constants(self.warm))
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
@@ -255,14 +265,14 @@ class Emulation:
         self._closers.clear()
 
 
-def pipeline_setup(profile: Profile, folder: Path) -> PipelineSetup:
+def pipeline_setup(profile: Profile) -> PipelineSetup:
     """What the pipeline of a profile is made of."""
     path = profile.catalog.path
     return PipelineSetup(
         camera=profile.camera.values(),
         sensor=dict(profile.sensor),
         identifier=dict(profile.identifier),
-        catalog_path=str(folder / Path(path).expanduser()) if path else "",
+        catalog_path=str(profile.folder / Path(path).expanduser()) if path else "",
         epoch=profile.catalog.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,

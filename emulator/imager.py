@@ -9,13 +9,10 @@ from __future__ import annotations
 import asyncio
 import pickle
 import queue
-import socket
-import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from emulator.errors import EmulatorError
 from emulator.frames import (
@@ -28,32 +25,36 @@ from emulator.frames import (
     PipelineSetup,
     Warm,
 )
+from emulator.worker_process import EXIT_GRACE_S, WorkerProcess
 
 Asked: TypeAlias = FrameRequest | ImageRequest
 Answer: TypeAlias = FrameResult | ImageResult | Failure
 Done: TypeAlias = Callable[[Answer], None]
 
-EXIT_GRACE_S: Final = 2.0
-
 
 class Imager(Protocol):
     """What the device asks frames of."""
 
-    pending: int
-    """Requests that are not answered yet."""
+    @property
+    def pending(self) -> int:
+        """Requests that are not answered yet."""
+        ...
 
     def submit(self, request: Asked, done: Done) -> None:
         """Ask for something; `done` is called once, in the event loop, in the order of the requests."""
+        ...
 
     async def settle(self) -> None:
         """Wait until nothing is pending."""
+        ...
 
 
 class DirectImager:
     """Does each request where it is asked for: for tests, and for runs without an event loop."""
 
+    pending = 0
+
     def __init__(self, handle: Callable[[Asked], Answer]) -> None:
-        self.pending = 0
         self._handle = handle
 
     def submit(self, request: Asked, done: Done) -> None:
@@ -107,14 +108,10 @@ class ProcessImager(_Queue):
     The emulator's process needs no numerics then, and its answers on the bus do not wait for the interpreter's lock.
     """
 
-    def __init__(self, setup: PipelineSetup) -> None:
+    def __init__(self, setup: PipelineSetup, worker: WorkerProcess) -> None:
         super().__init__()
         self._setup = setup
-        ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "emulator.worker", str(theirs.fileno())]
-        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)  # noqa: S603
-        theirs.close()
-        self._socket = ours
+        self._worker = worker
         self._warm: asyncio.Future[Warm] = asyncio.get_running_loop().create_future()
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
@@ -123,7 +120,7 @@ class ProcessImager(_Queue):
     @property
     def pid(self) -> int:
         """Process identifier of the worker."""
-        return self._process.pid
+        return self._worker.process.pid
 
     async def start(self) -> Warm:
         """Wait until the pipeline is ready.
@@ -133,14 +130,14 @@ class ProcessImager(_Queue):
         EmulatorError
             It cannot be: the worker's own one-line reason.
         """
-        reader, self._writer = await asyncio.open_connection(sock=self._socket)
+        reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
         self._write(self._setup)
         self._task = asyncio.create_task(self._read(reader))
         return await self._warm
 
     def submit(self, request: Asked, done: Done) -> None:
         """Send a request to the worker."""
-        if self._process.poll() is not None or self._writer is None:
+        if not self._worker.running or self._writer is None:
             done(Failure("picture worker: not running", fatal=True))
             return
         self._enqueue(done)
@@ -178,16 +175,9 @@ class ProcessImager(_Queue):
         self._closing = True
         if self._writer is not None:
             self._writer.close()
-        else:
-            self._socket.close()
         if self._task is not None:
             self._task.cancel()
-        loop = asyncio.get_running_loop()
-        try:
-            await asyncio.wait_for(loop.run_in_executor(None, self._process.wait), EXIT_GRACE_S)
-        except TimeoutError:
-            self._process.kill()
-            await loop.run_in_executor(None, self._process.wait)
+        await asyncio.get_running_loop().run_in_executor(None, self._worker.end)
         if self._warm.done() and not self._warm.cancelled():
             self._warm.exception()  # so that a failure already told is not told again at exit
 

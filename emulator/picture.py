@@ -77,12 +77,15 @@ class Picture:
     def warm_up(self) -> None:
         """Make and solve one frame of the default settings, lost in space and tracking, so that no kernel is cold."""
         camera = self.camera
-        constants = dict(zip(("k1", "k2", "p1", "p2"), camera.distortion, strict=False))
+        k1, k2, p1, p2, _ = camera.distortion
         settings = SolverSettings(
             focal_length=math.sqrt(camera.focal_px[0] * camera.focal_px[1]),
             centroid_x=camera.centre_px[0],
             centroid_y=camera.centre_px[1],
-            **constants,
+            k1=k1,
+            k2=k2,
+            p1=p1,
+            p2=p2,
         )
         here = (0.0, 0.0, 0.0, 1.0)
         for predicted in (None, here):

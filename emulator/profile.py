@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 
 from emulator.errors import EmulatorError
 from emulator.truth_config import FixedConfig, Strict, TruthConfig
@@ -148,6 +148,13 @@ class Profile(Strict):
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Parameters of the device by the names of the interface definition: its defaults in this profile."""
 
+    _folder: Path = PrivateAttr(default_factory=Path)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the profile's file, from which its relative paths count."""
+        return self._folder
+
 
 LINK_PARAMETERS: Final[dict[str, str]] = {
     "serial_dialect": "links.serial.dialect",
@@ -189,15 +196,8 @@ def find_profile(name_or_path: str, beside: Path | None = None) -> Path:
     return path
 
 
-def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> tuple[Profile, Path]:
+def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
     """Read a profile with all that it extends, and set `section.key=value` overrides over it.
-
-    Returns
-    -------
-    profile
-        Validated.
-    folder
-        Folder of the file, from which its relative paths count.
 
     Raises
     ------
@@ -215,7 +215,8 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
             raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
-    return profile, path.parent
+    profile._folder = path.parent  # noqa: SLF001 (not a key of the file)
+    return profile
 
 
 def _read(path: Path, depth: int) -> dict[str, Any]:

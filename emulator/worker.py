@@ -15,11 +15,11 @@ def main() -> None:
     """Take the setup, then requests, until the emulator closes the socket."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     link = socket.socket(fileno=int(sys.argv[1]))
+    from emulator.picture import make_picture  # while the emulator itself still starts
+
     setup = _receive(link)
     if setup is None:
         return
-    from emulator.picture import make_picture
-
     made = make_picture(setup)
     if isinstance(made, Failure):
         _send(link, made)

@@ -9,7 +9,9 @@ import typer
 
 
 def command(
-    profile: Annotated[str, typer.Argument(help="Name of a profile, or path of a profile file.")] = "cubestar",
+    profile: Annotated[
+        str, typer.Argument(help="Name of a profile, or path of a profile file.")
+    ] = "cubestar",
     serial: Annotated[
         str | None, typer.Option(help="auto (a pty), a device, listen://HOST:PORT, or off.")
     ] = None,
@@ -35,8 +37,14 @@ def command(
 
     One line on stdout, `ready serial=… can=… seed=…`, tells that it takes commands and where.
     """
+    from emulator.worker_process import WorkerProcess
+
+    worker = WorkerProcess()  # first of all: it imports and warms up while this process does the rest
+
+    import asyncio
     import logging
 
+    from emulator.emulation import Emulation, RunOptions
     from emulator.errors import EmulatorError
     from emulator.profile import load_profile
 
@@ -55,11 +63,7 @@ def command(
     overrides += [f"{key}={_quoted(value)}" for key, value in given.items() if value is not None]
     if seed is not None:
         overrides.append(f"run.seed={seed}")
-    loaded, folder = load_profile(profile, overrides)
-
-    import asyncio
-
-    from emulator.emulation import Emulation, RunOptions
+    loaded = load_profile(profile, overrides)
 
     async def run() -> None:
         import signal
@@ -68,7 +72,7 @@ def command(
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, ended.set)
-        emulation = Emulation(loaded, RunOptions(folder, truth_log, control))
+        emulation = Emulation(loaded, RunOptions(truth_log, control), worker=worker)
         try:
             await emulation.start()
             line = asyncio.create_task(emulation.ready())

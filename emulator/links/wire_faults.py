@@ -102,7 +102,10 @@ class WireFaults(Generic[Item]):
             self._after(settings.delay_s + number * settings.gap_s, part)
 
     def _after(self, seconds: float, item: Item) -> None:
-        if seconds > 0.0:
-            self._call_later(seconds, lambda: self._send(item) and None)
-        else:
+        def send() -> None:
             self._send(item)
+
+        if seconds > 0.0:
+            self._call_later(seconds, send)
+        else:
+            send()
