@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import signal
 import socket
 import sys
-from typing import Any
+from typing import Any, Final
 
 from emulator.frames import LENGTH, Failure
+
+NICE: Final = 5
+"""How much the worker stands back where processors are short: the links of the emulator come first."""
 
 
 def main() -> None:
     """Take the setup, then requests, until the emulator closes the socket."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends this process by closing the socket
+    os.nice(NICE)
     link = socket.socket(fileno=int(sys.argv[1]))
     from emulator.picture import make_picture  # while the emulator itself still starts
 

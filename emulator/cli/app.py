@@ -17,7 +17,9 @@ EXIT_BAD_INPUT: Final = 2
 """Exit status for input that is refused; 1 says that all worked and that the result is not good."""
 
 COMMANDS: Final[dict[str, str]] = {
+    "icd": "icd",
     "run": "run",
+    "bench": "bench",
     "render": "render",
     "campaign": "campaign",
     "catalog": "catalog",
