@@ -1,0 +1,421 @@
+"""Self-calibration: focal length, centre and distortion from stars matched over several frames.
+
+All frames are adjusted together (a bundle): one camera, one attitude a frame. The residual of a star is its
+measured position minus the projection of its catalogue direction, over its standard deviation. Levenberg–
+Marquardt steps solve for the camera by the Schur complement of the attitudes' 3 × 3 blocks; Huber weights and
+a final rejection keep false matches out. Weak priors at the start values hold what the frames cannot tell
+(in a narrow field, where a shift of the centre looks like a rotation) instead of letting it run away.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.errors import StaridError
+from starid.projection import CX, CY, FX, FY, K1, K2, K3, LIMIT2, P1, P2, jacobian_kernel, project_kernel
+from starid.wahba import solve_wahba
+
+Array = NDArray[np.float64]
+
+NAMES: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""Camera parameters in the order of `Calibration.covariance`."""
+
+GROUPS: Final = {
+    "focal": ("fx", "fy"),
+    "aspect": ("fx", "fy"),
+    "centre": ("cx", "cy"),
+    **{name: (name,) for name in NAMES[4:]},
+}
+"""What can be estimated: "focal" keeps the ratio of fx and fy, "aspect" frees it."""
+
+DEFAULT_ESTIMATE: Final = ("focal", "centre", "k1", "k2", "p1", "p2")
+
+_SLOTS: Final = (FX, FY, CX, CY, K1, K2, P1, P2, K3)
+_PRIOR_FOCAL: Final = 0.2
+_PRIOR_CENTRE: Final = 0.1
+_PRIOR_DISTORTION: Final = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02, "k3": 0.5}
+_HUBER: Final = 2.0
+_REJECT: Final = 5.0
+_RAYLEIGH_MEDIAN: Final = 1.17741
+_SMALLEST_SCALE: Final = 1e-9
+_MAX_STEPS: Final = 60
+_MAX_DAMPING: Final = 1e12
+_CONVERGED: Final = 1e-10
+_ROUNDS: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFrame:
+    """Matched stars of one frame.
+
+    Attributes
+    ----------
+    xy_px : ndarray (n, 2)
+        Measured positions, pixels.
+    reference : ndarray (n, 3)
+        Catalogue directions of the same stars, unit vectors, ICRS.
+    sigma_px : ndarray (n,), optional
+        Standard deviation of each position on each axis; without it all are equal and the noise is
+        estimated from the residuals.
+    attitude : Attitude, optional
+        Start value; without it Wahba's problem is solved with the start camera.
+    """
+
+    xy_px: Array
+    reference: Array
+    sigma_px: Array | None = None
+    attitude: Attitude | None = None
+
+    def __post_init__(self) -> None:
+        for name, columns in (("xy_px", 2), ("reference", 3)):
+            table = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if table.ndim != 2 or table.shape[1] != columns or not np.isfinite(table).all():
+                raise StaridError(f"calibration: {name} must be a finite array (n, {columns})")
+            object.__setattr__(self, name, table)
+        n = len(self.xy_px)
+        if len(self.reference) != n:
+            raise StaridError(f"calibration: {n} positions and {len(self.reference)} directions in one frame")
+        if n < 2:
+            raise StaridError(f"calibration: a frame with {n} matched stars; at least 2 needed")
+        if self.sigma_px is not None:
+            sigma = np.asarray(self.sigma_px, dtype=np.float64)
+            if sigma.shape != (n,) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+                raise StaridError(f"calibration: {n} positive finite standard deviations needed in a frame")
+            object.__setattr__(self, "sigma_px", sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Outcome of a calibration.
+
+    Attributes
+    ----------
+    camera : Camera
+        The estimated camera.
+    attitudes : tuple of Attitude
+        One a frame.
+    estimated : tuple of str
+        What was free (keys of `GROUPS`).
+    covariance : ndarray (9, 9)
+        Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; zero rows for what was held. Scaled by the
+        residuals where no standard deviations were given, or where they were too small.
+    rms_px : float
+        Root mean square distance of the used stars from their projection, pixels.
+    sigma_px : float
+        Noise of a position on one axis, pixels, from the residuals and the degrees of freedom (of a star
+        with mean weight, where stars have standard deviations of their own).
+    used : tuple of ndarray (n,) of bool
+        Stars of each frame that took part to the end.
+    residual_px : tuple of ndarray (n, 2)
+        Measured minus projected position of every star, pixels.
+    """
+
+    camera: Camera
+    attitudes: tuple[Attitude, ...]
+    estimated: tuple[str, ...]
+    covariance: Array
+    rms_px: float
+    sigma_px: float
+    used: tuple[NDArray[np.bool_], ...] = field(repr=False)
+    residual_px: tuple[Array, ...] = field(repr=False)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation of each camera parameter by name; 0 for what was held."""
+        return dict(zip(NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def star_count(self) -> int:
+        """Number of matched stars used, over all frames."""
+        return int(sum(used.sum() for used in self.used))
+
+
+def calibrate(
+    frames: Sequence[CalibrationFrame], camera: Camera, estimate: Sequence[str] = DEFAULT_ESTIMATE
+) -> Calibration:
+    """Estimate a camera and the attitude of each frame from matched stars.
+
+    Parameters
+    ----------
+    frames : sequence of CalibrationFrame
+        The more, and the better spread over the image, the better.
+    camera : Camera
+        Start value; parameters that are not estimated keep its values.
+    estimate : sequence of str
+        Keys of `GROUPS`.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    StaridError
+        Unknown parameter, too few stars for what is asked, matches that do not fit the start camera, or a
+        result that folds the image.
+    """
+    check_estimate(estimate)
+    if not frames:
+        raise StaridError("calibration: no frames given; at least one with matched stars needed")
+    bundle = _Bundle(frames, camera, estimate)
+    stars = sum(len(frame.xy_px) for frame in frames)
+    if 2 * stars <= bundle.freedom.shape[1] + 3 * len(frames):
+        raise StaridError(
+            f"calibration: {stars} matched stars in {len(frames)} frames do not determine "
+            f"{', '.join(estimate)}; give more frames or estimate less"
+        )
+    state = bundle.start()
+    for _ in range(_ROUNDS):
+        state = bundle.adjusted(state)
+        before = bundle.used
+        bundle.reject(state)
+        if all(np.array_equal(a, b) for a, b in zip(before, bundle.used, strict=True)):
+            break
+    return bundle.outcome(bundle.adjusted(state), tuple(estimate))
+
+
+def check_estimate(estimate: Sequence[str]) -> None:
+    """Refuse names that are not keys of `GROUPS`, and none at all."""
+    unknown = sorted(set(estimate) - set(GROUPS))
+    if unknown or not estimate:
+        what = f"{unknown[0]!r}" if unknown else "nothing"
+        raise StaridError(f"calibration: estimate {what} asked for, of {', '.join(GROUPS)} needed")
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where the adjustment stands: values of the nine camera parameters, and the attitudes."""
+
+    values: Array
+    attitudes: tuple[Attitude, ...]
+
+
+class _Bundle:
+    """The least-squares problem of all frames."""
+
+    def __init__(self, frames: Sequence[CalibrationFrame], camera: Camera, estimate: Sequence[str]) -> None:
+        self.frames = tuple(frames)
+        self.camera = camera
+        self.sigmas = tuple(np.ones(len(f.xy_px)) if f.sigma_px is None else f.sigma_px for f in frames)
+        self.has_sigmas = all(f.sigma_px is not None for f in frames)
+        self.used: tuple[NDArray[np.bool_], ...] = tuple(
+            np.ones(len(f.xy_px), dtype=np.bool_) for f in frames
+        )
+        self.initial = camera.params[list(_SLOTS)]
+        self.freedom = _freedom(estimate, self.initial)
+        prior = np.array(
+            [
+                *(_PRIOR_FOCAL * self.initial[:2]),
+                *(_PRIOR_CENTRE * camera.width, _PRIOR_CENTRE * camera.height),
+                *(_PRIOR_DISTORTION[name] for name in NAMES[4:]),
+            ]
+        )
+        self.prior = (self.freedom.T * prior**-2.0) @ self.freedom
+
+    def start(self) -> _State:
+        """State of the start values."""
+        attitudes = tuple(
+            solve_wahba(self.camera.back_project(f.xy_px), f.reference) if f.attitude is None else f.attitude
+            for f in self.frames
+        )
+        return _State(self.initial, attitudes)
+
+    def params(self, values: Array) -> Array:
+        """Kernel parameters of camera values, without a limit to the distortion."""
+        params = self.camera.params.copy()
+        params[list(_SLOTS)] = values
+        params[LIMIT2] = math.inf
+        params.flags.writeable = False
+        return params
+
+    def residuals(self, state: _State) -> list[Array]:
+        """Residuals (n, 2) of each frame, pixels."""
+        params = self.params(state.values)
+        return [
+            frame.xy_px - project_kernel(params, attitude.to_sensor(frame.reference))[0]
+            for frame, attitude in zip(self.frames, state.attitudes, strict=True)
+        ]
+
+    def distances(self, residuals: list[Array]) -> list[Array]:
+        """Residuals over standard deviation, lengths (n,)."""
+        return [np.hypot(r[:, 0], r[:, 1]) / s for r, s in zip(residuals, self.sigmas, strict=True)]
+
+    def scale(self, distances: list[Array]) -> float:
+        """Spread of the residuals on one axis, from the median of their lengths, in standard deviations."""
+        kept = np.concatenate([d[u] for d, u in zip(distances, self.used, strict=True)])
+        spread = max(float(np.median(kept)) / _RAYLEIGH_MEDIAN, _SMALLEST_SCALE)
+        return max(spread, 1.0) if self.has_sigmas else spread
+
+    def reject(self, state: _State) -> None:
+        """Keep the stars within five times the spread."""
+        distances = self.distances(self.residuals(state))
+        limit = _REJECT * self.scale(distances)
+        self.used = tuple(d <= limit for d in distances)
+
+    def cost(self, state: _State, scale: float) -> float:
+        """Huber's loss of the stars used, plus the prior."""
+        t = [d[u] / scale for d, u in zip(self.distances(self.residuals(state)), self.used, strict=True)]
+        lengths = np.concatenate(t)
+        huber = np.where(lengths <= _HUBER, 0.5 * lengths**2, _HUBER * (lengths - 0.5 * _HUBER))
+        move = np.linalg.lstsq(self.freedom, state.values - self.initial, rcond=None)[0]
+        total = float(huber.sum() + 0.5 * move @ self.prior @ move)
+        return total if math.isfinite(total) else math.inf
+
+    def adjusted(self, state: _State) -> _State:
+        """State after Levenberg–Marquardt steps until none helps."""
+        damping = 1e-3
+        scale = self.scale(self.distances(self.residuals(state)))
+        cost = self.cost(state, scale)
+        if not math.isfinite(cost):
+            raise StaridError(
+                "calibration: matched stars lie outside what the start camera can see; check them"
+            )
+        for _ in range(_MAX_STEPS):
+            system = _System(self, state, scale)
+            while damping < _MAX_DAMPING:
+                candidate = system.stepped(damping)
+                new_cost = self.cost(candidate, scale)
+                if new_cost < cost:
+                    break
+                damping *= 10.0
+            else:
+                break
+            gain = (cost - new_cost) / max(cost, 1e-300)
+            state, damping = candidate, max(damping * 0.1, 1e-12)
+            if gain < _CONVERGED:
+                break
+            scale = self.scale(self.distances(self.residuals(state)))
+            cost = self.cost(state, scale)
+        return state
+
+    def outcome(self, state: _State, estimated: tuple[str, ...]) -> Calibration:
+        """Package the final state."""
+        residuals = self.residuals(state)
+        distances = [d[u] for d, u in zip(self.distances(residuals), self.used, strict=True)]
+        squares = np.concatenate(distances) ** 2
+        freedom = max(2 * squares.size - self.freedom.shape[1] - 3 * len(self.frames), 1)
+        variance = float(squares.sum()) / freedom
+        system = _System(self, state, 1.0, robust=False)
+        factor = max(variance, 1.0) if self.has_sigmas else variance
+        covariance = self.freedom @ system.camera_covariance(factor) @ self.freedom.T
+        fx, fy, cx, cy, *distortion = state.values.tolist()
+        camera = dataclasses.replace(
+            self.camera,
+            focal_px=(fx, fy),
+            centre_px=(cx, cy),
+            distortion=cast("tuple[float, float, float, float, float]", tuple(distortion)),
+        )
+        lengths = np.concatenate([(r[u] ** 2).sum(axis=1) for r, u in zip(residuals, self.used, strict=True)])
+        weights = np.concatenate([s[u] ** -2.0 for s, u in zip(self.sigmas, self.used, strict=True)])
+        return Calibration(
+            camera=camera,
+            attitudes=state.attitudes,
+            estimated=estimated,
+            covariance=covariance,
+            rms_px=float(np.sqrt(lengths.mean())),
+            sigma_px=float(np.sqrt(variance / weights.mean())),
+            used=self.used,
+            residual_px=tuple(residuals),
+        )
+
+
+class _System:
+    """Normal equations of a bundle at a state, the attitudes' blocks apart."""
+
+    def __init__(self, bundle: _Bundle, state: _State, scale: float, *, robust: bool = True) -> None:
+        self.bundle = bundle
+        self.state = state
+        self.scale2 = scale * scale
+        p = bundle.freedom.shape[1]
+        params = bundle.params(state.values)
+        move = np.linalg.lstsq(bundle.freedom, state.values - bundle.initial, rcond=None)[0]
+        self.cc = self.scale2 * bundle.prior
+        self.gc = -self.scale2 * bundle.prior @ move
+        self.ca, self.aa, self.ga = [], [], []
+        frames = zip(bundle.frames, state.attitudes, bundle.used, bundle.sigmas, strict=True)
+        for frame, attitude, used, sigma in frames:
+            vectors = attitude.to_sensor(frame.reference[used])
+            residual = frame.xy_px[used] - project_kernel(params, vectors)[0]
+            lengths = np.hypot(residual[:, 0], residual[:, 1]) / (sigma[used] * scale)
+            weight = sigma[used] ** -2.0
+            if robust:
+                weight = weight * np.minimum(1.0, _HUBER / np.maximum(lengths, _HUBER))
+            by_camera = _camera_slopes(params, vectors) @ bundle.freedom
+            by_turn = _turn_slopes(params, vectors)
+            weighted = by_turn * weight[:, None, None]
+            self.cc = self.cc + np.einsum("nij,nik->jk", by_camera * weight[:, None, None], by_camera)
+            self.gc = self.gc + np.einsum("nij,n,ni->j", by_camera, weight, residual)
+            self.ca.append(np.einsum("nij,nik->jk", by_camera, weighted).reshape(p, 3))
+            self.aa.append(np.einsum("nij,nik->jk", weighted, by_turn))
+            self.ga.append(np.einsum("nij,ni->j", weighted, residual))
+
+    def stepped(self, damping: float) -> _State:
+        """State after one damped step."""
+        blocks = [np.linalg.inv(a + damping * np.diag(np.diag(a))) for a in self.aa]
+        schur = self.cc + damping * np.diag(np.diag(self.cc))
+        right = self.gc.copy()
+        for ca, block, ga in zip(self.ca, blocks, self.ga, strict=True):
+            schur = schur - ca @ block @ ca.T
+            right = right - ca @ block @ ga
+        step = np.linalg.solve(schur, right)
+        turns = [b @ (ga - ca.T @ step) for ca, b, ga in zip(self.ca, blocks, self.ga, strict=True)]
+        return _State(
+            self.state.values + self.bundle.freedom @ step,
+            tuple(a.rotated(turn) for a, turn in zip(self.state.attitudes, turns, strict=True)),
+        )
+
+    def camera_covariance(self, variance: float) -> Array:
+        """Covariance of the free parameters for a variance factor, the prior counted once."""
+        taken = [ca @ np.linalg.solve(aa, ca.T) for ca, aa in zip(self.ca, self.aa, strict=True)]
+        data = self.cc - self.scale2 * self.bundle.prior - np.sum(taken, axis=0)
+        inverse = np.linalg.inv(data / max(variance, _SMALLEST_SCALE**2) + self.bundle.prior)
+        symmetric: Array = 0.5 * (inverse + inverse.T)
+        return symmetric
+
+
+def _freedom(estimate: Sequence[str], values: Array) -> Array:
+    """Matrix (9, p) from the free parameters to the nine."""
+    columns = []
+    for name in dict.fromkeys(estimate):
+        if name == "focal" and "aspect" not in estimate:
+            columns.append(np.array([1.0, values[1] / values[0], *(0.0,) * 7]))
+        elif name != "focal":
+            columns += [np.eye(9)[NAMES.index(member)] for member in GROUPS[name]]
+    return np.column_stack(columns)
+
+
+def _turn_slopes(params: Array, vectors: Array) -> Array:
+    """Derivative (n, 2, 3) of the positions by a turn of the sensor, pixels per radian: J (v × e)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    slopes: Array = jacobian_kernel(params, np.ascontiguousarray(vectors)) @ cross
+    return slopes
+
+
+def _camera_slopes(params: Array, vectors: Array) -> Array:
+    """Derivative (n, 2, 9) of the positions by the camera parameters `NAMES`."""
+    bare = params.copy()
+    bare[list(_SLOTS)] = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    bare.flags.writeable = False
+    a, b = project_kernel(bare, vectors)[0].T
+    fx, fy, cx, cy = params[[FX, FY, CX, CY]]
+    u, v = project_kernel(params, vectors)[0].T
+    s = a * a + b * b
+    slopes = np.zeros((len(vectors), 2, 9))
+    slopes[:, 0, 0], slopes[:, 1, 1] = (u - cx) / fx, (v - cy) / fy
+    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
+    for column, power in ((4, 1), (5, 2), (8, 3)):
+        slopes[:, 0, column], slopes[:, 1, column] = fx * a * s**power, fy * b * s**power
+    slopes[:, 0, 6], slopes[:, 1, 6] = fx * 2.0 * a * b, fy * (s + 2.0 * b * b)
+    slopes[:, 0, 7], slopes[:, 1, 7] = fx * (s + 2.0 * a * a), fy * 2.0 * a * b
+    return slopes

@@ -1,0 +1,99 @@
+"""Camera profiles: a camera, and how it was calibrated, in a small TOML file.
+
+The table ``[camera]`` holds the keys of `starid.camera.Camera.to_dict` and is all that is read back, so a
+device profile with such a table is a camera profile too. The table ``[calibration]`` tells for people and
+scripts where the numbers come from.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from starid.cache import write_atomically
+from starid.calibration import NAMES, Calibration
+from starid.camera import Camera
+from starid.errors import StaridError
+
+
+def save_camera(path: str | Path, camera: Camera, calibration: Calibration | None = None) -> None:
+    """Write a camera profile, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        File to write; an old one is replaced.
+    camera : Camera
+        What `load_camera` gives back.
+    calibration : Calibration, optional
+        Its figures and covariance are written beside.
+
+    Raises
+    ------
+    StaridError
+        The file cannot be written.
+    """
+    tables: dict[str, Mapping[str, Any]] = {"camera": camera.to_dict()}
+    if calibration is not None:
+        tables["calibration"] = {
+            "frames": len(calibration.attitudes),
+            "stars": calibration.star_count,
+            "rms_px": calibration.rms_px,
+            "sigma_px": calibration.sigma_px,
+            "estimated": list(calibration.estimated),
+            "parameters": list(NAMES),
+            "sigma": [calibration.sigmas[name] for name in NAMES],
+            "covariance": calibration.covariance.tolist(),
+        }
+    lines = []
+    for name, table in tables.items():
+        lines += [f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items()), ""]
+    text = "\n".join(lines)
+    target = Path(path)
+    try:
+        write_atomically(target, lambda part: part.write_text(text, encoding="utf-8"))
+    except OSError as error:
+        raise StaridError(
+            f"camera profile {target}: cannot be written ({error.strerror}); choose another place"
+        ) from None
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read the camera of a profile.
+
+    Raises
+    ------
+    StaridError
+        The file is missing, no TOML, without a table [camera], or holds a wrong key or value.
+    """
+    source = Path(path)
+    try:
+        content = tomllib.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise StaridError(
+            f"camera profile {source}: no such file; write one with starhil calibrate"
+        ) from None
+    except OSError as error:
+        raise StaridError(f"camera profile {source}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StaridError(f"camera profile {source}: is no TOML ({error}); correct it") from None
+    table = content.get("camera")
+    if not isinstance(table, dict):
+        raise StaridError(
+            f"camera profile {source}: has no table [camera]; add one with width, height and fov_deg"
+        )
+    try:
+        return Camera.from_dict(table)
+    except StaridError as error:
+        raise StaridError(f"camera profile {source}: {error}") from None
+
+
+def _toml(value: object) -> str:
+    """A value as TOML: numbers, text without special characters, and lists of them."""
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    return repr(value)

@@ -1,0 +1,227 @@
+"""Calibration without a laboratory: from the stars of several frames and a rough field of view.
+
+Each frame is identified with the start camera, whose focal length may be off by the tolerance; the matches
+calibrate the camera; with it all catalogue stars in the field are matched again, which brings in the corners
+that the start camera had missed; and so on until nothing changes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starid.attitude import Attitude
+from starid.calibration import (
+    DEFAULT_ESTIMATE,
+    GROUPS,
+    Calibration,
+    CalibrationFrame,
+    calibrate,
+    check_estimate,
+)
+from starid.camera import Camera
+from starid.catalog import StarCatalog, blend, load_catalog
+from starid.errors import StaridError
+from starid.identifier import Identifier
+
+Array = NDArray[np.float64]
+
+MODELS: Final[tuple[tuple[str, ...], ...]] = (
+    ("focal",),
+    ("focal", "k1"),
+    ("focal", "centre", "k1"),
+    ("focal", "centre", "k1", "k2"),
+    DEFAULT_ESTIMATE,
+    ("aspect", *DEFAULT_ESTIMATE[1:]),
+)
+"""Sets of free parameters from which "auto" takes the one that the frames justify."""
+
+_ROUNDS: Final = 4
+_WINDOW_SIGMAS: Final = 5.0
+_LEAST_WINDOW_PX: Final = 1.0
+_SIGMA_FLOOR_PX: Final = 0.02
+_FAINTER: Final = 0.3
+_BLEND_PX: Final = 2.0
+
+
+class Stars(NamedTuple):
+    """Detections of one frame: positions (n, 2) px, fluxes (n,), errors (n,) or (n, 2) px or None."""
+
+    xy_px: Array
+    flux: Array
+    xy_sigma_px: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """Outcome: the calibration, and which frames it rests on.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        Camera, covariance and residuals.
+    frame_index : tuple of int
+        Frames given that were identified and used, in the order of `calibration.attitudes`.
+    refused : dict of int to str
+        Frames that could not be identified, and why.
+    """
+
+    calibration: Calibration
+    frame_index: tuple[int, ...]
+    refused: dict[int, str]
+
+
+def self_calibrate(
+    frames: Sequence[Stars],
+    camera: Camera,
+    catalog: StarCatalog | None = None,
+    *,
+    fov_tolerance: float = 0.1,
+    estimate: Sequence[str] | None = None,
+) -> SelfCalibration:
+    """Identify frames and estimate the camera that took them.
+
+    Parameters
+    ----------
+    frames : sequence of Stars
+        Detections of each frame.
+    camera : Camera
+        Start value: size, model and rough focal length.
+    catalog : StarCatalog, optional
+        By default the whole of Hipparcos at its default epoch.
+    fov_tolerance : float
+        Relative uncertainty of the start camera's focal length.
+    estimate : sequence of str, optional
+        What is free (see `starid.calibration.GROUPS`); by default the set of `MODELS` with the least
+        Bayesian information criterion.
+
+    Raises
+    ------
+    StaridError
+        No frame could be identified, or what `calibrate` refuses.
+    """
+    if not frames:
+        raise StaridError("calibration: no frames given; at least one image with stars needed")
+    if estimate is not None:
+        check_estimate(estimate)
+    sky = load_catalog() if catalog is None else catalog
+    identifier = Identifier(camera, sky, fov_tolerance=fov_tolerance)
+    matched: dict[int, CalibrationFrame] = {}
+    refused: dict[int, str] = {}
+    faintest = -np.inf
+    for index, stars in enumerate(frames):
+        sigma = _axis_sigma(stars)
+        solution = identifier.identify(stars.xy_px, stars.flux, sigma)
+        if not solution.valid:
+            refused[index] = solution.reason.value
+            continue
+        rows, chosen = solution.catalog_index, solution.detection_index
+        faintest = max(faintest, float(sky.v[rows].max()))
+        matched[index] = _frame(stars, sigma, chosen, sky.vectors[rows], solution.attitude)
+    if not matched:
+        reasons = ", ".join(sorted(set(refused.values())))
+        raise StaridError(
+            f"calibration: none of {len(frames)} frames could be identified ({reasons}); "
+            "check the field of view, or take frames with more stars"
+        )
+    seen = blend(sky.brighter_than(faintest + _FAINTER), _BLEND_PX * camera.pixel_scale_rad)
+    indices = tuple(matched)
+    result = calibrate(list(matched.values()), camera, _enough(list(matched.values()), ("focal", "k1")))
+    for _ in range(_ROUNDS):
+        again = [
+            _rematched(frames[index], result.camera, attitude, seen, result.sigma_px)
+            for index, attitude in zip(indices, result.attitudes, strict=True)
+        ]
+        before = result
+        start = dataclasses.replace(camera, focal_px=result.camera.focal_px)
+        result = _best(again, start) if estimate is None else calibrate(again, start, estimate)
+        if _same(before, result):
+            break
+    return SelfCalibration(result, indices, refused)
+
+
+def _axis_sigma(stars: Stars) -> Array | None:
+    """Error of each position on one axis, with a floor for what no detector knows of itself."""
+    if stars.xy_sigma_px is None:
+        return None
+    sigma = np.asarray(stars.xy_sigma_px, dtype=np.float64)
+    squares = sigma**2 if sigma.ndim == 1 else np.mean(sigma**2, axis=1)
+    floored: Array = np.sqrt(squares + _SIGMA_FLOOR_PX**2)
+    return floored
+
+
+def _frame(
+    stars: Stars, sigma: Array | None, chosen: NDArray[np.int64], reference: Array, attitude: Attitude
+) -> CalibrationFrame:
+    return CalibrationFrame(
+        xy_px=np.asarray(stars.xy_px)[chosen],
+        reference=reference,
+        sigma_px=None if sigma is None else sigma[chosen],
+        attitude=attitude,
+    )
+
+
+def _rematched(
+    stars: Stars, camera: Camera, attitude: Attitude, sky: StarCatalog, sigma_px: float
+) -> CalibrationFrame:
+    """Pair detections and catalogue stars that are each other's nearest, within a window."""
+    near = sky.in_cone(attitude.boresight, camera.field_radius_rad * 1.02)
+    xy, inside = camera.project(attitude.to_sensor(sky.vectors[near]))
+    near, xy = near[inside], xy[inside]
+    measured = np.asarray(stars.xy_px, dtype=np.float64)
+    window = max(_WINDOW_SIGMAS * sigma_px, _LEAST_WINDOW_PX)
+    distance, of_catalog = cKDTree(xy).query(measured, distance_upper_bound=window)
+    _, of_detection = cKDTree(measured).query(xy)
+    chosen = np.flatnonzero(np.isfinite(distance))
+    chosen = chosen[of_detection[of_catalog[chosen]] == chosen]
+    return _frame(stars, _axis_sigma(stars), chosen, sky.vectors[near[of_catalog[chosen]]], attitude)
+
+
+def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:
+    """Count the unknowns: camera parameters and three angles a frame."""
+    return sum(len(GROUPS[name]) for name in model) - ("focal" in model) + 3 * len(frames)
+
+
+def _enough(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the model, or the focal length alone where there are too few stars for it."""
+    equations = 2 * sum(len(frame.xy_px) for frame in frames)
+    return model if equations > 2 * _unknowns(model, frames) else ("focal",)
+
+
+def _best(frames: list[CalibrationFrame], camera: Camera) -> Calibration:
+    """Calibrate with each model and keep that with the least Bayesian information criterion."""
+    models = [model for model in MODELS if _enough(frames, model) == model] or [MODELS[0]]
+    results = [calibrate(frames, camera, model) for model in models]
+    equations = 2 * sum(len(frame.xy_px) for frame in frames)
+    noise = results[-1].sigma_px
+    costs = [
+        _misfit(result, frames, noise) + _unknowns(model, frames) * np.log(equations)
+        for model, result in zip(models, results, strict=True)
+    ]
+    return results[int(np.argmin(costs))]
+
+
+def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], noise: float) -> float:
+    """Sum of squared residuals in units of the noise, each star's share bounded."""
+    total = 0.0
+    for residual, frame in zip(result.residual_px, frames, strict=True):
+        sigma = np.full(len(residual), noise)
+        if frame.sigma_px is not None:
+            sigma = noise * frame.sigma_px / np.sqrt(1.0 / np.mean(frame.sigma_px**-2.0))
+        total += float(np.minimum((residual**2).sum(axis=1) / sigma**2, _WINDOW_SIGMAS**2).sum())
+    return total
+
+
+def _same(first: Calibration, second: Calibration) -> bool:
+    """Tell whether two calibrations map the image alike to a thousandth of a pixel."""
+    if first.estimated != second.estimated:
+        return False
+    grid = second.camera.border(9)
+    moved = first.camera.project(second.camera.back_project(grid))[0] - grid
+    return bool(np.nanmax(np.abs(moved)) < 1e-3)
