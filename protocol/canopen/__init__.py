@@ -6,9 +6,10 @@ restore, node guarding, event-driven PDOs that obey the NMT state), so the state
 """
 
 from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.application import Application, StandInApplication, check_status
+from protocol.canopen.application import Application, Picture, StandInApplication, check_status
 from protocol.canopen.context import UNCONFIGURED, EventKind, NmtState, SlaveEvent
 from protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from protocol.canopen.dictionary import Deferred
 from protocol.canopen.eds import build_eds
 from protocol.canopen.emergency import ErrorCode, ErrorRegister
 from protocol.canopen.slave import CanopenSlave
@@ -19,6 +20,7 @@ __all__ = [
     "AbortCode",
     "Application",
     "CanopenSlave",
+    "Deferred",
     "DeviceDictionary",
     "ErrorCode",
     "ErrorRegister",
@@ -27,6 +29,7 @@ __all__ = [
     "MemoryStorage",
     "NmtState",
     "ParameterStorage",
+    "Picture",
     "SdoAbortError",
     "SlaveEvent",
     "StandInApplication",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.dictionary import Deferred
 from protocol.codec import Row
 from protocol.icd import InterfaceDefinition
 from protocol.messages import ErrorCode
@@ -20,13 +22,23 @@ STATUS_ABORTS = {
 }
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A grey image of 8 bits, row by row from the top, and the number of the frame that it shows."""
+
+    width: int
+    height: int
+    frame: int
+    pixels: bytes
+
+
 class Application(Protocol):
     """The device behind an object dictionary; each method may refuse by `SdoAbortError`."""
 
     def telemetry(self, row: Row) -> bytes:
         """Return the present bytes of a telemetry row."""
 
-    def telecommand(self, row: Row, payload: bytes) -> None:
+    def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
         """Execute a telecommand whose payload has been checked against its row."""
 
     def parameter(self, name: str) -> Value:
@@ -35,8 +47,11 @@ class Application(Protocol):
     def set_parameter(self, name: str, value: Value) -> None:
         """Set a parameter; the value is within the limits of the interface definition."""
 
-    def domain(self, name: str) -> bytes:
-        """Return bulk data (an image)."""
+    def image(self, name: str) -> Picture:
+        """Return an image: `frame`, the last one taken by `take_image`, or `stored`, that of save_image."""
+
+    def take_image(self, name: str) -> Deferred | None:
+        """Take an image for reading."""
 
 
 def check_status(status: int, what: str) -> None:
@@ -62,12 +77,15 @@ class StandInApplication:
         Values of telemetry rows by row name; the row's defaults where none are given.
     commands
         Telecommands executed: row name and values.
+    images, taken
+        Images by name; names of those that were to be taken.
     """
 
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._parameters: dict[str, Value] = {name: item.default for name, item in icd.parameters.items()}
         self.rows: dict[str, dict[str, Value]] = {}
-        self.domains: dict[str, bytes] = {}
+        self.images: dict[str, Picture] = {}
+        self.taken: list[str] = []
         self.commands: list[tuple[str, dict[str, Value]]] = []
 
     def telemetry(self, row: Row) -> bytes:
@@ -86,8 +104,12 @@ class StandInApplication:
         """Hold the value."""
         self._parameters[name] = value
 
-    def domain(self, name: str) -> bytes:
-        """Return the data that was set."""
-        if name not in self.domains:
+    def image(self, name: str) -> Picture:
+        """Return the image that was set."""
+        if name not in self.images:
             raise SdoAbortError(AbortCode.NO_DATA, name)
-        return self.domains[name]
+        return self.images[name]
+
+    def take_image(self, name: str) -> None:
+        """Note the wish."""
+        self.taken.append(name)

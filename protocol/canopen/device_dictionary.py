@@ -10,7 +10,7 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.application import Application, StandInApplication, abort_of
+from protocol.canopen.application import Application, Picture, StandInApplication, abort_of
 from protocol.canopen.communication import (
     Identity,
     PdoDefault,
@@ -19,7 +19,7 @@ from protocol.canopen.communication import (
     set_limits,
     variable,
 )
-from protocol.canopen.dictionary import Dictionary, decode, encode, type_size
+from protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
 from protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, load_layout
 from protocol.codec import Field, Row, Slot
 from protocol.icd import InterfaceDefinition, load_icd
@@ -77,7 +77,7 @@ class DeviceDictionary(Dictionary):
         self.application: Application = StandInApplication(icd)
         self.sources: dict[str, set[Key]] = {}
         self._readers: dict[Key, Callable[[], bytes]] = {}
-        self._writers: dict[Key, Callable[[bytes], None]] = {}
+        self._writers: dict[Key, Writer] = {}
         self._sizes: dict[Key, int] = {}
         self._names: dict[str, Key] = {}
         self._cache: dict[str, bytes] = {}
@@ -123,8 +123,8 @@ class DeviceDictionary(Dictionary):
             self._place_telemetry(objects, placed, self.icd.telemetry[placed.telemetry])
         elif placed.parameters:
             self._place_parameters(objects, placed)
-        elif placed.domain is not None:
-            self._place_domain(objects, placed, placed.domain)
+        elif placed.image is not None:
+            self._place_image(objects, placed, placed.image)
         elif placed.packed:
             self._place_packed(objects, placed)
         else:
@@ -207,13 +207,29 @@ class DeviceDictionary(Dictionary):
             raise abort_of(error) from None
         self.application.set_parameter(parameter.name, value)
 
-    def _place_domain(self, objects: ObjectDictionary, placed: PlacedObject, name: str) -> None:
-        key = (placed.index, 0)
-        objects.add_object(variable(placed.name, *key, datatypes.DOMAIN, "ro"))
-        self._readers[key] = partial(self._read_domain, name)
+    def _place_image(self, objects: ObjectDictionary, placed: PlacedObject, name: str) -> None:
+        index = placed.index
+        readers: list[tuple[str, int, Callable[[Picture], bytes]]] = [
+            ("pixels", datatypes.DOMAIN, lambda image: image.pixels),
+            ("width", datatypes.UNSIGNED16, lambda image: image.width.to_bytes(2, "little")),
+            ("height", datatypes.UNSIGNED16, lambda image: image.height.to_bytes(2, "little")),
+            ("frame counter", datatypes.UNSIGNED32, lambda image: image.frame.to_bytes(4, "little")),
+        ]
+        members: list[ODVariable] = []
+        for part, data_type, extract in readers:
+            member = variable(part, index, len(members) + 1, data_type, "ro")
+            self._readers[index, member.subindex] = partial(self._read_image, name, extract)
+            members.append(member)
+        members[0].description = "8 bits a pixel, row by row from the top"
+        if name == "frame":
+            member = variable("take", index, len(members) + 1, datatypes.UNSIGNED8, "wo", limits=(1, 1))
+            member.description = "write 1 to take the frame; the answer comes when it can be read"
+            self._writers[index, member.subindex] = lambda _data: self.application.take_image(name)
+            members.append(member)
+        add_record(objects, placed.name, members)
 
-    def _read_domain(self, name: str) -> bytes:
-        return self.application.domain(name)
+    def _read_image(self, name: str, extract: Callable[[Picture], bytes]) -> bytes:
+        return extract(self.application.image(name))
 
     def _place_packed(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         members: list[ODVariable] = []
@@ -246,17 +262,17 @@ class DeviceDictionary(Dictionary):
         member.description = row.doc
         return member
 
-    def _execute(self, row: Row, payload: bytes) -> None:
+    def _execute(self, row: Row, payload: bytes) -> Deferred | None:
         if len(payload) < row.size:
             raise SdoAbortError(AbortCode.LENGTH_LOW, f"{row.name}: {len(payload)} bytes, {row.size} needed")
         try:
             row.decode(payload)
         except MessageError as error:
             raise abort_of(error) from None
-        self.application.telecommand(row, payload)
+        return self.application.telecommand(row, payload)
 
-    def _execute_bare(self, row: Row, _data: bytes) -> None:
-        self._execute(row, b"")
+    def _execute_bare(self, row: Row, _data: bytes) -> Deferred | None:
+        return self._execute(row, b"")
 
     def _row_part(self, row: Row, slot: Slot) -> bytes:
         return self.row_bytes(row)[_span(slot)]

@@ -25,6 +25,14 @@ COMMUNICATION: Final = range(0x1000, 0x2000)
 """Indices of the communication profile; all above belong to the application."""
 
 
+class Deferred:
+    """A write that the device has taken and whose result comes later; the node is then told by `finish_write`."""
+
+
+Writer = Callable[[bytes], Deferred | None]
+"""Takes a value that passed all checks; refuses by `SdoAbortError`, or tells that the result comes later."""
+
+
 @dataclass(slots=True)
 class Entry:
     """One variable of a node's object dictionary with its present value.
@@ -49,7 +57,7 @@ class Entry:
     variable: ODVariable
     value: bytes = b""
     reader: Callable[[], bytes] | None = None
-    writer: Callable[[bytes], None] | None = None
+    writer: Writer | None = None
     maximum_size: int = MAXIMUM_STRING
     persistent: bool = False
 
@@ -184,16 +192,19 @@ class Dictionary:
             raise SdoAbortError(AbortCode.READ_ONLY, f"{index:04X}h:{subindex:02X}h")
         return entry
 
-    def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write as an SDO client does: access, length and range are checked, then the handler decides."""
+    def write(self, index: int, subindex: int, data: bytes) -> Deferred | None:
+        """Write as an SDO client does: access, length and range are checked, then the handler decides.
+
+        Returns a token if the result comes later.
+        """
         entry = self.writable(index, subindex)
         check_length(entry, len(data))
         check_value(entry.variable, data)
-        if entry.writer is not None:
-            entry.writer(data)
+        deferred = None if entry.writer is None else entry.writer(data)
         entry.value = data
         self.changed.add(entry.key)
         self.new_instant()
+        return deferred
 
 
 def default_bytes(variable: ODVariable, node_id: int) -> bytes:

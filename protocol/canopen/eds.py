@@ -27,9 +27,7 @@ EDS_DATE: Final = dt.date(2026, 1, 1)
 Section = list[tuple[str, str]]
 
 
-def build_eds(
-    dictionary: Dictionary, *, file_name: str = "star-sensor.eds", date: dt.date = EDS_DATE
-) -> str:
+def build_eds(dictionary: Dictionary, *, file_name: str = "star-sensor.eds", date: dt.date = EDS_DATE) -> str:
     """Return the text of the electronic data sheet.
 
     Parameters

@@ -45,7 +45,7 @@ class PlacedObject(_Model):
     value: str | None = None
     telecommand: str | None = None
     parameters: bool = False
-    domain: str | None = None
+    image: Literal["frame", "stored"] | None = None
     packed: list[PackedField] = []
 
     @model_validator(mode="after")
@@ -55,12 +55,12 @@ class PlacedObject(_Model):
             self.telemetry is not None,
             self.value is not None or self.telecommand is not None,
             self.parameters,
-            self.domain is not None,
+            self.image is not None,
             bool(self.packed),
         ]
         if sum(kinds) != 1:
             raise ValueError(
-                "needs just one of requests, telemetry, value and/or telecommand, parameters, domain, packed"
+                "needs just one of requests, telemetry, value and/or telecommand, parameters, image, packed"
             )
         return self
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.dictionary import Dictionary, check_length
+from protocol.canopen.dictionary import Deferred, Dictionary, check_length
 from protocol.canopen.sdo_transfer import (
     MAXIMUM_BLOCK,
     BlockDownload,
@@ -25,6 +26,16 @@ LENGTH: Final = 8
 ABORT: Final = 0x80
 
 
+@dataclass
+class _Waiting:
+    """A download that is taken and not yet answered."""
+
+    deferred: Deferred
+    answers: list[bytes]
+    index: int
+    subindex: int
+
+
 class SdoServer:
     """Answers the SDO requests of one client (1200h).
 
@@ -40,6 +51,7 @@ class SdoServer:
         self._dictionary = dictionary
         self._timeout_s = timeout_s
         self._transfer: Transfer | None = None
+        self._waiting: _Waiting | None = None
         self.deadline: float | None = None
         self.faults: list[str] = []
         """What handlers of the application raised beside `SdoAbortError`; the node makes events of it."""
@@ -47,18 +59,31 @@ class SdoServer:
     @property
     def busy(self) -> bool:
         """Whether a transfer is under way."""
-        return self._transfer is not None
+        return self._transfer is not None or self._waiting is not None
 
     def reset(self) -> None:
         """Forget the transfer under way; nothing is sent."""
         self._transfer = None
+        self._waiting = None
         self.deadline = None
+
+    def finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> list[bytes]:
+        """Answer a download whose result has come; nothing if its client no longer waits for it."""
+        waiting = self._waiting
+        if waiting is None or waiting.deferred is not deferred:
+            return []
+        self._waiting = None
+        self.deadline = None
+        if refusal is None:
+            return waiting.answers
+        return [self._abort(refusal.code, waiting.index, waiting.subindex)]
 
     def tick(self, now: float) -> list[bytes]:
         """Abort the transfer whose client has been silent for too long."""
-        if self._transfer is None or self.deadline is None or now < self.deadline:
+        under_way = self._transfer or self._waiting
+        if under_way is None or self.deadline is None or now < self.deadline:
             return []
-        return [self._abort(AbortCode.TIMEOUT, self._transfer.index, self._transfer.subindex)]
+        return [self._abort(AbortCode.TIMEOUT, under_way.index, under_way.subindex)]
 
     def receive(self, data: bytes, now: float) -> list[bytes]:
         """Take the data of one frame and return the data of the answers.
@@ -73,10 +98,9 @@ class SdoServer:
         if len(data) != LENGTH:
             return []
         index, subindex = int.from_bytes(data[1:3], "little"), data[3]
-        if self._transfer is not None and not self._begins(data):
-            index, subindex = self._transfer.index, self._transfer.subindex
-        elif not self._begins(data):
-            index, subindex = 0, 0
+        if not self._begins(data):
+            under_way = self._transfer or self._waiting
+            index, subindex = (0, 0) if under_way is None else (under_way.index, under_way.subindex)
         try:
             answers = self._handle(data, index, subindex)
         except SdoAbortError as abort:
@@ -85,8 +109,12 @@ class SdoServer:
             self.faults.append(f"SDO {index:04X}h:{subindex:02X}h: {error}")
             return [self._abort(AbortCode.GENERAL, index, subindex)]
         if self._transfer is not None and self._transfer.done:
+            if self._transfer.deferred is not None:
+                self._waiting = _Waiting(self._transfer.deferred, [], index, subindex)
             self._transfer = None
-        self.deadline = None if self._transfer is None else now + self._timeout_s
+        if self._waiting is not None:
+            self._waiting.answers, answers = answers, []
+        self.deadline = now + self._timeout_s if self.busy else None
         return answers
 
     def _streaming(self) -> bool:
@@ -103,13 +131,13 @@ class SdoServer:
     def _handle(self, data: bytes, index: int, subindex: int) -> list[bytes]:
         command = data[0]
         if command == ABORT or (command >> 5 == 4 and not self._streaming()):
-            self._transfer = None
+            self._transfer = self._waiting = None
             return []
         if not self._begins(data):
             if self._transfer is None:
                 raise SdoAbortError(AbortCode.COMMAND, f"0x{command:02X} without a transfer")
             return self._transfer.request(data)
-        self._transfer = None
+        self._transfer = self._waiting = None
         match command >> 5:
             case 1:
                 return self._initiate_download(data, index, subindex)
@@ -125,7 +153,9 @@ class SdoServer:
         if command & 0x02:
             entry = self._dictionary.writable(index, subindex)
             length = 4 - (command >> 2 & 0x03) if command & 0x01 else min(4, entry.size or 4)
-            self._dictionary.write(index, subindex, data[4 : 4 + length])
+            deferred = self._dictionary.write(index, subindex, data[4 : 4 + length])
+            if deferred is not None:
+                self._waiting = _Waiting(deferred, [], index, subindex)
         else:
             buffer = self._buffer(data, index, subindex, sized=bool(command & 0x01))
             self._transfer = SegmentedDownload(index, subindex, buffer, self._commit(index, subindex))

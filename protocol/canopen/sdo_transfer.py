@@ -11,14 +11,15 @@ from collections.abc import Callable
 from typing import Final
 
 from protocol.canopen.abort import AbortCode, SdoAbortError
+from protocol.canopen.dictionary import Deferred
 
 SEGMENT: Final = 7
 """Data bytes of a segment."""
 MAXIMUM_BLOCK: Final = 127
 """Segments of a block, at most."""
 
-Commit = Callable[[bytes], None]
-"""Writes the whole data to the object; refuses by `SdoAbortError`."""
+Commit = Callable[[bytes], Deferred | None]
+"""Writes the whole data to the object; refuses by `SdoAbortError`, or tells that the result comes later."""
 
 
 class Transfer:
@@ -28,6 +29,8 @@ class Transfer:
         self.index = index
         self.subindex = subindex
         self.done = False
+        self.deferred: Deferred | None = None
+        """Set at the end of a download whose result comes later: the answer has to wait for it."""
 
     def request(self, data: bytes) -> list[bytes]:
         """Take one request; the base class knows none."""
@@ -85,7 +88,7 @@ class SegmentedDownload(Transfer):
         self._buffer.data += data[1 : 8 - unused]
         self._buffer.check()
         if command & 0x01:
-            self._commit(self._buffer.finish())
+            self.deferred = self._commit(self._buffer.finish())
             self.done = True
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= 0x10
@@ -171,7 +174,7 @@ class BlockDownload(Transfer):
         received = self._buffer.finish()
         if self._crc and crc_hqx(received, 0) != int.from_bytes(data[1:3], "little"):
             raise SdoAbortError(AbortCode.CRC)
-        self._commit(received)
+        self.deferred = self._commit(received)
         self.done = True
         return [bytes([0xA1]) + bytes(7)]
 

@@ -13,7 +13,7 @@ from protocol.can_framing import CanFrame
 from protocol.canopen.abort import SdoAbortError
 from protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE, SDO_TRANSMIT
 from protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent
-from protocol.canopen.dictionary import Dictionary
+from protocol.canopen.dictionary import Deferred, Dictionary
 from protocol.canopen.eds import build_eds
 from protocol.canopen.emergency import EmergencyProducer
 from protocol.canopen.error_control import ErrorControl
@@ -156,6 +156,15 @@ class CanopenSlave:
         self._begin(now)
         self.pdos.trigger(keys)
         self.pdos.tick()
+        return self._finish()
+
+    def finish_write(
+        self, deferred: Deferred, now: float, refusal: SdoAbortError | None = None
+    ) -> list[CanFrame]:
+        """Tell the result of a write that a handler of the application deferred: done, or refused after all."""
+        self._begin(now)
+        for data in self.sdo.finish(deferred, refusal):
+            self._context.send(SDO_TRANSMIT + self.node_id, data)
         return self._finish()
 
     def raise_emergency(

@@ -9,7 +9,7 @@ from typing import Final
 from protocol.canopen.abort import AbortCode, SdoAbortError
 from protocol.canopen.context import Context, EventKind
 from protocol.canopen.dictionary import COMMUNICATION as COMMUNICATION_INDICES
-from protocol.canopen.dictionary import Entry, default_bytes
+from protocol.canopen.dictionary import Deferred, Entry, default_bytes
 from protocol.canopen.storage import APPLICATION, COMMUNICATION, LSS, ParameterStorage, StorageError
 
 STORE: Final = 0x1010
@@ -36,9 +36,9 @@ class ParameterStore:
     def __init__(self, context: Context, storage: ParameterStorage) -> None:
         self._context = context
         self._storage = storage
-        self.on_save: Callable[[], None] | None = None
+        self.on_save: Callable[[], Deferred | None] | None = None
         """Stores the parameters that the application keeps itself; `SdoAbortError` if it cannot."""
-        self.on_restore: Callable[[], None] | None = None
+        self.on_restore: Callable[[], Deferred | None] | None = None
         """Lets the application's own parameters be the defaults from its next restart on."""
         for index, action in ((STORE, self._store), (RESTORE, self._restore)):
             for subindex in (ALL, *GROUPS):
@@ -88,13 +88,17 @@ class ParameterStore:
             return False
         return (entry.key[0] in COMMUNICATION_INDICES) == (group == COMMUNICATION)
 
-    def _store(self, subindex: int, data: bytes) -> None:
+    def _store(self, subindex: int, data: bytes) -> Deferred | None:
         if data != SAVE:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'save'")
+        deferred = None
         for number, group in GROUPS.items():
             if subindex in {ALL, number}:
                 self._save(group)
+                if group == APPLICATION and self.on_save is not None:
+                    deferred = self.on_save()
         self._context.report(EventKind.STORED, subindex)
+        return deferred
 
     def _save(self, group: str) -> None:
         values = {
@@ -106,16 +110,15 @@ class ParameterStore:
             self._storage.save(group, values)
         except StorageError as error:
             self._failed(error)
-        if group == APPLICATION and self.on_save is not None:
-            self.on_save()
 
     def _differs(self, entry: Entry) -> bool:
         """Tell whether a value is not its default: a default that follows the node-ID goes on doing so."""
         return entry.value != default_bytes(entry.variable, self._context.node_id)
 
-    def _restore(self, subindex: int, data: bytes) -> None:
+    def _restore(self, subindex: int, data: bytes) -> Deferred | None:
         if data != LOAD:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
+        deferred = None
         for number, group in GROUPS.items():
             if subindex in {ALL, number}:
                 try:
@@ -123,8 +126,9 @@ class ParameterStore:
                 except StorageError as error:
                     self._failed(error)
                 if group == APPLICATION and self.on_restore is not None:
-                    self.on_restore()
+                    deferred = self.on_restore()
         self._context.report(EventKind.RESTORED, subindex)
+        return deferred
 
     def _failed(self, error: StorageError) -> None:
         self._context.report(EventKind.STORAGE_ERROR, detail=str(error))

@@ -8,7 +8,7 @@ import canopen
 import pytest
 
 from protocol.can_framing import CanFrame
-from protocol.canopen import CanopenSlave, DeviceDictionary, StandInApplication, build_dictionary
+from protocol.canopen import CanopenSlave, DeviceDictionary, Picture, StandInApplication, build_dictionary
 from protocol.canopen.storage import ParameterStorage
 
 NODE = 0x2C
@@ -101,6 +101,11 @@ class Bench:
             result += [(self.now, frame.id, frame.data) for frame in frames]
         self.now = end
         return result
+
+    def show(self, pixels: bytes) -> bytes:
+        """Give the application a frame of these pixels, in one row."""
+        self.application.images["frame"] = Picture(len(pixels), 1, 7, pixels)
+        return pixels
 
     def events(self) -> list[tuple[str, float]]:
         return [(event.kind.value, event.value) for event in self.slave.take_events()]

@@ -213,7 +213,7 @@ def test_restricted_identifiers(quiet, identifier):
         (0x6001_3008, AbortCode.NO_OBJECT),
         (0x1000_0020, AbortCode.NOT_MAPPABLE),
         (0x6042_0010, AbortCode.NOT_MAPPABLE),  # write-only
-        (0x6040_0008, AbortCode.NOT_MAPPABLE),  # bulk data
+        (0x6040_0108, AbortCode.NOT_MAPPABLE),  # bulk data
         (0x6000_0010, AbortCode.NOT_MAPPABLE),  # another length
         (0x0005_0008, AbortCode.NO_OBJECT),  # a TPDO has no place holders
         (0x6000_0008, 0),

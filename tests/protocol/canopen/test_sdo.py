@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from binascii import crc_hqx
+from unittest.mock import Mock
 
 import pytest
 
-from protocol.canopen import AbortCode
+from protocol.canopen import AbortCode, Deferred, SdoAbortError
 
 ATTITUDE = "00 20 a0"  # 2000h:160, precise_attitude as a whole
 SERIAL_DIALECT = "20 60 24"  # 6020h:36
@@ -71,7 +72,7 @@ def test_expedited(bench, request_, answer):
         ("2f 29 10 01 03", AbortCode.VALUE_HIGH),
         ("2f 42 60 00 02", AbortCode.LENGTH_LOW),
         ("2b 42 60 00 07 00", AbortCode.VALUE_RANGE),  # no such camera
-        ("40 40 60 00", AbortCode.NO_DATA),  # no image yet
+        ("40 40 60 01", AbortCode.NO_DATA),  # no image yet
         ("40 03 10 01", AbortCode.NO_DATA),  # no error in the history
         ("2f 03 10 00 01", AbortCode.VALUE_RANGE),
         ("2f 19 10 00 01", AbortCode.VALUE_RANGE),
@@ -95,14 +96,14 @@ def test_segmented_upload_with_size_and_toggle(bench):
 
 
 def test_segmented_upload_of_exactly_seven_bytes(bench):
-    bench.application.domains["image"] = b"1234567"
-    assert bench.sdo("40 40 60 00") == "4140600007000000"
+    bench.show(b"1234567")
+    assert bench.sdo("40 40 60 01") == "4140600107000000"
     assert bench.sdo("60") == "01" + b"1234567".hex()
 
 
 def test_segmented_upload_of_nothing(bench):
-    bench.application.domains["image"] = b""
-    assert bench.sdo("40 40 60 00") == "4140600000000000"
+    bench.show(b"")
+    assert bench.sdo("40 40 60 01") == "4140600100000000"
     assert bench.sdo("60") == "0f" + "00" * 7
 
 
@@ -233,8 +234,8 @@ def test_no_answer_before_start(new_bench):
 
 def upload_block(bench, size: int, crc: bool = True) -> bytes:
     """Upload 6040h in blocks of `size`; check sequence numbers, end and CRC."""
-    answer = bytes.fromhex(bench.sdo(bytes([0xA4 if crc else 0xA0, 0x40, 0x60, 0, size, 0])))
-    assert answer[:4] == bytes([0xC6, 0x40, 0x60, 0])
+    answer = bytes.fromhex(bench.sdo(bytes([0xA4 if crc else 0xA0, 0x40, 0x60, 1, size, 0])))
+    assert answer[:4] == bytes([0xC6, 0x40, 0x60, 1])
     total = int.from_bytes(answer[4:], "little")
     data, answers = b"", bench.frame(0x62C, b"\xa3" + bytes(7))
     while True:
@@ -257,14 +258,14 @@ def upload_block(bench, size: int, crc: bool = True) -> bytes:
 @pytest.mark.parametrize("length", [0, 1, 6, 7, 8, 14, 888, 889, 890, 2000])
 @pytest.mark.parametrize("size", [1, 5, 127])
 def test_block_upload(bench, length, size):
-    data = bench.application.domains["image"] = bytes(number * 7 & 0xFF for number in range(length))
+    data = bench.show(bytes(number * 7 & 0xFF for number in range(length)))
     assert upload_block(bench, size, crc=size != 5) == data
     assert bench.sdo("a1") == abort("000000", AbortCode.COMMAND)
 
 
 def test_block_upload_repeats_what_was_not_confirmed(bench):
-    data = bench.application.domains["image"] = bytes(range(70))
-    bench.sdo("a4 40 60 00 05 00")
+    data = bench.show(bytes(range(70)))
+    bench.sdo("a4 40 60 01 05 00")
     first = bench.frame(0x62C, b"\xa3" + bytes(7))
     assert first[-1][1] == bytes([5]) + data[28:35]
     again = bench.frame(0x62C, bytes([0xA2, 2, 3, 0, 0, 0, 0, 0]))
@@ -276,8 +277,8 @@ def test_block_upload_repeats_what_was_not_confirmed(bench):
 
 
 def test_block_upload_repeats_the_last_segment(bench):
-    bench.application.domains["image"] = b"0123456789"
-    bench.sdo("a4 40 60 00 7f 00")
+    bench.show(b"0123456789")
+    bench.sdo("a4 40 60 01 7f 00")
     bench.frame(0x62C, b"\xa3" + bytes(7))
     assert bench.sdo("a2 01 7f") == "81" + b"789".hex() + "00000000"
     assert bench.sdo("a2 01 7f").startswith("d1")  # 4 unused bytes
@@ -286,47 +287,51 @@ def test_block_upload_repeats_the_last_segment(bench):
 @pytest.mark.parametrize(
     ("requests", "code"),
     [
-        (["a4 40 60 00 00 00"], AbortCode.BLOCK_SIZE),
-        (["a4 40 60 00 80 00"], AbortCode.BLOCK_SIZE),
-        (["a4 40 60 00 05 00", "a3", "a2 02 00"], AbortCode.BLOCK_SIZE),
-        (["a4 40 60 00 05 00", "a3", "a2 02 80"], AbortCode.BLOCK_SIZE),
-        (["a4 40 60 00 05 00", "a3", "a2 06 05"], AbortCode.SEQUENCE),
-        (["a4 40 60 00 05 00", "a2 01 05"], AbortCode.COMMAND),
-        (["a4 40 60 00 05 00", "a1"], AbortCode.COMMAND),
-        (["a4 40 60 00 05 00", "a3", "a3"], AbortCode.COMMAND),
-        (["a4 40 60 00 05 00", "a3", "a1"], AbortCode.COMMAND),
-        (["a4 40 60 00 05 00", "a3", "60"], AbortCode.COMMAND),
-        (["a4 40 60 00 7f 00", "a3", "a2 0f 7f", "a2 0f 7f"], AbortCode.COMMAND),
+        (["a4 40 60 01 00 00"], AbortCode.BLOCK_SIZE),
+        (["a4 40 60 01 80 00"], AbortCode.BLOCK_SIZE),
+        (["a4 40 60 01 05 00", "a3", "a2 02 00"], AbortCode.BLOCK_SIZE),
+        (["a4 40 60 01 05 00", "a3", "a2 02 80"], AbortCode.BLOCK_SIZE),
+        (["a4 40 60 01 05 00", "a3", "a2 06 05"], AbortCode.SEQUENCE),
+        (["a4 40 60 01 05 00", "a2 01 05"], AbortCode.COMMAND),
+        (["a4 40 60 01 05 00", "a1"], AbortCode.COMMAND),
+        (["a4 40 60 01 05 00", "a3", "a3"], AbortCode.COMMAND),
+        (["a4 40 60 01 05 00", "a3", "a1"], AbortCode.COMMAND),
+        (["a4 40 60 01 05 00", "a3", "60"], AbortCode.COMMAND),
+        (["a4 40 60 01 7f 00", "a3", "a2 0f 7f", "a2 0f 7f"], AbortCode.COMMAND),
     ],
 )
 def test_faults_of_block_uploads(bench, requests, code):
-    bench.application.domains["image"] = bytes(100)
+    bench.show(bytes(100))
     for request in requests[:-1]:
         bench.sdo(request)
-    assert bench.sdo(requests[-1]) == abort("406000", code)
+    assert bench.sdo(requests[-1]) == abort("406001", code)
 
 
 def test_block_upload_of_what_cannot_be_read(bench):
-    assert bench.sdo("a4 40 60 00 7f 00") == abort("406000", AbortCode.NO_DATA)
+    assert bench.sdo("a4 40 60 01 7f 00") == abort("406001", AbortCode.NO_DATA)
     assert bench.sdo("a4 42 60 00 7f 00") == abort("426000", AbortCode.WRITE_ONLY)
     assert bench.sdo("a4 99 50 00 7f 00") == abort("995000", AbortCode.NO_OBJECT)
 
 
 @pytest.mark.parametrize(
     ("length", "threshold", "answer"),
-    [(10, 10, "4140600a"), (10, 9, "c640600a"), (4, 20, "434060"), (4, 0, "c6406004")],
+    [
+        (10, 10, "41406001 0a000000"),
+        (10, 9, "c6406001 0a000000"),
+        (4, 20, "43406001 00000000"),
+        (4, 0, "c6406001 04000000"),
+    ],
 )
 def test_protocol_switch_threshold(bench, length, threshold, answer):
-    bench.application.domains["image"] = bytes(length)
-    got = bench.sdo(bytes([0xA4, 0x40, 0x60, 0, 0x7F, threshold]))
-    assert (got[:6] + got[8:10] if len(answer) == 8 else got[:6]) == answer
+    bench.show(bytes(length))
+    assert bench.sdo(bytes([0xA4, 0x40, 0x60, 1, 0x7F, threshold])) == answer.replace(" ", "")
 
 
 def test_block_transfer_times_out(bench):
-    bench.application.domains["image"] = bytes(100)
-    bench.sdo("a4 40 60 00 7f 00")
+    bench.show(bytes(100))
+    bench.sdo("a4 40 60 01 7f 00")
     bench.frame(0x62C, b"\xa3" + bytes(7))
-    assert bytes.fromhex(abort("406000", AbortCode.TIMEOUT)) in [data for _, _, data in bench.advance(1.0)]
+    assert bytes.fromhex(abort("406001", AbortCode.TIMEOUT)) in [data for _, _, data in bench.advance(1.0)]
 
 
 PARAMETER = b"\x01" + bytes.fromhex("0000000000006940")  # set_parameter: exposure 200
@@ -419,8 +424,6 @@ def test_block_download_to_what_cannot_be_written(bench):
 
 
 def test_refusal_of_the_device(bench):
-    from protocol.canopen import SdoAbortError
-
     def refuse(row, payload):
         raise SdoAbortError(AbortCode.DEVICE_STATE, row.name)
 
@@ -439,3 +442,69 @@ def test_other_errors_of_the_device_are_a_general_abort_and_an_event(bench):
     assert bench.sdo("40 00 60 00") == abort("006000", AbortCode.GENERAL)
     (event,) = bench.slave.take_events()
     assert "6000h:00h: no such thing" in event.detail
+
+
+def test_image_record(bench):
+    bench.show(b"abc")
+    assert bench.read(0x6040, 1) == b"abc"
+    assert [bench.number(0x6040, subindex) for subindex in (2, 3, 4)] == [3, 1, 7]
+    assert bench.write(0x6040, 5, 1, 1) == 0
+    assert bench.application.taken == ["frame"]
+    assert bench.sdo("40 43 60 01") == abort("436001", AbortCode.NO_DATA)
+
+
+# Writes whose result comes later
+
+
+@pytest.fixture
+def later(bench):
+    """A device that takes a mode command and tells its result later."""
+    deferred = Deferred()
+    bench.application.telecommand = Mock(return_value=deferred)
+    return deferred
+
+
+def finish(bench, deferred, refusal=None):
+    return [(frame.id, frame.data.hex()) for frame in bench.slave.finish_write(deferred, bench.now, refusal)]
+
+
+def test_deferred_write_is_answered_when_it_is_done(bench, later):
+    assert bench.sdo("2f 00 60 00 02") == ""
+    assert finish(bench, Deferred()) == []
+    assert finish(bench, later) == [(0x5AC, "6000600000000000")]
+    assert finish(bench, later) == []
+
+
+def test_deferred_write_refused_after_all(bench, later):
+    bench.sdo("2f 00 60 00 02")
+    refusal = SdoAbortError(AbortCode.HARDWARE)
+    assert finish(bench, later, refusal) == [(0x5AC, abort("006000", AbortCode.HARDWARE))]
+
+
+def test_deferred_segmented_and_block_download(bench, later):
+    bench.sdo("20 42 60 00")
+    assert bench.sdo("0b 02 03") == ""
+    assert finish(bench, later) == [(0x5AC, "2000000000000000")]
+    bench.sdo("c2 42 60 00 02")
+    bench.sdo("81 02 03")
+    assert bench.sdo("d5") == ""
+    assert finish(bench, later) == [(0x5AC, "a100000000000000")]
+
+
+def test_deferred_write_times_out(bench, later):
+    bench.sdo("2f 00 60 00 02")
+    assert (0x5AC, abort("006000", AbortCode.TIMEOUT)) in [(i, d.hex()) for _, i, d in bench.advance(1.0)]
+    assert finish(bench, later) == []
+
+
+@pytest.mark.parametrize("request_", ["40 01 10 00", "80 00 60 00"])
+def test_client_that_no_longer_waits(bench, later, request_):
+    bench.sdo("2f 00 60 00 02")
+    bench.sdo(request_)
+    assert finish(bench, later) == []
+
+
+def test_request_out_of_place_while_waiting(bench, later):
+    bench.sdo("2f 00 60 00 02")
+    assert bench.sdo("60") == abort("006000", AbortCode.COMMAND)
+    assert finish(bench, later) == []

@@ -12,7 +12,7 @@ from protocol.can_framing import CanFrame
 from protocol.canopen import AbortCode, NmtState
 
 IMAGE = bytes(number * 31 & 0xFF for number in range(100))
-IMAGE_MUX = "406000"
+IMAGE_MUX = "406001"
 EXPOSURE_MUX = "206001"
 COMMAND_MUX = "002062"  # set_parameter, 9 bytes
 NO_MUX = "000000"
@@ -60,7 +60,7 @@ class SdoMachine(RuleBasedStateMachine):
     def power_on(self):
         self.bench = type(self).new_bench().power_on()
         self.bench.write(0x1017, 0, 0, 2)
-        self.bench.application.domains["image"] = IMAGE
+        self.bench.show(IMAGE)
         self.model = Model()
         self.exposure = 100
         self.commands = 0

@@ -104,8 +104,8 @@ def test_what_it_can_do(stored, index):
 
 
 def test_application_is_asked_for_its_own_parameters(stored):
-    stored.slave.store.on_save = save = Mock()
-    stored.slave.store.on_restore = restore = Mock()
+    stored.slave.store.on_save = save = Mock(return_value=None)
+    stored.slave.store.on_restore = restore = Mock(return_value=None)
     stored.write(0x1010, 2, SAVE)
     stored.write(0x1011, 2, LOAD)
     assert (save.call_count, restore.call_count) == (0, 0)
