@@ -1,0 +1,102 @@
+"""`starhil icd`: the interface definition for people and for other tools."""
+
+from __future__ import annotations
+
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+group = typer.Typer(help="The interface definition: list it, export it.", no_args_is_help=True)
+
+
+class Format(StrEnum):
+    """Formats of an export."""
+
+    MARKDOWN = "markdown"
+    HTML = "html"
+    DBC = "dbc"
+    EDS = "eds"
+    XTCE = "xtce"
+    COSMOS = "cosmos"
+
+
+@group.command()
+def export(
+    format_: Annotated[
+        Format, typer.Argument(metavar="FORMAT", help="markdown, html, dbc, eds, xtce or cosmos.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write; stdout without it.")
+    ] = None,
+    icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
+) -> None:
+    """Write the interface definition in another format.
+
+    markdown and html are for people; dbc, eds, xtce and cosmos for CAN tools, CANopen masters and ground software.
+    """
+    from protocol.export import export as render
+    from protocol.icd import load_icd
+
+    text = render(load_icd(icd), format_.value)
+    if output is None:
+        print(text, end="")
+    else:
+        _write(output, text)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    from emulator.errors import EmulatorError
+
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        fresh.write_text(text, encoding="utf-8")
+        fresh.replace(path)
+    except OSError as error:
+        fresh.unlink(missing_ok=True)
+        raise EmulatorError(f"{path}: cannot write: {error.strerror}") from None
+
+
+@group.command("list")
+def list_rows(
+    icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """List telecommands, telemetry and parameters, one a line."""
+    import json
+
+    from protocol.icd import load_icd
+
+    definition = load_icd(icd)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "name": definition.name,
+                    "version": definition.version,
+                    "rows": [
+                        {
+                            "id": r.id,
+                            "kind": r.kind,
+                            "name": r.name,
+                            "size": r.size,
+                            "provenance": r.provenance,
+                        }
+                        for r in definition.rows
+                    ],
+                    "parameters": [
+                        {"id": p.id, "name": p.name, "unit": p.unit, "default": p.default}
+                        for p in definition.parameters.values()
+                    ],
+                }
+            )
+        )
+        return
+    for row in definition.rows:
+        print(f"{row.id:4d}  {row.kind:11s}  {row.size:4d} B  {row.provenance:9s}  {row.name}")
+    for parameter in definition.parameters.values():
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        print(f"{parameter.id:4d}  parameter    {parameter.default!s:>6}{unit}  {parameter.name}")

@@ -1,0 +1,31 @@
+"""The interface definition in other people's formats, each made by one module from the rows alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from types import MappingProxyType
+from typing import Final, cast
+
+from protocol.errors import ProtocolError
+from protocol.icd import InterfaceDefinition
+
+FORMATS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "markdown": "tables for people, as Markdown",
+        "html": "tables for people, as one HTML page",
+        "dbc": "CAN database (cantools, canmatrix, Vector tools)",
+        "eds": "electronic data sheet of the CANopen node (CiA 306)",
+        "xtce": "XML Telemetric and Command Exchange 1.2 (Yamcs and others)",
+        "cosmos": "command and telemetry definition of OpenC3 COSMOS",
+    }
+)
+"""Names of the formats and what they are."""
+
+
+def export(icd: InterfaceDefinition, name: str) -> str:
+    """Return the interface definition in the named format. Raises ProtocolError for a name that is none."""
+    if name not in FORMATS:
+        raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(FORMATS)}")
+    module = import_module(f"protocol.export.{name}")
+    return cast("Callable[[InterfaceDefinition], str]", module.render)(icd)

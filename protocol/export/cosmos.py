@@ -1,0 +1,99 @@
+"""The interface definition as command and telemetry text of OpenC3 COSMOS.
+
+A packet is the identifier byte followed by the row's data, as the serial framing carries it between start and end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from protocol.codec import Field, Row
+from protocol.export.describe import number
+from protocol.icd import InterfaceDefinition
+
+TARGET: Final = "STARHIL"
+IDENTIFIER: Final = "PACKET_ID"
+ID_BITS: Final = 8
+
+
+def render(icd: InterfaceDefinition) -> str:
+    """Return the text of the definition; commands and telemetry in one file."""
+    return "\n".join(_lines(icd)) + "\n"
+
+
+def _lines(icd: InterfaceDefinition) -> Iterator[str]:
+    yield f"# {icd.name} {icd.version}: {icd.doc}"
+    yield "# Made from the interface definition; do not edit."
+    for row in icd.rows:
+        yield ""
+        if row.kind == "telecommand":
+            yield f"COMMAND {TARGET} {row.name.upper()} LITTLE_ENDIAN {_quoted(row.doc)}"
+            yield f'  APPEND_ID_PARAMETER {IDENTIFIER} {ID_BITS} UINT {row.id} {row.id} {row.id} "Identifier"'
+        else:
+            yield f"TELEMETRY {TARGET} {row.name.upper()} LITTLE_ENDIAN {_quoted(row.doc)}"
+            yield f'  APPEND_ID_ITEM {IDENTIFIER} {ID_BITS} UINT {row.id} "Identifier"'
+        for index, field in enumerate(row.fields):
+            yield from _field(row, field, index)
+
+
+def _field(row: Row, field: Field, index: int) -> Iterator[str]:
+    keyword = "PARAMETER" if row.kind == "telecommand" else "ITEM"
+    name = (field.name or f"unused_{index}").upper()
+    bits = field.width or 8 * field.size
+    limits = _limits(field) if row.kind == "telecommand" else ""
+    endian = ""
+    if field.width:
+        # COSMOS counts bits from the most significant one, and takes a bit field's order from its bytes
+        byte = field.offset + field.shift // 8
+        offset = ID_BITS + 8 * byte + 8 - field.shift % 8 - field.width
+        endian = " BIG_ENDIAN"
+    else:
+        offset = ID_BITS + 8 * field.offset
+    yield f"  {keyword} {name} {offset} {bits} {_type(field)}{limits} {_quoted(field.doc or 'Unused')}{endian}"
+    if field.enum is not None:
+        yield from (f"    STATE {label.upper()} {value}" for label, value in field.enum.values.items())
+    elif field.kind == "flag":
+        yield from ("    STATE FALSE 0", "    STATE TRUE 1")
+    if field.scaled:
+        if row.kind == "telecommand":
+            yield f"    POLY_WRITE_CONVERSION {number(-field.bias / field.scale)} {number(1.0 / field.scale)}"
+        else:
+            yield f"    POLY_READ_CONVERSION {number(field.bias)} {number(field.scale)}"
+    if field.unit:
+        yield f"    UNITS {_quoted(field.unit)} {_quoted(field.unit)}"
+
+
+def _type(field: Field) -> str:
+    match field.kind:
+        case "float":
+            return "FLOAT"
+        case "bytes":
+            return "BLOCK"
+        case "text":
+            return "STRING"
+        case _:
+            return "INT" if not field.width and field.type.startswith("i") else "UINT"
+
+
+def _limits(field: Field) -> str:
+    """Least, greatest and default value of a command parameter."""
+    if field.slot.type == "bytes":
+        return f" 0x{bytes(field.size).hex()}" if field.kind == "bytes" else ' ""'
+    if field.enum is not None:
+        low, high = min(field.enum.values.values()), max(field.enum.values.values())
+        default = field.enum.values[field.default] if isinstance(field.default, str) else low
+        return f" {low} {high} {default}"
+    if field.kind in ("flag", "unused"):
+        return f" 0 {2**field.width - 1 if field.width else 0} {int(bool(field.default))}"
+    if field.kind == "float" and (field.minimum is None or field.maximum is None):
+        return " MIN MAX 0"
+    low_limit, high_limit = field.physical_limits
+    default_value = (
+        field.default if isinstance(field.default, (int, float)) else min(max(0.0, low_limit), high_limit)
+    )
+    return f" {number(low_limit)} {number(high_limit)} {number(default_value)}"
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace('"', "'") + '"'

@@ -1,0 +1,133 @@
+"""The interface definition as a CAN database (DBC).
+
+Each row gives its frames on the bus between the default addresses: request, telemetry and refusal, or telecommand,
+acknowledge and refusal. A message longer than 8 bytes describes the data after its segments have been joined (7 bytes
+and a counter each), as DBC files do for other transport protocols.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from protocol.can_framing import MAX_FRAME_DATA, CanIdentifier, MessageType
+from protocol.codec import Field, Row
+from protocol.export.describe import number
+from protocol.icd import InterfaceDefinition
+
+EXTENDED: Final = 0x80000000
+"""Flag of 29-bit identifiers in DBC files."""
+
+_SIGNED: Final = ("i8", "i16", "i32", "i64")
+
+
+@dataclass(frozen=True)
+class _Message:
+    """One message of the database."""
+
+    identifier: int
+    name: str
+    size: int
+    sender: str
+    signals: tuple[Field, ...]
+    doc: str
+
+
+def render(icd: InterfaceDefinition) -> str:
+    """Return the text of the database."""
+    host = int(icd.parameters["host_address"].default)
+    device = int(icd.parameters["can_address"].default)
+    messages = [message for row in icd.rows for message in _messages(row, icd, host, device)]
+    return "\n".join(_lines(icd, messages)) + "\n"
+
+
+def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
+    yield from (f'VERSION "{icd.name} {icd.version}"', "", "NS_ :", "", "BS_:", "", "BU_: OBC SENSOR")
+    for message in messages:
+        yield ""
+        yield f"BO_ {message.identifier | EXTENDED} {message.name}: {message.size} {message.sender}"
+        for signal in message.signals:
+            yield from _signals(signal, "OBC" if message.sender == "SENSOR" else "SENSOR")
+    yield ""
+    yield f'CM_ "{_text(icd.doc)} Messages longer than 8 bytes describe the data after their segments are joined.";'
+    for message in messages:
+        yield f'CM_ BO_ {message.identifier | EXTENDED} "{_text(message.doc)}";'
+        for signal in message.signals:
+            if signal.slot.type != "bytes":
+                yield f'CM_ SG_ {message.identifier | EXTENDED} {signal.name} "{_text(signal.doc)}";'
+    yield 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";'
+    yield 'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";'
+    for message in messages:
+        for signal in message.signals:
+            if signal.enum is not None:
+                values = " ".join(f'{value} "{name}"' for name, value in signal.enum.values.items())
+                yield f"VAL_ {message.identifier | EXTENDED} {signal.name} {values} ;"
+    for message in messages:
+        for signal in message.signals:
+            if signal.kind == "float":
+                precision = 1 if signal.type == "f32" else 2
+                yield f"SIG_VALTYPE_ {message.identifier | EXTENDED} {signal.name} : {precision};"
+
+
+def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:
+    to_device = (row.id, host, device)
+    to_host = (row.id, device, host)
+    signals = tuple(row.named_fields.values())
+    error = tuple(field for field in icd.telemetry["acknowledge"].fields if field.name == "error")
+    code = tuple(_at_start(field) for field in error)
+    long = row.size > MAX_FRAME_DATA
+    if row.kind == "telemetry":
+        asked, answered = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
+        if long:
+            answered = MessageType.TELEMETRY_EXTENDED
+        yield _Message(_id(asked, *to_device), f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
+        yield _Message(_id(answered, *to_host), f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
+        refused = MessageType.TELEMETRY_NACK
+    else:
+        asked = MessageType.TELECOMMAND_EXTENDED if long else MessageType.TELECOMMAND
+        yield _Message(_id(asked, *to_device), f"TC_{row.name}", row.size, "OBC", signals, row.doc)
+        answered = MessageType.TELECOMMAND_ACK
+        yield _Message(
+            _id(answered, *to_host), f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}."
+        )
+        refused = MessageType.TELECOMMAND_NACK
+    yield _Message(_id(refused, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
+
+
+def _at_start(field: Field) -> Field:
+    """Return the field as the first byte of a message of its own."""
+    slot = type(field.slot)(0, field.slot.type, 0, field.slot.size)
+    return Field(field.name, field.kind, slot, enum=field.enum, provenance=field.provenance, doc=field.doc)
+
+
+def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:
+    return CanIdentifier(kind, row_id, source, destination).pack()
+
+
+def _signals(field: Field, receiver: str) -> Iterator[str]:
+    start = 8 * field.offset
+    if field.slot.type == "bytes":
+        for index in range(field.size):
+            yield f' SG_ {field.name}_{index} : {start + 8 * index}|8@1+ (1,0) [0|255] "" {receiver}'
+        return
+    width = field.width or 8 * field.size
+    sign = "-" if field.slot.type in _SIGNED or field.kind == "float" else "+"
+    low, high = _limits(field)
+    yield (
+        f" SG_ {field.name} : {start + field.shift}|{width}@1{sign} ({number(field.scale)},{number(field.bias)}) "
+        f'[{number(low)}|{number(high)}] "{_text(field.unit)}" {receiver}'
+    )
+
+
+def _limits(field: Field) -> tuple[float, float]:
+    if field.enum is not None:
+        return min(field.enum.values.values()), max(field.enum.values.values())
+    if field.kind == "float" and (field.minimum is None or field.maximum is None):
+        return 0.0, 0.0
+    return field.physical_limits
+
+
+def _text(text: str) -> str:
+    """Text without the quotes that would end it."""
+    return text.replace('"', "'")

@@ -1,0 +1,124 @@
+"""Rows and fields in words, for the formats that people read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from protocol.codec import Field, Row
+from protocol.icd import InterfaceDefinition
+from protocol.values import EnumDefinition, Parameter
+
+FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
+PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
+
+_SOURCE: Final = (
+    "Source: confirmed (public flight software or manual, named), proxy (public for another unit of the same family) "
+    "or ours (no public source; chosen here)."
+)
+
+INTRODUCTION: Final = (
+    "Multi-byte fields are little-endian. Identifiers below 128 are telecommands, from 128 on telemetry.",
+    _SOURCE,
+)
+
+
+def number(value: float) -> str:
+    """Write a number without digits that say nothing."""
+    return f"{value:.10g}"
+
+
+def title(row: Row) -> str:
+    """Heading of a row: its identifier and name."""
+    return f"{row.id} (0x{row.id:02X}) {row.name}"
+
+
+def facts(row: Row) -> str:
+    """Size and source of a row."""
+    size = f"{row.size} byte{'' if row.size == 1 else 's'}"
+    return f"{size}, {row.provenance}{f': {row.source}' if row.source else ''}"
+
+
+def field_cells(field: Field) -> tuple[str, ...]:
+    """Cells of a field under FIELD_COLUMNS."""
+    meaning = field.doc
+    if field.parameter is not None:
+        meaning = f"{meaning} Parameter {field.parameter}."
+    return (
+        _place(field),
+        field.name or "unused",
+        _type(field),
+        field.unit,
+        _value(field),
+        _range(field),
+        field.provenance if field.name else "",
+        meaning or "Unused, sent as 0.",
+    )
+
+
+def parameter_cells(parameter: Parameter) -> tuple[str, ...]:
+    """Cells of a parameter under PARAMETER_COLUMNS."""
+    limits = f"{number(parameter.minimum)} to {number(parameter.maximum)}"
+    if parameter.enum is not None:
+        limits = enum_text(parameter.enum)
+    elif parameter.type == "bool":
+        limits = "0 or 1"
+    default = parameter.default
+    return (
+        str(parameter.id),
+        parameter.name,
+        parameter.type,
+        parameter.unit,
+        limits,
+        str(default) if isinstance(default, str) else number(float(default)),
+        parameter.doc,
+    )
+
+
+def enum_text(enum: EnumDefinition) -> str:
+    """Members of an enumeration in one line."""
+    return ", ".join(f"{value} {name}" for name, value in enum.values.items())
+
+
+def sections(icd: InterfaceDefinition) -> Iterator[tuple[str, list[Row]]]:
+    """The two groups of rows with their headings."""
+    yield "Telecommands", [row for row in icd.rows if row.kind == "telecommand"]
+    yield "Telemetry", [row for row in icd.rows if row.kind == "telemetry"]
+
+
+def _place(field: Field) -> str:
+    if not field.width:
+        last = field.offset + field.size - 1
+        return str(field.offset) if field.size == 1 else f"{field.offset}–{last}"
+    byte, bit = field.offset + field.shift // 8, field.shift % 8
+    return f"{byte}.{bit}" if field.width == 1 else f"{byte}.{bit}–{bit + field.width - 1}"
+
+
+def _type(field: Field) -> str:
+    if field.width:
+        return "bit" if field.width == 1 else f"{field.width} bits"
+    if field.slot.type == "bytes":
+        return f"{'text' if field.kind == 'text' else 'bytes'}[{field.size}]"
+    return field.slot.type
+
+
+def _value(field: Field) -> str:
+    if field.enum is not None:
+        return enum_text(field.enum)
+    if not field.scaled:
+        return ""
+    text = f"raw × {number(field.scale)}"
+    if field.bias:
+        text += f" {'+' if field.bias > 0 else '−'} {number(abs(field.bias))}"
+    return text
+
+
+def _range(field: Field) -> str:
+    if field.kind not in ("integer", "float", "bits") or (field.minimum is None and field.maximum is None):
+        return ""
+    if field.minimum == field.maximum:
+        return number(field.minimum or 0.0)
+    low, high = field.physical_limits
+    if field.maximum is None and field.kind == "float":
+        return f"≥ {number(low)}"
+    return f"{number(low)} to {number(high)}"

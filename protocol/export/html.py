@@ -1,0 +1,72 @@
+"""The interface definition as one HTML page without outside parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
+from typing import Final
+
+from protocol.export import describe
+from protocol.icd import InterfaceDefinition
+
+_STYLE: Final = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 72em; padding: 0 1em; color: #1a1a1a; }
+h1, h2, h3 { line-height: 1.2; } h2 { border-bottom: 2px solid #446; margin-top: 2.5em; } h3 { margin-top: 2em; }
+table { border-collapse: collapse; width: 100%; font-size: 13px; } th, td { border: 1px solid #bbc; padding: 3px 7px; text-align: left;
+vertical-align: top; } th { background: #eef; } tr.ours td { background: #fffbe8; } tr.proxy td { background: #f0f7ff; }
+td:nth-child(2) { font-family: ui-monospace, monospace; } .facts { color: #555; } nav a { margin-right: 1em; }
+@media print { h3, tr { break-inside: avoid; } }
+"""
+
+
+def render(icd: InterfaceDefinition) -> str:
+    """Return the definition as an HTML page: rows, parameters, enumerations."""
+    return "\n".join(_lines(icd)) + "\n"
+
+
+def _lines(icd: InterfaceDefinition) -> Iterator[str]:
+    heading = f"Interface definition {icd.name} {icd.version}"
+    yield "<!DOCTYPE html>"
+    yield '<html lang="en"><head><meta charset="utf-8">'
+    yield f"<title>{escape(heading)}</title><style>{_STYLE}</style></head><body>"
+    yield f"<h1>{escape(heading)}</h1><p>{escape(icd.doc)}</p>"
+    yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.INTRODUCTION)
+    yield (
+        '<nav><a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>'
+        '<a href="#parameters">Parameters</a><a href="#enumerations">Enumerations</a></nav>'
+    )
+    for title, rows in describe.sections(icd):
+        yield f'<h2 id="{title.lower()}">{title}</h2>'
+        yield "<table><tr><th>Id</th><th>Name</th><th>Bytes</th><th>Source</th><th>Meaning</th></tr>"
+        for row in rows:
+            yield (
+                f'<tr class="{row.provenance}"><td>{row.id}</td><td><a href="#row-{row.id}">{escape(row.name)}</a></td>'
+                f"<td>{row.size}</td><td>{row.provenance}</td><td>{escape(row.doc)}</td></tr>"
+            )
+        yield "</table>"
+        for row in rows:
+            yield f'<h3 id="row-{row.id}">{escape(describe.title(row))}</h3>'
+            yield f'<p>{escape(row.doc)}</p><p class="facts">{escape(describe.facts(row))}.</p>'
+            if row.fields:
+                yield from _table(
+                    describe.FIELD_COLUMNS,
+                    ((field.provenance, describe.field_cells(field)) for field in row.fields),
+                )
+    yield '<h2 id="parameters">Parameters</h2>'
+    yield from _table(
+        describe.PARAMETER_COLUMNS,
+        (("confirmed", describe.parameter_cells(parameter)) for parameter in icd.parameters.values()),
+    )
+    yield '<h2 id="enumerations">Enumerations</h2>'
+    yield from _table(
+        ("Name", "Numbers", "Meaning"),
+        (("confirmed", (enum.name, describe.enum_text(enum), enum.doc)) for enum in icd.enums.values()),
+    )
+    yield "</body></html>"
+
+
+def _table(columns: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> Iterator[str]:
+    yield "<table><tr>" + "".join(f"<th>{escape(column)}</th>" for column in columns) + "</tr>"
+    for kind, cells in rows:
+        yield f'<tr class="{kind}">' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
+    yield "</table>"

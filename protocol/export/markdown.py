@@ -1,0 +1,56 @@
+"""The interface definition as Markdown tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from protocol.export import describe
+from protocol.icd import InterfaceDefinition
+
+
+def render(icd: InterfaceDefinition) -> str:
+    """Return the definition as Markdown: rows, parameters, enumerations."""
+    return "\n".join(_lines(icd)) + "\n"
+
+
+def _lines(icd: InterfaceDefinition) -> Iterator[str]:
+    yield f"# Interface definition {icd.name} {icd.version}"
+    yield ""
+    yield icd.doc
+    for paragraph in describe.INTRODUCTION:
+        yield ""
+        yield paragraph
+    for heading, rows in describe.sections(icd):
+        yield from ("", f"## {heading}", "")
+        yield from _table(
+            ("Id", "Name", "Bytes", "Source", "Meaning"),
+            ((str(row.id), row.name, str(row.size), row.provenance, row.doc) for row in rows),
+        )
+        for row in rows:
+            yield from ("", f"### {describe.title(row)}", "", row.doc, "", f"{describe.facts(row)}.")
+            if row.fields:
+                yield ""
+                yield from _table(
+                    describe.FIELD_COLUMNS, (describe.field_cells(field) for field in row.fields)
+                )
+    yield from ("", "## Parameters", "")
+    yield from _table(
+        describe.PARAMETER_COLUMNS,
+        (describe.parameter_cells(parameter) for parameter in icd.parameters.values()),
+    )
+    yield from ("", "## Enumerations", "")
+    yield from _table(
+        ("Name", "Numbers", "Meaning"),
+        ((enum.name, describe.enum_text(enum), enum.doc) for enum in icd.enums.values()),
+    )
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    yield _row(columns)
+    yield _row(["---"] * len(columns))
+    for row in rows:
+        yield _row(row)
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -1,0 +1,222 @@
+"""The interface definition as XTCE 1.2 (XML Telemetric and Command Exchange).
+
+A packet is the identifier byte followed by the row's data, as the serial framing carries it between start and end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+from xml.etree import ElementTree as ET
+
+from protocol.codec import Field, Row
+from protocol.export.describe import number
+from protocol.icd import InterfaceDefinition
+from protocol.values import IcdError
+
+NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
+PACKET: Final = "Packet"
+IDENTIFIER: Final = "identifier"
+
+_LITTLE: Final = "leastSignificantByteFirst"
+
+
+def render(icd: InterfaceDefinition) -> str:
+    """Return the XML text. Raises IcdError for a bit field that runs across bytes, which XTCE cannot say in this order."""
+    system = ET.Element(
+        "SpaceSystem", {"name": _identifier(icd.name), "xmlns": NAMESPACE, "shortDescription": icd.doc}
+    )
+    ET.SubElement(
+        system, "Header", {"version": icd.version, "date": "2026-01-01", "validationStatus": "Working"}
+    )
+    _telemetry(
+        ET.SubElement(system, "TelemetryMetaData"), [row for row in icd.rows if row.kind == "telemetry"]
+    )
+    _commands(
+        ET.SubElement(system, "CommandMetaData"), [row for row in icd.rows if row.kind == "telecommand"]
+    )
+    ET.indent(system)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(system, encoding="unicode") + "\n"
+
+
+def wire_order(row: Row) -> Iterator[Field]:
+    """Fields of a row in the order of their bits on the wire, most significant bit of each byte first."""
+    for slot in row.slots:
+        fields = [field for field in row.fields if field.slot is slot]
+        for byte in range(slot.size) if fields[0].width else (0,):
+            within = [field for field in fields if not field.width or field.shift // 8 == byte]
+            for field in within:
+                if field.width and (field.shift % 8) + field.width > 8:
+                    raise IcdError(f"{row.name}.{field.name}: bits across bytes cannot be exported")
+            yield from sorted(within, key=lambda field: -field.shift)
+
+
+def _telemetry(parent: ET.Element, rows: list[Row]) -> None:
+    types = ET.SubElement(parent, "ParameterTypeSet")
+    parameters = ET.SubElement(parent, "ParameterSet")
+    containers = ET.SubElement(parent, "ContainerSet")
+    _unsigned(
+        ET.SubElement(types, "IntegerParameterType", {"name": f"{IDENTIFIER}_type", "signed": "false"}), 8
+    )
+    ET.SubElement(
+        parameters,
+        "Parameter",
+        {
+            "name": IDENTIFIER,
+            "parameterTypeRef": f"{IDENTIFIER}_type",
+            "shortDescription": "Telemetry identifier.",
+        },
+    )
+    root = ET.SubElement(containers, "SequenceContainer", {"name": PACKET, "abstract": "true"})
+    _entries(root, "Parameter", [IDENTIFIER])
+    for row in rows:
+        names = []
+        for index, field in enumerate(wire_order(row)):
+            name = _name(row, field, index)
+            names.append(name)
+            _type(types, "Parameter", name, field)
+            about = {"name": name, "parameterTypeRef": f"{name}_type"}
+            ET.SubElement(parameters, "Parameter", about | _short(field.doc))
+        container = ET.SubElement(containers, "SequenceContainer", {"name": row.name} | _short(row.doc))
+        _entries(container, "Parameter", names)
+        base = ET.SubElement(container, "BaseContainer", {"containerRef": PACKET})
+        criteria = ET.SubElement(base, "RestrictionCriteria")
+        ET.SubElement(criteria, "Comparison", {"parameterRef": IDENTIFIER, "value": str(row.id)})
+
+
+def _commands(parent: ET.Element, rows: list[Row]) -> None:
+    types = ET.SubElement(parent, "ArgumentTypeSet")
+    commands = ET.SubElement(parent, "MetaCommandSet")
+    for row in rows:
+        command = ET.SubElement(commands, "MetaCommand", {"name": row.name} | _short(row.doc))
+        arguments = [(_name(row, field, index), field) for index, field in enumerate(wire_order(row))]
+        if any(field.name for _, field in arguments):
+            listed = ET.SubElement(command, "ArgumentList")
+            for name, field in arguments:
+                if field.name:
+                    _type(types, "Argument", name, field)
+                    about = {"name": field.name, "argumentTypeRef": f"{name}_type"}
+                    if field.default is not None:
+                        about["initialValue"] = _initial(field)
+                    ET.SubElement(listed, "Argument", about | _short(field.doc))
+        container = ET.SubElement(command, "CommandContainer", {"name": f"{row.name}_packet"})
+        entries = ET.SubElement(container, "EntryList")
+        _fixed(entries, "identifier", row.id, 8)
+        for name, field in arguments:
+            if field.name:
+                ET.SubElement(entries, "ArgumentRefEntry", {"argumentRef": field.name})
+            else:
+                _fixed(entries, name, 0, _bits(field))
+
+
+def _fixed(entries: ET.Element, name: str, value: int, bits: int) -> None:
+    size = -(-bits // 8)
+    ET.SubElement(
+        entries,
+        "FixedValueEntry",
+        {"name": name, "binaryValue": value.to_bytes(size, "big").hex().upper(), "sizeInBits": str(bits)},
+    )
+
+
+def _entries(container: ET.Element, kind: str, names: Iterable[str]) -> None:
+    entries = ET.SubElement(container, "EntryList")
+    for name in names:
+        ET.SubElement(entries, f"{kind}RefEntry", {f"{kind.lower()}Ref": name})
+
+
+def _type(types: ET.Element, what: str, name: str, field: Field) -> None:
+    """Write the type of a parameter or argument."""
+    about = {"name": f"{name}_type"}
+    if field.slot.type == "bytes":
+        kind = ET.SubElement(types, f"Binary{what}Type", about)
+        _unit(kind, field)
+        size = ET.SubElement(ET.SubElement(kind, "BinaryDataEncoding"), "SizeInBits")
+        ET.SubElement(size, "FixedValue").text = str(8 * field.size)
+        return
+    if field.kind == "float":
+        bits = {"sizeInBits": str(8 * field.size)}
+        kind = ET.SubElement(types, f"Float{what}Type", about | bits)
+        _unit(kind, field)
+        ET.SubElement(kind, "FloatDataEncoding", bits | {"encoding": "IEEE754_1985", "byteOrder": _LITTLE})
+    elif field.enum is not None:
+        kind = ET.SubElement(types, f"Enumerated{what}Type", about)
+        _integer(kind, field)
+        members = ET.SubElement(kind, "EnumerationList")
+        for label, value in field.enum.values.items():
+            ET.SubElement(members, "Enumeration", {"value": str(value), "label": label})
+        return
+    elif field.kind == "flag":
+        _integer(ET.SubElement(types, f"Boolean{what}Type", about), field)
+        return
+    elif field.scaled:
+        kind = ET.SubElement(types, f"Float{what}Type", about | {"sizeInBits": "64"})
+        _integer(kind, field)
+    else:
+        signed = str(_signed(field)).lower()
+        kind = ET.SubElement(types, f"Integer{what}Type", about | {"signed": signed})
+        _integer(kind, field)
+    if what == "Argument" and (field.minimum is not None or field.maximum is not None):
+        _range(kind, field)
+
+
+def _integer(kind: ET.Element, field: Field) -> None:
+    """Write the unit and the encoding of an integer, with its scale."""
+    _unit(kind, field)
+    encoding = ET.SubElement(
+        kind,
+        "IntegerDataEncoding",
+        {
+            "sizeInBits": str(_bits(field)),
+            "encoding": "twosComplement" if _signed(field) else "unsigned",
+            "byteOrder": _LITTLE,
+        },
+    )
+    if field.scaled:
+        calibrator = ET.SubElement(ET.SubElement(encoding, "DefaultCalibrator"), "PolynomialCalibrator")
+        ET.SubElement(calibrator, "Term", {"coefficient": number(field.bias), "exponent": "0"})
+        ET.SubElement(calibrator, "Term", {"coefficient": number(field.scale), "exponent": "1"})
+
+
+def _unsigned(kind: ET.Element, bits: int) -> None:
+    ET.SubElement(kind, "UnitSet")
+    ET.SubElement(kind, "IntegerDataEncoding", {"sizeInBits": str(bits), "encoding": "unsigned"})
+
+
+def _range(kind: ET.Element, field: Field) -> None:
+    low, high = field.physical_limits
+    ranges = ET.SubElement(kind, "ValidRangeSet")
+    ET.SubElement(ranges, "ValidRange", {"minInclusive": number(low), "maxInclusive": number(high)})
+
+
+def _unit(kind: ET.Element, field: Field) -> None:
+    units = ET.SubElement(kind, "UnitSet")
+    if field.unit:
+        ET.SubElement(units, "Unit").text = field.unit
+
+
+def _initial(field: Field) -> str:
+    if isinstance(field.default, bool):
+        return str(field.default)
+    return str(field.default)
+
+
+def _bits(field: Field) -> int:
+    return field.width or 8 * field.size
+
+
+def _signed(field: Field) -> bool:
+    return not field.width and field.type.startswith("i")
+
+
+def _short(doc: str) -> dict[str, str]:
+    return {"shortDescription": doc} if doc else {}
+
+
+def _name(row: Row, field: Field, index: int) -> str:
+    """Name of a field that is its own in the whole definition."""
+    return f"{row.name}_{field.name or f'unused_{index}'}"
+
+
+def _identifier(text: str) -> str:
+    """Text as an XTCE name: no dots, slashes, colons or spaces."""
+    return "".join("_" if character in ".:/ " else character for character in text)
