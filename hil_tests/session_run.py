@@ -91,6 +91,8 @@ def run_session(request: SessionRequest) -> SessionResult:
             state = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-session-")))
             emulator = _emulator(request, script, options, folder, state)
         bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+        for link in bench.links:
+            bench.client(link)  # a port that cannot be had is refused before the first step
         result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
     if request.junit is not None:
         try:

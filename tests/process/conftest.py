@@ -1,0 +1,48 @@
+"""Emulators that run as processes of their own, for the tests of this folder."""
+
+from __future__ import annotations
+
+import pytest
+
+from hil_tests.client import ObcClient
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.own_hub import OwnBus
+
+FAST_BAUD = 921600
+
+
+@pytest.fixture(scope="module")
+def bus():
+    """A CAN bus of the module's own: vcan0 or a hub."""
+    with OwnBus() as channel:
+        yield channel
+
+
+@pytest.fixture(scope="module")
+def emulator(bus, tmp_path_factory):
+    """An emulator on a pty at 921600 baud and on the bus."""
+    folder = tmp_path_factory.mktemp("emulator")
+    command = emulator_command(
+        serial="auto",
+        can=bus,
+        seed=1,
+        settings=[f"links.serial.baud={FAST_BAUD}"],
+        state_dir=folder / "state",
+        truth_log=folder / "truth.csv",
+    )
+    with EmulatorProcess(command) as process:
+        yield process
+
+
+@pytest.fixture
+def serial_obc(emulator):
+    """An OBC on the serial line."""
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as client:
+        yield client
+
+
+@pytest.fixture
+def can_obc(emulator):
+    """An OBC on the CAN bus."""
+    with ObcClient.open(can=emulator.ready["can"], timeout_s=5.0) as client:
+        yield client

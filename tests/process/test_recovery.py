@@ -1,0 +1,180 @@
+"""What a bench does to a unit: power cut, peers that do not read, buses that vanish, two masters, half messages."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import time
+import tty
+
+import pytest
+
+from hil_tests.client import ObcClient
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.errors import DeviceError
+from hil_tests.own_hub import OwnHub
+from protocol.can_framing import CanFrame
+from tests.process.conftest import FAST_BAUD
+from tests.process.reference import frame_request
+
+pytestmark = pytest.mark.process
+
+MEMORY_LIMIT = 500e6
+PATIENCE_S = 20.0
+
+
+def wait_until(condition, within_s: float = PATIENCE_S) -> None:
+    deadline = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about in time"
+        time.sleep(0.05)
+
+
+def answers(client: ObcClient) -> bool:
+    try:
+        return client.telemetry("identification", timeout_s=0.5)["interface_version"] == 1
+    except DeviceError:
+        return False
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Make emulators with a parameter store that lasts over the test."""
+    processes = []
+
+    def _make(**options) -> EmulatorProcess:
+        process = EmulatorProcess(emulator_command(seed=1, state_dir=tmp_path / "state", **options))
+        processes.append(process)
+        return process.start()
+
+    yield _make
+    for process in processes:
+        process.kill()
+
+
+def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp_path):
+    rng = random.Random(5)
+    emulator = own(settings=["device.boot_s=0"])
+    boots = 0
+    allowed = {100}
+    for turn in range(4):
+        with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
+            found = obc.get_parameter("exposure")
+            assert found in allowed, f"after cut {turn}"
+            count = obc.telemetry("boot_status")["boot_count"]
+            assert count == boots + 1
+            boots = count
+            for value in range(1000 + 100 * turn, 1000 + 100 * turn + rng.randrange(1, 12)):
+                allowed = {found, value}
+                obc.set_parameter("exposure", value)
+                obc.command("save_parameters")
+                found = value
+            # the last command is acknowledged before the disk is; the cut comes in between or after
+            time.sleep(rng.random() * 0.01)
+            allowed = {value, value - 1, *allowed}
+        emulator.restart(signal.SIGKILL)
+    emulator.stop()
+    files = sorted(path for path in (tmp_path / "state").iterdir() if path.is_file())
+    assert files
+    for path in files:
+        if path.suffix == ".json":
+            json.loads(path.read_text())
+
+
+def test_a_serial_peer_that_never_reads_does_not_stop_the_device(emulator, can_obc):
+    port = os.open(emulator.ready["serial"], os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        tty.setraw(port)
+        sent = 0
+        for _ in range(400):
+            try:
+                sent += os.write(port, frame_request(211))
+            except BlockingIOError:
+                time.sleep(0.01)
+            assert can_obc.telemetry("identification")["interface_version"] == 1
+        assert sent > 400
+    finally:
+        os.close(port)
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=1.0) as obc:
+        wait_until(lambda: answers(obc))
+        assert len(obc.telemetry("star_tracker")) > 20
+
+
+def test_half_a_message_is_given_up_and_the_next_one_is_answered(serial_obc, can_obc):
+    serial_obc.command("clear_counters")
+    serial_obc.run(_send(serial_obc, frame_request(2, bytes(6))[:5]))
+    can_obc.run(_send(can_obc, CanFrame(0x07250104, bytes(7) + b"\x07")))
+    wait_until(lambda: can_obc.telemetry("communication_status")["can_telecommand_error"])
+    status = serial_obc.telemetry("communication_status")
+    assert status["uart_incomplete"]
+    assert not status["uart_protocol_error"]
+
+
+async def _send(client: ObcClient, item) -> None:
+    client.core.link.send(item)
+
+
+def test_two_masters_on_one_bus_get_their_own_replies(emulator):
+    channel = emulator.ready["can"]
+    with (
+        ObcClient.open(can=channel, host_address=1) as first,
+        ObcClient.open(can=channel, host_address=77) as second,
+    ):
+        assert answers(first)
+        assert answers(second)
+        running = [client.core.read("star_tracker") for client in (first, second) for _ in range(50)]
+        readings = [
+            client.run(coroutine)
+            for client, coroutine in zip([first] * 50 + [second] * 50, running, strict=True)
+        ]
+        assert len(readings) == 100
+        assert first.stray_replies == second.stray_replies == []
+        assert first.faults == second.faults == []
+
+
+def test_the_device_comes_back_by_itself_when_the_hub_does(own):
+    with OwnHub() as hub:
+        emulator = own(serial="off", can=hub.channel)
+        port = hub.port
+        with ObcClient.open(can=hub.channel, timeout_s=0.5) as obc:
+            assert answers(obc)
+            hub.stop()
+            assert not answers(obc)
+            hub.start(port)
+            wait_until(lambda: answers(obc))
+        assert emulator.running
+        emulator.stop()
+
+
+def test_memory_stays_below_its_limit_while_frames_are_solved(emulator, can_obc):
+    can_obc.set_parameter("update_rate", 5.0)
+    can_obc.command("set_mode", mode="lost_in_space")
+    can_obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=PATIENCE_S)
+    first = can_obc.telemetry("device_status")["frames_captured"]
+    can_obc.wait_for(
+        "device_status", lambda reading: reading["frames_captured"] >= first + 15, within_s=PATIENCE_S
+    )
+    assert emulator.memory_bytes() < MEMORY_LIMIT
+    can_obc.command("set_mode", mode="standby")
+
+
+def test_sigterm_ends_it_in_good_order_and_gives_the_pty_back(own, tmp_path):
+    link = tmp_path / "port"
+    emulator = own(can="off", extra=["--symlink", str(link)])
+    assert link.is_symlink()
+    with ObcClient.open(serial=str(link)) as obc:
+        assert answers(obc)
+    emulator.stop()
+    assert not link.is_symlink()
+
+
+def test_a_port_that_another_program_holds_is_refused(emulator, own):
+    taken = emulator.ready["serial"]
+    with ObcClient.open(serial=taken) as obc:
+        assert answers(obc)
+        baud = [f"links.serial.baud={FAST_BAUD}"]
+        with pytest.raises(Exception, match="status 2") as caught:
+            own(serial="/dev/no-such-tty", can="off", settings=baud)
+        assert "/dev/no-such-tty" in str(caught.value)

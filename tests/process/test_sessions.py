@@ -1,0 +1,82 @@
+"""The sessions that come along, each against an emulator process of its own, as a user would run them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from hil_tests.emulator_process import STARHIL
+from protocol.candump import read_candump
+
+pytestmark = pytest.mark.process
+
+TIME_OUT_S = 120
+
+
+def starhil(*words: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-c", STARHIL, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=TIME_OUT_S, check=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "links"),
+    [
+        ("first_light", ["--serial", "auto"]),
+        ("first_light", ["--can", "auto"]),
+        ("slew_tracking", ["--can", "auto"]),
+        ("image_download", ["--serial", "auto"]),
+        ("parameters", ["--serial", "auto"]),
+        ("errors", ["--serial", "auto", "--can", "auto"]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "-".join(word[2:] for word in value[::2]),
+)
+def test_a_session_passes(name, links, tmp_path):
+    junit = tmp_path / "junit.xml"
+    done = starhil("session", name, "--start", *links, "--log", tmp_path, "--junit", junit, "--json")
+    assert done.stderr == ""
+    result = json.loads(done.stdout)
+    failed = [(item["step"], item["detail"]) for item in result["results"] if item["status"] == "failed"]
+    assert (done.returncode, failed) == (0, [])
+    assert int(ET.parse(junit).getroot().get("tests")) == result["steps"]
+    if "--serial" in links:
+        assert " TX 1F 7F " in (tmp_path / "serial.log").read_text()
+    if "--can" in links:
+        assert sum(1 for _ in read_candump(tmp_path / "can.log")) > result["steps"]
+
+
+def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(tmp_path):
+    script = tmp_path / "wrong.toml"
+    script.write_text("[[step]]\nread = 'identification'\nexpect = { interface_version = 99 }\n")
+    done = starhil("session", script, "--start", "--log", tmp_path)
+    assert done.returncode == 1
+    assert "interface_version is 1, expected 99" in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "message"),
+    [
+        (
+            "[[step]]\nread = 'quaternoin'\n",
+            ["--start"],
+            "wrong.toml: step 1: unknown telemetry row 'quaternoin'",
+        ),
+        ("[[step]]\nwait_s = 0\n", ["--serial", "/dev/no-such-port"], "/dev/no-such-port"),
+        ("[[step]]\nwait_s = 0\n", ["--can", "socketcand:127.0.0.1:1/vcan0"], "cannot connect"),
+        ("[[step]]\nwait_s = 0\n", ["--start", "--profile", "no_such_profile"], "no_such_profile"),
+        ("[emulator]\nset = ['camera.widht=5']\n[[step]]\nwait_s = 0\n", ["--start"], "widht"),
+    ],
+    ids=["unknown telemetry", "no port", "no hub", "no profile", "wrong key"],
+)
+def test_bad_input_ends_with_one_line_and_status_2(text, words, message, tmp_path):
+    script = tmp_path / "wrong.toml"
+    script.write_text(text)
+    done = starhil("session", script, *words, "--log", tmp_path / "log")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.stderr.startswith("starhil: ")
