@@ -1,0 +1,70 @@
+"""What false-star filters share: two frames of objects in, which objects are true stars and which belong together out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+
+
+class FilterError(StaridError):
+    """Frames that a false-star filter cannot work on."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedFrame:
+    """The objects of one frame as they were measured.
+
+    Attributes
+    ----------
+    brightness
+        Magnitudes, (n,).
+    positions
+        Offsets from the frame's centre, (n, 2), degrees.
+    """
+
+    brightness: NDArray[np.float64]
+    positions: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.brightness.ndim != 1 or self.positions.shape != (self.brightness.size, 2):
+            raise FilterError(
+                f"frame: {self.brightness.shape} brightness values for positions {self.positions.shape}; "
+                "give (n,) and (n, 2)"
+            )
+        if not (np.isfinite(self.brightness).all() and np.isfinite(self.positions).all()):
+            raise FilterError(
+                "frame: an object's brightness or position is not finite; drop such objects first"
+            )
+
+    def __len__(self) -> int:
+        return int(self.brightness.size)
+
+
+@dataclass(frozen=True, eq=False)
+class FilterResult:
+    """Which objects are true stars.
+
+    Attributes
+    ----------
+    true_before, true_now
+        For each object of the earlier and of the later frame whether it is taken for a true star.
+    matches
+        Pairs of objects (earlier, later) that are the same star, (m, 2).
+    """
+
+    true_before: NDArray[np.bool_]
+    true_now: NDArray[np.bool_]
+    matches: NDArray[np.int64]
+
+
+class FalseStarFilter(Protocol):
+    """What tells true stars from false ones in two successive frames."""
+
+    def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
+        """Compare two successive frames; with nothing to go by every object is taken for a false star."""
+        ...
