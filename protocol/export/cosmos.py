@@ -1,6 +1,7 @@
 """The interface definition as command and telemetry text of OpenC3 COSMOS.
 
 A packet is the identifier byte followed by the row's data, as the serial framing carries it between start and end.
+COSMOS cuts off the fraction of a raw value that it computes, so a scaled parameter may go out one step too small.
 """
 
 from __future__ import annotations

@@ -1,0 +1,391 @@
+"""Exports of the interface definition, each read back by somebody else's reader on the same packets as our codec."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
+from protocol.codec import Field, Row
+from protocol.errors import ProtocolError
+from protocol.export import FORMATS, export
+from protocol.icd import load_icd
+from protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from protocol.values import Value, to_f32
+
+ICD = load_icd()
+TELEMETRY = [row for row in ICD.rows if row.kind == "telemetry"]
+TELECOMMANDS = [row for row in ICD.rows if row.kind == "telecommand"]
+OBC, DEVICE = 1, 4
+
+
+def by_name(row: Row) -> str:
+    return row.name
+
+
+def packets(row: Row) -> Iterator[tuple[dict[str, Value], bytes]]:
+    """Values that differ from field to field, with the bytes that our codec makes of them."""
+    for turn in range(4):
+        values = {
+            name: _value(field, number, turn) for number, (name, field) in enumerate(row.named_fields.items())
+        }
+        yield values, row.encode(values)
+
+
+def _value(field: Field, number: int, turn: int) -> Value:
+    match field.kind:
+        case "flag":
+            return bool((number + turn) % 2)
+        case "enum":
+            assert field.enum is not None
+            return list(field.enum.values)[(number + turn) % len(field.enum.values)]
+        case "bytes":
+            return bytes((17 * index + 31 * turn) % 256 for index in range(field.size))
+        case "float":
+            low, high = field.physical_limits
+            value = min(max((-1.5 + turn) * (number + 1) * 1.25, low), high)
+            return to_f32(value) if field.slot.type == "f32" else value
+        case _:
+            low, high = field.raw_limits
+            return field.to_physical(low + (high - low) * (turn + 1) // (5 + number % 3))
+
+
+def same(theirs: object, ours: Value) -> bool:
+    if isinstance(ours, float):
+        return isinstance(theirs, (int, float)) and math.isclose(theirs, ours, rel_tol=1e-9, abs_tol=1e-9)
+    return theirs == ours
+
+
+@cache
+def text(name: str) -> str:
+    return export(ICD, name)
+
+
+@cache
+def on_disk(name: str, folder: Path) -> Path:
+    file = folder / f"icd.{name}"
+    file.write_text(text(name), encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("icd")
+
+
+# -- DBC ---------------------------------------------------------------------------------------------------------------
+
+
+def _dbc_signals(row: Row, values: dict[str, Value]) -> dict[str, Value]:
+    signals: dict[str, Value] = {}
+    for name, field in row.named_fields.items():
+        value = values[name]
+        if isinstance(value, bytes):
+            signals |= {f"{name}_{index}": byte for index, byte in enumerate(value)}
+        else:
+            signals[name] = int(value) if field.kind == "flag" else value
+    return signals
+
+
+@cache
+def _cantools() -> Any:
+    cantools = pytest.importorskip("cantools", reason="cantools reads the DBC; install the extra `test`")
+    return cantools.database.load_string(text("dbc"), database_format="dbc", strict=True)
+
+
+def _joined(frames: list[Any]) -> bytes:
+    return frames[0].data if len(frames) == 1 else b"".join(frame.data[:-1] for frame in frames)
+
+
+@pytest.mark.parametrize("row", [*TELECOMMANDS, *TELEMETRY], ids=by_name)
+def test_cantools_reads_what_our_frames_carry(row: Row) -> None:
+    database = _cantools()
+    for values, data in packets(row):
+        if row.kind == "telemetry":
+            frames = encode_reply_frames(Reply(ReplyKind.TELEMETRY, row.id, data, destination=OBC), DEVICE)
+        else:
+            frames = encode_request_frames(Request.of(row.id, data), OBC, DEVICE)
+        message = database.get_message_by_frame_id(frames[0].id)
+        assert message.name == f"{'TLM' if row.kind == 'telemetry' else 'TC'}_{row.name}"
+        assert (message.length, message.is_extended_frame) == (row.size, True)
+        read = message.decode(_joined(frames), decode_choices=True) if row.size else {}
+        expected = _dbc_signals(row, values)
+        assert read.keys() == expected.keys()
+        for name, value in expected.items():
+            assert same(str(read[name]) if isinstance(value, str) else read[name], value), name
+
+
+def test_cantools_makes_commands_that_our_device_accepts() -> None:
+    database = _cantools()
+    for row in TELECOMMANDS:
+        for values, data in packets(row):
+            message = database.get_message_by_name(f"TC_{row.name}")
+            theirs = message.encode(_dbc_signals(row, values), strict=False) if row.size else b""
+            assert theirs == data, row.name
+
+
+def test_cantools_names_every_frame_of_a_dialogue() -> None:
+    database = _cantools()
+    request = Request.of(230)
+    dialogue = [
+        (encode_request_frames(request, OBC, DEVICE), "REQ_quaternion"),
+        (
+            encode_reply_frames(Reply(ReplyKind.NACK, 230, code=ErrorCode.BUSY, destination=OBC), DEVICE),
+            "NACK_quaternion",
+        ),
+        (encode_request_frames(Request.of(1, b"\x5a"), OBC, DEVICE), "TC_reset"),
+        (encode_reply_frames(Reply(ReplyKind.ACK, 1, destination=OBC), DEVICE), "ACK_reset"),
+        (
+            encode_reply_frames(Reply(ReplyKind.NACK, 1, code=ErrorCode.CRC, destination=OBC), DEVICE),
+            "NACK_reset",
+        ),
+    ]
+    for frames, name in dialogue:
+        message = database.get_message_by_frame_id(frames[0].id)
+        assert message.name == name
+        if name.startswith("NACK"):
+            assert str(message.decode(frames[0].data)["error"]) in ("busy", "crc")
+    assert CanDeviceReceiver(DEVICE).feed(dialogue[0][0][0], 0.0) == [Request.of(230, b"", OBC)]
+
+
+def test_canmatrix_reads_the_same_layout(folder: Path) -> None:
+    formats = pytest.importorskip(
+        "canmatrix.formats", reason="canmatrix reads the DBC; install the extra `test`"
+    )
+    matrix = formats.loadp_flat(str(on_disk("dbc", folder)))
+    for row in TELEMETRY:
+        frame = matrix.frame_by_name(f"TLM_{row.name}")
+        assert frame is not None
+        assert frame.size == row.size
+        assert frame.arbitration_id.extended
+        for name, field in row.named_fields.items():
+            if field.slot.type == "bytes":
+                continue
+            signal = frame.signal_by_name(name)
+            assert signal.get_startbit() == 8 * field.offset + field.shift, name
+            assert signal.size == (field.width or 8 * field.size)
+            assert signal.is_float == (field.kind == "float")
+            assert float(signal.factor) == pytest.approx(field.scale)
+            assert float(signal.offset) == pytest.approx(field.bias)
+            assert (signal.unit or "") == field.unit
+            if field.enum is not None:
+                assert {int(value): str(label) for value, label in signal.values.items()} == dict(
+                    field.enum.names
+                )
+
+
+# -- XTCE --------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _xtce(file: Path) -> Any:
+    definitions = pytest.importorskip(
+        "space_packet_parser.xtce.definitions",
+        reason="space_packet_parser reads the XTCE; install the extra `test`",
+    )
+    return definitions.XtcePacketDefinition.from_xtce(file, root_container_name="Packet")
+
+
+def test_the_xtce_is_valid_against_the_published_schema(folder: Path) -> None:
+    validation = pytest.importorskip(
+        "space_packet_parser.xtce.validation",
+        reason="space_packet_parser brings the schema; install the extra `test`",
+    )
+    schema = Path(validation.__file__).parent / "schemas" / "SpaceSystem.xsd"
+    result = validation.validate_xtce(
+        on_disk("xtce", folder),
+        local_xsd=schema,
+        print_results=False,
+        raise_on_error=False,
+        allow_schema_download=False,
+    )
+    assert [str(error) for error in result.errors] == []
+    assert result.valid
+
+
+@pytest.mark.parametrize("row", TELEMETRY, ids=by_name)
+def test_an_xtce_reader_reads_our_telemetry(row: Row, folder: Path) -> None:
+    definition = _xtce(on_disk("xtce", folder))
+    for values, data in packets(row):
+        packet = definition.parse_bytes(bytes((row.id,)) + data)
+        assert int(packet["identifier"]) == row.id
+        for name, value in values.items():
+            read = packet[f"{row.name}_{name}"]
+            theirs = bool(read) if isinstance(value, bool) else str(read) if isinstance(value, str) else read
+            assert same(bytes(theirs) if isinstance(value, bytes) else theirs, value), name
+
+
+# -- EDS ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_eds_is_read_by_canopen_and_passes_the_checker(folder: Path) -> None:
+    canopen = pytest.importorskip("canopen")
+    file = on_disk("eds", folder)
+    dictionary = canopen.import_od(str(file), node_id=5)
+    names = {item.name for item in dictionary.values()}
+    assert "Parameters" in names or any("arameter" in name for name in names)
+    assert dictionary[0x1018][1] is not None
+    checker = Path(sys.executable).with_name("dcfchk")
+    if not checker.exists():
+        pytest.skip("dcfchk of dcf-tools is not installed; it checks the EDS")
+    result = subprocess.run([checker, "-n", "5", file], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr.strip(), result.stdout.strip()) == (0, "", "")
+
+
+# -- COSMOS ------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _cosmos(file: Path) -> Any:
+    config = pytest.importorskip(
+        "openc3.packets.packet_config", reason="openc3 reads the COSMOS text; it is not installed"
+    )
+    definition = config.PacketConfig()
+    definition.process_file(str(file), "STARHIL")
+    assert definition.warnings == []
+    return definition
+
+
+def test_cosmos_reads_our_telemetry(folder: Path) -> None:
+    definition = _cosmos(on_disk("cosmos", folder))
+    for row in TELEMETRY:
+        packet = definition.telemetry["STARHIL"][row.name.upper()]
+        assert packet.defined_length == 1 + row.size
+        for values, data in packets(row):
+            packet.buffer = bytes((row.id,)) + data
+            assert packet.identify(packet.buffer)
+            for name, value in values.items():
+                read = packet.read(name.upper(), "CONVERTED")
+                expected = str(value).upper() if isinstance(value, (bool, str)) else value
+                assert same(bytes(read) if isinstance(value, bytes) else read, expected), f"{row.name}.{name}"
+
+
+def test_cosmos_makes_our_telecommands(folder: Path) -> None:
+    definition = _cosmos(on_disk("cosmos", folder))
+    for row in TELECOMMANDS:
+        packet = definition.commands["STARHIL"][row.name.upper()]
+        for values, data in packets(row):
+            packet.restore_defaults()
+            for name, value in values.items():
+                packet.write(name.upper(), str(value).upper() if isinstance(value, (bool, str)) else value)
+            theirs = bytes(packet.buffer)
+            assert theirs[0] == row.id
+            scaled = [field for field in row.named_fields.values() if field.scaled]
+            if not scaled:
+                assert theirs[1:] == data, row.name
+            read = row.decode(theirs[1:])
+            for field in scaled:  # COSMOS cuts fractions of the raw value off
+                assert read[field.name] == pytest.approx(values[field.name], abs=1.001 * field.scale), (
+                    field.name
+                )
+            assert row.encode({**values, **{field.name: read[field.name] for field in scaled}}) == theirs[1:]
+
+
+def test_the_cosmos_text_has_every_row_once_and_no_overlap() -> None:
+    seen: dict[str, list[tuple[int, int]]] = {}
+    current = ""
+    for line in text("cosmos").splitlines():
+        if match := re.match(r"(?:COMMAND|TELEMETRY) STARHIL (\w+) ", line):
+            current = match[1].lower()
+            assert current not in seen
+            seen[current] = []
+        elif match := re.match(r"  (?:PARAMETER|ITEM) (\w+) (\d+) (\d+) ", line):
+            seen[current].append((int(match[2]), int(match[3])))
+    assert seen.keys() == {row.name for row in ICD.rows}
+    for row in ICD.rows:
+        places = sorted(seen[row.name])
+        assert sum(size for _, size in places) == 8 * row.size
+        assert all(a + size == b for (a, size), (b, _) in pairwise(places))
+
+
+# -- for people --------------------------------------------------------------------------------------------------------
+
+
+class _Page(HTMLParser):
+    """Checks that tags close, and collects links, targets and cells."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.links: set[str] = set()
+        self.targets: set[str] = set()
+        self.rows: list[int] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "!doctype"):
+            self.open.append(tag)
+        about = dict(attrs)
+        self.links.add((about.get("href") or "").removeprefix("#"))
+        self.targets.add(about.get("id") or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_its_links_lead_somewhere() -> None:
+    page = _Page()
+    page.feed(text("html"))
+    assert page.open == []
+    assert page.links <= page.targets
+    assert {f"row-{row.id}" for row in ICD.rows} <= page.targets
+
+
+def test_markdown_tables_have_even_columns_and_every_field() -> None:
+    lines = text("markdown").splitlines()
+    width = 0
+    for line in lines:
+        if line.startswith("|"):
+            columns = len(re.findall(r"(?<!\\)\|", line)) - 1
+            assert width in (0, columns), line
+            width = columns
+        else:
+            width = 0
+    for row in ICD.rows:
+        start = lines.index(f"### {row.id} (0x{row.id:02X}) {row.name}")
+        section = "\n".join(lines[start : start + 100]).split("\n###")[0]
+        for name, field in row.named_fields.items():
+            assert f"| {name} |" in section
+            assert f"| {field.provenance} |" in section
+
+
+@pytest.mark.parametrize("name", ["markdown", "html"])
+def test_texts_for_people_tell_parameters_and_enumerations(name: str) -> None:
+    for word in (*ICD.parameters, *ICD.enums):
+        assert word in text(name)
+
+
+# -- all ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_same_definition_gives_the_same_text(name: str) -> None:
+    assert export(ICD, name) == text(name)
+
+
+def test_an_unknown_format_is_told() -> None:
+    with pytest.raises(ProtocolError, match="no export format 'pdf'; choose one of markdown"):
+        export(ICD, "pdf")
+
+
+def test_a_changed_row_changes_every_export(tmp_path: Path) -> None:
+    from protocol.icd import default_icd_path
+
+    for file in default_icd_path().glob("*.toml"):
+        (tmp_path / file.name).write_text(
+            file.read_text().replace('name = "sample_period"', 'name = "frame_interval"')
+        )
+    changed = load_icd(tmp_path)
+    for name in FORMATS:
+        if name != "eds":  # the object dictionary places rows of the definition by its own file
+            assert "frame_interval" in export(changed, name).lower()
+            assert "sample_period" not in export(changed, name).lower()
