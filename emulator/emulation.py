@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emulator.clock import Clock, SteppedClock, make_clock
+from emulator.control import ControlServer
 from emulator.cycle import Measurement
 from emulator.device import Background, Device, do_at_once
 from emulator.errors import EmulatorError
+from emulator.faults import Faults
 from emulator.frames import PipelineSetup, Warm
 from emulator.imager import ProcessImager, ThreadImager
 from emulator.links.can import CanLink
@@ -89,6 +91,9 @@ class Emulation:
         self._closers: list[Callable[[], object]] = []
         self._pump: ClockPump | None = None
         self.stepper: StepPump | None = None
+        self.faults = Faults(self)
+        self.control: ControlServer | None = None
+        self.ended = asyncio.Event()
         self._warming: asyncio.Task[None] | None = None
         self._awake = asyncio.Event()
         self._closing = False
@@ -141,6 +146,9 @@ class Emulation:
         else:
             self._pump = ClockPump(device.scheduler, self.clock)
             self._pump.start()
+        if self.options.control != "off":
+            self.control = ControlServer(self, self.ended.set)
+            self.ready_words["control"] = await self.control.start(self.options.control)
         self._warming = asyncio.create_task(self._warm_up())
 
     def _open_store(self) -> StateStore:
@@ -256,6 +264,8 @@ class Emulation:
         for link in (self.serial, self.can):
             if link is not None:
                 await link.close()
+        if self.control is not None:
+            self.control.close()
         if self.feed is not None:
             self.feed.close()
         await self.imager.close()

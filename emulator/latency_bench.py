@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +118,7 @@ class HubProbe:
     def ask(self, name: str) -> float | None:
         """Ask for a row; return the time to the last frame of the reply in seconds, or None if none came."""
         row = load_icd().telemetry[name]
-        frames = 1 if row.size <= 8 else -(-row.size // 7)  # noqa: PLR2004 (a frame carries 8 bytes, a segment 7)
+        frames = 1 if row.size <= 8 else -(-row.size // 7)  # a frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
         for frame in encode_request_frames(Request.of(row.id), 1, 4):
             self._socket.sendall(_socketcand(frame))
@@ -253,7 +253,7 @@ def measure(
 
 
 def _measure_links(
-    probes: dict[str, Callable[[str], float | None]],
+    probes: Mapping[str, Callable[[str], float | None]],
     worker: str,
     rate: float,
     seconds: float,

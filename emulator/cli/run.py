@@ -68,15 +68,14 @@ def command(
     async def run() -> None:
         import signal
 
-        ended = asyncio.Event()
+        emulation = Emulation(loaded, RunOptions(truth_log, control), worker=worker)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, ended.set)
-        emulation = Emulation(loaded, RunOptions(truth_log, control), worker=worker)
+            loop.add_signal_handler(number, emulation.ended.set)
         try:
             await emulation.start()
             line = asyncio.create_task(emulation.ready())
-            stop = asyncio.create_task(ended.wait())
+            stop = asyncio.create_task(emulation.ended.wait())
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
                 print(line.result(), flush=True)

@@ -1,0 +1,133 @@
+"""Fault injection at three levels: what the sensor sees, what the device does, what the wires carry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
+
+from emulator.errors import EmulatorError
+from emulator.links.wire_faults import WireFaultSettings
+from emulator.truth_config import Strict
+
+if TYPE_CHECKING:
+    from emulator.emulation import Emulation
+
+Chance = Annotated[float, Field(ge=0.0, le=1.0)]
+Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
+
+
+class OpticalFault(Strict):
+    """What goes wrong in what the sensor sees."""
+
+    false_stars: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Bright points that are no stars, at other places in every frame."""
+    missing_stars: Annotated[int, Field(ge=0, le=1000)] = 0
+    """So many of the brightest stars in the field are not seen."""
+    blocked_share: Chance = 0.0
+    """Share of the field that is covered."""
+
+
+class DeviceFault(Strict):
+    """What goes wrong in the device."""
+
+    stuck: bool = False
+    """Requests are neither taken nor answered; frames go on."""
+    error: str | None = None
+    """Enter the error mode for this cause, a name of the enumeration `device_error`."""
+    reset: str | None = None
+    """Restart now for this cause, a name of the enumeration `reset_cause`."""
+
+
+class WireFault(Strict):
+    """What goes wrong on a wire; see `WireFaultSettings`."""
+
+    drop: Chance = 0.0
+    corrupt: Chance = 0.0
+    junk: Chance = 0.0
+    delay_s: Seconds = 0.0
+    split: Annotated[int, Field(ge=0, le=4096)] = 0
+    gap_s: Seconds = 0.02
+
+    def settings(self) -> WireFaultSettings:
+        """Make the settings of a link."""
+        return WireFaultSettings(**self.model_dump())
+
+
+class FaultRequest(Strict):
+    """One `fault` request; what is not given stays as it is."""
+
+    optical: OpticalFault | None = None
+    device: DeviceFault | None = None
+    serial: WireFault | None = None
+    can: WireFault | None = None
+
+
+class Faults:
+    """What is wrong with a run at present."""
+
+    def __init__(self, emulation: Emulation) -> None:
+        self._emulation = emulation
+        self._optical: dict[str, Any] = {}
+
+    def inject(self, request: FaultRequest) -> None:
+        """Bring faults about; all of the request, or nothing of it.
+
+        Raises
+        ------
+        EmulatorError
+            A name is not known, or a link is not there.
+        """
+        self._check(request)
+        device = self._emulation.device
+        if request.optical is not None:
+            self._optical = request.optical.model_dump(exclude_defaults=True)
+            device.cycle.faults = lambda _index: self._optical
+        if request.serial is not None and self._emulation.serial is not None:
+            self._emulation.serial.wire.settings = request.serial.settings()
+        if request.can is not None and self._emulation.can is not None:
+            self._emulation.can.wire.settings = request.can.settings()
+        if request.device is not None:
+            device.deaf = request.device.stuck
+            if request.device.reset is not None:
+                device.reset(request.device.reset)
+            if request.device.error is not None:
+                device.modes.fail(request.device.error)
+
+    def _check(self, request: FaultRequest) -> None:
+        enums = self._emulation.device.icd.enums
+        if request.device is not None:
+            for key, name, enum in (
+                ("error", request.device.error, enums["device_error"]),
+                ("reset", request.device.reset, enums["reset_cause"]),
+            ):
+                if name is not None and name not in enum.values:
+                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(enum.values)}")
+        for name, fault, link in (
+            ("serial", request.serial, self._emulation.serial),
+            ("can", request.can, self._emulation.can),
+        ):
+            if fault is not None and link is None:
+                raise EmulatorError(f"{name}: this run has no such link")
+
+    def clear(self) -> None:
+        """Set everything right; the error mode is left by telecommand."""
+        self._optical = {}
+        device = self._emulation.device
+        device.cycle.faults = lambda _index: {}
+        device.deaf = False
+        for link in (self._emulation.serial, self._emulation.can):
+            if link is not None:
+                link.wire.settings = WireFaultSettings()
+
+    def describe(self) -> dict[str, Any]:
+        """Return what is wrong, by level."""
+        found: dict[str, Any] = {}
+        if self._optical:
+            found["optical"] = dict(self._optical)
+        if self._emulation.device.deaf:
+            found["device"] = {"stuck": True}
+        for name, link in (("serial", self._emulation.serial), ("can", self._emulation.can)):
+            if link is not None and not link.wire.settings.none:
+                found[name] = vars(link.wire.settings)
+        return found
