@@ -64,6 +64,8 @@ class DeviceDictionary(Dictionary):
     ----------
     sources
         Telemetry row → keys of the entries that show it.
+    parameters
+        Parameter → key of its entry.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class DeviceDictionary(Dictionary):
         self.layout = layout
         self.application: Application = StandInApplication(icd)
         self.sources: dict[str, set[Key]] = {}
+        self.parameters: dict[str, Key] = {}
         self._readers: dict[Key, Callable[[], bytes]] = {}
         self._writers: dict[Key, Writer] = {}
         self._sizes: dict[Key, int] = {}
@@ -192,6 +195,7 @@ class DeviceDictionary(Dictionary):
             if parameter.enum is not None:
                 member.value_descriptions = dict(parameter.enum.names)
             self._names[f"{placed.index:04x}.{parameter.name}"] = key
+            self.parameters[parameter.name] = key
             self._readers[key] = partial(self._read_parameter, parameter, data_type)
             self._writers[key] = partial(self._write_parameter, parameter, data_type)
             members.append(member)

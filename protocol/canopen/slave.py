@@ -88,6 +88,8 @@ class CanopenSlave:
         self.time = TimeConsumer(context)
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
         self.pdos = PdoService(context, self.emergency)
+        self.on_reset: Callable[[], int | None] | None = None
+        """Resets the application when NMT resets the node; the node-ID that it returns holds, unless LSS stored one."""
         self._clock_offset_us = 0
         self._silence: tuple[float, float] | None = None
         self._pending_bit_rate = bit_rate
@@ -181,10 +183,14 @@ class CanopenSlave:
         self.emergency.clear_error(code, key=key)
         return self._finish()
 
-    def reset_node(self, now: float) -> list[CanFrame]:
-        """Restart as after NMT "reset node", on the application's own wish."""
+    def reset_node(self, now: float, node_id: int | None = None) -> list[CanFrame]:
+        """Restart as after NMT "reset node", on the application's own wish and without its event.
+
+        A `node_id` that is given holds from here on, unless LSS has stored one.
+        """
         self._begin(now)
-        self._reset(application=True)
+        self._prepare_node_id(node_id)
+        self._initialise(application=True)
         return self._finish()
 
     def take_events(self) -> list[SlaveEvent]:
@@ -348,7 +354,13 @@ class CanopenSlave:
     def _reset(self, *, application: bool) -> None:
         kind = EventKind.RESET_NODE if application else EventKind.RESET_COMMUNICATION
         self._context.report(kind)
+        if application and self.on_reset is not None:
+            self._prepare_node_id(self.on_reset())
         self._initialise(application=application)
+
+    def _prepare_node_id(self, node_id: int | None) -> None:
+        if node_id is not None and self.store.load_lss() is None:
+            self.lss.pending_node_id = node_id
 
     def _initialise(self, *, application: bool) -> None:
         """Pass through INITIALISING: parameters at their stored values, boot-up message, PRE-OPERATIONAL."""

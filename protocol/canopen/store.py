@@ -72,6 +72,10 @@ class ParameterStore:
         """Keep node-ID and bit rate, bit/s; `StorageError` if they cannot be kept."""
         self._storage.save(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")})
 
+    def clear_lss(self) -> None:
+        """Forget what LSS stored; `StorageError` if that fails."""
+        self._storage.clear(LSS)
+
     def _stored(self, group: str) -> dict[str, bytes]:
         try:
             return self._storage.load(group)
