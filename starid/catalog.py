@@ -12,7 +12,6 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from starid.cache import cached_tables
 from starid.errors import StaridError
@@ -289,9 +288,7 @@ def blend(catalog: StarCatalog, separation_rad: float, band: Band = "v") -> Star
         raise StaridError(f"star catalogue: separation {separation_rad} given, radians ≥ 0 needed")
     leader = np.arange(len(catalog))
     chord = 2.0 * math.sin(0.5 * min(separation_rad, math.pi))
-    if len(catalog) == 0:
-        return catalog
-    pairs = cKDTree(catalog.vectors).query_pairs(chord, output_type="ndarray")
+    pairs = _close_pairs(catalog.vectors, chord)
     if len(pairs) == 0:
         return catalog
     rank = np.empty(len(catalog), dtype=np.intp)
@@ -319,3 +316,24 @@ def blend(catalog: StarCatalog, separation_rad: float, band: Band = "v") -> Star
         catalog.subset(kept), vectors=vectors, ra_rad=ra, dec_rad=dec, hp=magnitudes["hp"], v=magnitudes["v"]
     )
     return merged.subset(np.argsort(merged.v, kind="stable"))
+
+
+def _close_pairs(vectors: NDArray[np.float64], chord: float) -> NDArray[np.intp]:
+    """Pairs of indices (m, 2) of unit vectors not farther apart than a chord.
+
+    The vectors are ordered by z; partners stand within the chord of z, so the order is compared with itself
+    shifted by one, two, … until none is near enough. (A tree would do, but importing one costs half a second.)
+    """
+    order = np.argsort(vectors[:, 2], kind="stable")
+    ordered = vectors[order]
+    x, z = np.ascontiguousarray(ordered[:, 0]), np.ascontiguousarray(ordered[:, 2])
+    found = [np.empty((0, 2), dtype=np.intp)]
+    for shift in range(1, len(order)):
+        near = np.flatnonzero(z[shift:] - z[:-shift] <= chord)
+        if near.size == 0:
+            break
+        near = near[np.abs(x[near + shift] - x[near]) <= chord]
+        gap = ordered[near + shift] - ordered[near]
+        close = near[np.einsum("ij,ij->i", gap, gap) <= chord * chord]
+        found.append(np.column_stack([order[close], order[close + shift]]))
+    return np.concatenate(found)

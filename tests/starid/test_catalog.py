@@ -5,12 +5,14 @@ from __future__ import annotations
 import gzip
 import math
 import pickle
+from functools import cache as cache_once
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from starid import cache, catalog, hipparcos
 from starid.catalog import StarCatalog, blend, load_catalog
@@ -36,9 +38,14 @@ def published(name: str) -> list[tuple[int, np.ndarray, list[str]]]:
     return rows
 
 
+@cache_once
+def sky_of_2000() -> StarCatalog:
+    return load_catalog(epoch=2000.0)
+
+
 @pytest.fixture(scope="module")
 def sky() -> StarCatalog:
-    return load_catalog(epoch=2000.0)
+    return sky_of_2000()
 
 
 @pytest.fixture
@@ -138,7 +145,7 @@ def test_cuts_go_both_ways(sky: StarCatalog) -> None:
 @given(st.floats(0, 360), st.sampled_from([-90.0, -89.9, -30.0, 0.0, 60.0, 90.0]), st.floats(0, 200))
 @settings(deadline=None, derandomize=True, max_examples=60)
 def test_cones_are_those_of_the_angle(ra: float, dec: float, radius: float) -> None:
-    stars = load_catalog(epoch=2000.0).brighter_than(4.0)
+    stars = sky_of_2000().brighter_than(4.0)
     a, d, r = np.radians([ra, dec, radius])
     axis = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
     inside = np.arctan2(np.linalg.norm(np.cross(stars.vectors, axis), axis=1), stars.vectors @ axis) <= r
@@ -194,6 +201,14 @@ def test_blend_leaves_no_close_pair_of_leaders_and_no_light_behind(sky: StarCata
     untouched = merged.subset(merged.index_of(32349)[None])
     np.testing.assert_array_equal(untouched.vectors[0], stars.vectors[0])
     assert blend(sky.subset([]), 1.0).hip.size == 0
+
+
+def test_close_pairs_are_those_of_a_tree(sky: StarCatalog) -> None:
+    vectors = sky.brighter_than(6.0).vectors
+    for chord in (1e-5, 1e-3, 0.05, 2.0):
+        some = vectors if chord < 1.0 else vectors[:60]
+        theirs = {tuple(sorted(pair)) for pair in cKDTree(some).query_pairs(chord)}
+        assert {tuple(sorted(pair)) for pair in catalog._close_pairs(some, chord).tolist()} == theirs
 
 
 def lines_of_the_file(n: int) -> list[bytes]:
