@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -12,16 +13,21 @@ import numpy.typing as npt
 from starid.background import Background, estimate_background
 from starid.centroid import CHI2, FIT_COLUMNS, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
 from starid.errors import StaridError
-from starid.matched_filter import find_peaks, noise_factor, spot_taps
+from starid.matched_filter import find_peaks, find_peaks_in_smooth, noise_factor, spot_taps
 from starid.measurement import AT_EDGE, SATURATED, find_neighbours, measure
 from starid.spot_shape import SpotShape, moments_of, shape_from_moments
+from starid.trail_filter import smooth_along_trails, trail_noise_factor
 from starid.windows import WINDOW_COLUMNS, cut_windows, lay_windows
+
+Grid: TypeAlias = npt.NDArray[np.float32]
 
 LEAST_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
 _MOST_PEAKS: Final = 16384
+_HIGHER: Final = 1.5
 _STARS_FOR_SHAPE: Final = 40
-_SHAPE_WINDOW_PX: Final = 24
+_SHAPE_WINDOW_PX: Final = 40
+_TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
 _FIT_PARAMETERS: Final = 3
 _RELAX: Final = 0.8
@@ -155,6 +161,8 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
         peaks, heights = _peaks(counts, background, shape.sigma_px, chosen.threshold_sigma)
         shape = _shape(counts, background, peaks, chosen, saturation, shape.sigma_px)
+    if shape.trail_px > _TRAIL_FILTER_PX:
+        peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
     if len(peaks) == 0:
         flat = float(counts.min()) == float(counts.max())
         return _nothing(
@@ -196,15 +204,41 @@ def _peaks(
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
     taps = spot_taps(sigma_px)
+
+    def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+        return find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
+
+    return _search(search, background, threshold_sigma * noise_factor(taps))
+
+
+def _trail_peaks(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    shape: SpotShape,
+    threshold_sigma: float,
+) -> tuple[npt.NDArray[np.int32], Grid]:
+    """As `_peaks`, with the filter for the frame's trails."""
+    smooth = smooth_along_trails(counts, shape.sigma_px, shape.flow)
+
+    def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+        return find_peaks_in_smooth(smooth, threshold, background.block_px, peaks, heights)
+
+    return _search(search, background, threshold_sigma * trail_noise_factor(shape.sigma_px, shape.trail_px))
+
+
+def _search(
+    search: Callable[[Grid, npt.NDArray[np.int32], Grid], int], background: Background, factor: float
+) -> tuple[npt.NDArray[np.int32], Grid]:
+    """Search for peaks above `factor` times the noise, or above more where there are too many to list."""
     peaks = np.empty((_MOST_PEAKS, 2), dtype=np.int32)
     heights = np.empty(_MOST_PEAKS, dtype=np.float32)
-    factor = threshold_sigma * noise_factor(taps)
-    count = _MOST_PEAKS
-    while count == _MOST_PEAKS:
+    while True:
         threshold = (background.level + np.float32(factor) * background.noise).astype(np.float32)
-        count = find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
-        factor *= 1.5
-    heights = heights[:count] + np.float32(factor / 1.5 * background.median_noise)
+        count = search(threshold, peaks, heights)
+        if count < _MOST_PEAKS:
+            break
+        factor *= _HIGHER
+    heights = heights[:count] + np.float32(factor * background.median_noise)
     order = np.argsort(-heights, kind="stable")
     return peaks[:count][order], heights[order]
 
@@ -230,13 +264,12 @@ def _shape(
         start,
         _SHAPE_WINDOW_PX,
         saturation,
-        _STARS_FOR_SHAPE,
         table,
     )
     shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
     if settings.follow_trails:
         return shape
-    return dataclasses.replace(shape, trail_field=np.zeros_like(shape.trail_field), trail_px=0.0)
+    return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
 
 
 def _measured(
@@ -257,9 +290,7 @@ def _measured(
     flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
     count = len(peaks)
     windows = np.zeros((count, WINDOW_COLUMNS))
-    pixels = np.empty(
-        lay_windows(counts, peaks, flux, *grid, spot, shape.trail_field, windows), dtype=np.float32
-    )
+    pixels = np.empty(lay_windows(counts, peaks, flux, *grid, spot, shape.flow, windows), dtype=np.float32)
     cut_windows(counts, windows, background.level, grid[2], float(saturation), pixels)
     first = np.empty(count + 1, dtype=np.int32)
     neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)

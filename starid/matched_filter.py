@@ -89,6 +89,29 @@ def _smooth_along(
             out[x] += tap * (left[x] + right[x])
 
 
+def smooth_image(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], taps: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
+    """Smooth a whole image (h, w) with the filter of `spot_taps`; beyond its edges it goes on with its last pixels."""
+    out = np.empty(image.shape, dtype=np.float32)
+    _smooth_all(image, taps, out)
+    return out
+
+
+@compiled_loops
+def _smooth_all(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    taps: npt.NDArray[np.float32],
+    out: npt.NDArray[np.float32],
+) -> None:
+    """Smooth every row of an image."""
+    reach = taps.size - 1
+    padded = np.empty(image.shape[1] + 2 * reach, np.float32)
+    for y in range(image.shape[0]):
+        _smooth_down(image, y, taps, padded[reach : reach + image.shape[1]])
+        _smooth_along(padded, taps, out[y])
+
+
 @compiled_loops
 def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
     """Values of row i of a grid of blocks at every image column."""
@@ -136,6 +159,52 @@ def _is_top(
 
 
 @compiled_loops
+def _peaks_of_row(
+    y: int,
+    height: int,
+    row: npt.NDArray[np.float32],
+    before: npt.NDArray[np.float32],
+    after: npt.NDArray[np.float32],
+    lines: npt.NDArray[np.float32],
+    q: np.float32,
+    above: npt.NDArray[np.uint8],
+    count: int,
+    peaks: npt.NDArray[np.int32],
+    heights: npt.NDArray[np.float32],
+) -> int:
+    """Add the peaks of row y to the list; return how many there are now."""
+    if _mark(row, lines[0], lines[1], q, above) == 0:
+        return count
+    words = above.view(np.uint64)
+    for word in range(words.size):
+        if words[word] == 0:
+            continue
+        for x in range(8 * word, min(8 * word + 8, row.size)):
+            if above[x] == 0 or not _is_top(row, before, after, x, y > 0, y < height - 1):
+                continue
+            if count == peaks.shape[0]:
+                return count
+            peaks[count, 0] = x
+            peaks[count, 1] = y
+            heights[count] = row[x] - (lines[0, x] + q * (lines[1, x] - lines[0, x]))
+            count += 1
+    return count
+
+
+@compiled_loops
+def _set_lines(
+    grid: npt.NDArray[np.float32], block: float, y: int, current: int, lines: npt.NDArray[np.float32]
+) -> tuple[int, np.float32]:
+    """Have the two lines of a grid of blocks ready that row y lies between; return which, and how far between."""
+    v = min(max((y + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
+    i = min(int(v), max(grid.shape[0] - 2, 0))
+    if i != current:
+        _grid_line(grid, i, block, lines[0])
+        _grid_line(grid, min(i + 1, grid.shape[0] - 1), block, lines[1])
+    return i, np.float32(v - i)
+
+
+@compiled_loops
 def find_peaks(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     threshold: npt.NDArray[np.float32],
@@ -170,42 +239,38 @@ def find_peaks(
     reach = taps.size - 1
     padded = np.empty(width + 2 * reach, np.float32)
     smooth = np.empty((3, width), np.float32)
-    upper = np.empty(width, np.float32)
-    lower = np.empty(width, np.float32)
-    grid_row = -1
+    lines = np.empty((2, width), np.float32)
     above = np.zeros((width + 7) // 8 * 8, np.uint8)
-    words = above.view(np.uint64)
     count = 0
+    line = -1
     for y in range(height + 1):
         if y < height:
             _smooth_down(image, y, taps, padded[reach : reach + width])
             _smooth_along(padded, taps, smooth[y % 3])
-        if y == 0:
-            continue
-        # row y − 1 has both neighbours now
-        row = smooth[(y - 1) % 3]
-        before = smooth[(y - 2) % 3] if y > 1 else row
-        after = smooth[y % 3] if y < height else row
-        v = min(max((y - 0.5) / block - 0.5, 0.0), threshold.shape[0] - 1.0)
-        i = min(int(v), max(threshold.shape[0] - 2, 0))
-        if i != grid_row:
-            grid_row = i
-            _grid_line(threshold, i, block, upper)
-            _grid_line(threshold, min(i + 1, threshold.shape[0] - 1), block, lower)
-        q = np.float32(v - i)
-        found = _mark(row, upper, lower, q, above)
-        if found == 0:
-            continue
-        for word in range(words.size):
-            if words[word] == 0:
-                continue
-            for x in range(8 * word, min(8 * word + 8, width)):
-                if above[x] == 0 or not _is_top(row, before, after, x, y > 1, y < height):
-                    continue
-                if count == peaks.shape[0]:
-                    return count
-                peaks[count, 0] = x
-                peaks[count, 1] = y - 1
-                heights[count] = row[x] - (upper[x] + q * (lower[x] - upper[x]))
-                count += 1
+        if y > 0:
+            # row y − 1 has both neighbours now
+            line, q = _set_lines(threshold, block, y - 1, line, lines)
+            row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
+            count = _peaks_of_row(y - 1, height, row, before, after, lines, q, above, count, peaks, heights)
+    return count
+
+
+@compiled_loops
+def find_peaks_in_smooth(
+    smooth: npt.NDArray[np.float32],
+    threshold: npt.NDArray[np.float32],
+    block: float,
+    peaks: npt.NDArray[np.int32],
+    heights: npt.NDArray[np.float32],
+) -> int:
+    """As `find_peaks`, in an image (h, w) that has been smoothed already."""
+    height, width = smooth.shape
+    lines = np.empty((2, width), np.float32)
+    above = np.zeros((width + 7) // 8 * 8, np.uint8)
+    count = 0
+    line = -1
+    for y in range(height):
+        line, q = _set_lines(threshold, block, y, line, lines)
+        before, after = smooth[max(y - 1, 0)], smooth[min(y + 1, height - 1)]
+        count = _peaks_of_row(y, height, smooth[y], before, after, lines, q, above, count, peaks, heights)
     return count

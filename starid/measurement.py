@@ -15,15 +15,14 @@ from starid.centroid import (
     HOT_PIXEL,
     NO_FIT,
     PIXELS,
-    SHORT_TRAIL_PX,
     STATE,
+    UNUSABLE,
     WANDERED,
     X,
     Y,
     explained,
     fit_star,
-    spot_model,
-    trail_model,
+    star_model,
 )
 from starid.jit_loops import compiled_loops
 from starid.windows import (
@@ -58,6 +57,7 @@ _BAD_FIT: Final = 4.0
 _STRAY_SIGMA: Final = 7.0
 _STRAY_DISTANCE_SIGMA: Final = 2.0
 _FIT_PARAMETERS: Final = 3
+_LEAST_SIDE: Final = 11
 
 
 @compiled_loops
@@ -115,22 +115,6 @@ def find_neighbours(
 
 
 @compiled_loops
-def _shape_at(
-    x: float,
-    y: float,
-    shape: tuple[float, float, float],
-    left: int,
-    top: int,
-    model: npt.NDArray[np.float64],
-) -> None:
-    """Model of a round spot or a trail, whichever the shape says."""
-    if math.hypot(shape[1], shape[2]) > SHORT_TRAIL_PX:
-        trail_model(x, y, shape[0], (shape[1], shape[2]), left, top, model)
-    else:
-        spot_model(x, y, shape[0], left, top, model)
-
-
-@compiled_loops
 def _mask_stray_pixel(
     pixels: npt.NDArray[np.float32],
     model: npt.NDArray[np.float64],
@@ -142,23 +126,23 @@ def _mask_stray_pixel(
 ) -> bool:
     """Take the pixel that contradicts the fit most, if one does and is off the star's core, out of the fit."""
     worst = _STRAY_SIGMA * _STRAY_SIGMA
-    row = column = -1
+    stray = -1
     variance = window[NOISE] * window[NOISE]
-    for j in range(pixels.shape[0]):
-        for i in range(pixels.shape[1]):
-            off_x = abs(window[LEFT] + i - star[X]) - 0.5 * abs(window[TRAIL_X])
-            off_y = abs(window[TOP] + j - star[Y]) - 0.5 * abs(window[TRAIL_Y])
-            if max(off_x, off_y) < _STRAY_DISTANCE_SIGMA * sigma or math.isinf(pixels[j, i]):
-                continue
-            light = star[FLUX] * model[0, j, i]
-            off = pixels[j, i] - light
-            error = model_error * light
-            chi2 = off * off / (variance + light * per_dn + error * error)
-            if off > 0.0 and chi2 > worst:
-                worst, row, column = chi2, j, i
-    if row >= 0:
-        pixels[row, column] = np.float32(math.inf)
-    return row >= 0
+    columns = int(window[COLUMNS])
+    for k in range(pixels.size):
+        off_x = abs(window[LEFT] + k % columns - star[X]) - 0.5 * abs(window[TRAIL_X])
+        off_y = abs(window[TOP] + k // columns - star[Y]) - 0.5 * abs(window[TRAIL_Y])
+        if max(off_x, off_y) < _STRAY_DISTANCE_SIGMA * sigma or not pixels[k] < UNUSABLE:
+            continue
+        light = star[FLUX] * model[0, k]
+        off = pixels[k] - light
+        error = model_error * light
+        chi2 = off * off / (variance + light * per_dn + error * error)
+        if off > 0.0 and chi2 > worst:
+            worst, stray = chi2, k
+    if stray >= 0:
+        pixels[stray] = np.float32(math.inf)
+    return stray >= 0
 
 
 @compiled_loops
@@ -181,9 +165,8 @@ def _judge(
     if not (-0.5 <= star[X] < width - 0.5 and -0.5 <= star[Y] < height - 0.5):
         return float(OUTSIDE)
     squares = 0.0
-    for j in range(pixels.shape[0]):
-        for i in range(pixels.shape[1]):
-            squares += model[0, j, i] * model[0, j, i]
+    for k in range(pixels.size):
+        squares += model[0, k] * model[0, k]
     if patch == 0.0 and star[FLUX] * math.sqrt(squares) < least_ratio * noise:
         return float(FAINT)
     allowed = _WANDER_PX * max(sigma, 1.0) + patch + 0.5 * length
@@ -192,7 +175,9 @@ def _judge(
     if patch > 0.0:
         # the wings must call for a core that saturates
         return (
-            float(GOOD) if star[FLUX] * np.max(model[0]) > _WING_SHARE * saturation_dn else float(HOT_PIXEL)
+            float(GOOD)
+            if star[FLUX] * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn
+            else float(HOT_PIXEL)
         )
     by_shape, by_pixel, total, used = explained(pixels, model)
     if sigma > _SHARP_SIGMA_PX and by_pixel > by_shape:
@@ -223,7 +208,8 @@ def _flags(
     if window[PATCH] > 0.0:
         flags |= SATURATED
     column, row = round(star[X] - window[LEFT]), round(star[Y] - window[TOP])
-    if 0 <= row < pixels.shape[0] and 0 <= column < pixels.shape[1] and math.isinf(pixels[row, column]):
+    inside = 0 <= row < window[ROWS] and 0 <= column < window[COLUMNS]
+    if inside and not pixels[row * int(window[COLUMNS]) + column] < UNUSABLE:
         flags |= SATURATED
     return flags
 
@@ -261,44 +247,49 @@ def measure(
         Filled with bits `SATURATED`, `AT_EDGE`.
     """
     sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
-    largest = 1
+    largest, side = 1, _LEAST_SIDE
     for k in range(windows.shape[0]):
         stars[k, STATE] = NO_FIT
         flags[k] = 0
-        largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
-    models = np.empty(3 * largest)
+        if windows[k, COLUMNS] > 0.0:
+            largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
+            side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
+    models = np.empty((3, largest))
+    lights = np.empty((3, largest))
+    work = np.empty((5, side))
+    cleaned = np.empty(largest, np.float32)
     for turn in range(_ROUNDS):
         for k in range(windows.shape[0]):
             window, star = windows[k], stars[k]
             alone = first[k] == first[k + 1]
             if window[COLUMNS] <= 0.0 or (turn > 0 and (alone or star[STATE] != GOOD)):
                 continue
-            left, top = int(window[LEFT]), int(window[TOP])
-            rows, columns = int(window[ROWS]), int(window[COLUMNS])
-            start = int(window[OFFSET])
-            own = pixels[start : start + rows * columns].reshape((rows, columns))
-            model = models[: 3 * rows * columns].reshape((3, rows, columns))
+            place = (int(window[LEFT]), int(window[TOP]), int(window[COLUMNS]), int(window[ROWS]))
+            count = place[2] * place[3]
+            begin = int(window[OFFSET])
+            own = pixels[begin : begin + count]
+            model = models[:, :count]
             shape = (sigma, window[TRAIL_X], window[TRAIL_Y])
             target = own
             if not alone:
-                target = own.copy()
-                for place in range(first[k], first[k + 1]):
-                    other = neighbours[place]
-                    if stars[other, STATE] != GOOD:
+                target = cleaned[:count]
+                target[:] = own
+                for entry in range(first[k], first[k + 1]):
+                    other = stars[neighbours[entry]]
+                    if other[STATE] != GOOD:
                         continue
-                    _shape_at(stars[other, X], stars[other, Y], shape, left, top, model)
-                    for j in range(rows):
-                        for i in range(columns):
-                            target[j, i] -= np.float32(stars[other, FLUX] * model[0, j, i])
+                    star_model(other[X], other[Y], shape, place, lights, work)
+                    for i in range(count):
+                        target[i] -= np.float32(other[FLUX] * lights[0, i])
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
             guess = (window[START_X], window[START_Y]) if turn == 0 else (star[X], star[Y])
-            fit_star(target, left, top, guess, shape, noise, model, star)
+            fit_star(target, place, guess, shape, noise, model, work, star)
             if (
                 star[STATE] == GOOD
                 and star[CHI2] > _BAD_FIT * (star[PIXELS] - _FIT_PARAMETERS)
                 and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
             ):
-                fit_star(target, left, top, (star[X], star[Y]), shape, noise, model, star)
+                fit_star(target, place, (star[X], star[Y]), shape, noise, model, work, star)
             if star[STATE] == GOOD:
                 star[STATE] = _judge(target, model, star, window, sigma, least_ratio, saturation_dn, size)
             if star[STATE] == GOOD:

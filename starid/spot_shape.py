@@ -1,16 +1,21 @@
-"""Shape of the stars of a frame: width of the spot, and the trail that a turning sensor draws.
+"""Shape of the stars of a frame: width of the spot, and the trails that a turning sensor draws.
 
 Second moments of bright stars under a Gaussian weight that is adapted to the star itself (Bernstein & Jarvis 2002)
-give each star's covariance. What all have in common and round is the spot; the rest is the trail: a star that moves
-evenly by d during the exposure has d·dᵀ/12 added. As d is nearly linear in the image position (translation, roll,
-and a little from the projection), d·dᵀ is taken as a quadratic in it; a pure roll, whose trails turn about a point
-of the image, is covered as well.
+give each star's covariance: across a trail that of the spot, along it more. The trails of a frame belong to one
+rotation of the sensor; through a lens that keeps straight lines straight they follow, with (u, v) measured from the
+image's centre,
+
+    dx = t_x + a·u² + b·u·v − r·v,    dy = t_y + a·u·v + b·v² + r·u,
+
+and nearly so through any other. The five numbers are fitted to the stars' trails, whose senses are not seen.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -19,35 +24,44 @@ import numpy.typing as npt
 from starid.background import interpolate_at
 from starid.jit_loops import compiled_loops
 
+Array = npt.NDArray[np.float64]
+
+FLOW_TERMS: Final = 5
+MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
-_ITERATIONS: Final = 12
+_ITERATIONS: Final = 30
 _SETTLED: Final = 1e-2
+_WEIGHT_END: Final = 12.0
 _LEAST_FOR_SPOT: Final = 3
-_LEAST_FOR_FIELD: Final = 14
+_LEAST_FOR_ROLL: Final = 5
+_LEAST_FOR_FLOW: Final = 12
 _ROUND_BELOW_PX: Final = 0.7
 _LEAST_SIGMA_PX: Final = 0.3
+_MOST_PAIRS: Final = 20
 _CLIP: Final = 3.0
+_UNEXPLAINED: Final = 0.5
+_ROUNDS: Final = 4
 
 
 @dataclass(frozen=True)
 class SpotShape:
-    """Spot and trail over a frame.
+    """Spot and trails of a frame.
 
     Attributes
     ----------
     sigma_px : float
         Standard deviation of the spot, pixels.
-    trail_field : ndarray (6, 3)
-        Coefficients over (1, u, v, u², uv, v²), u and v the image position scaled to ±1, of the trail's products
-        (dx², dx·dy, dy²), pixels²; all zero where stars are round.
+    flow : ndarray (5,)
+        t_x, t_y, r, a, b of the trails, pixels, for (u, v) in halves of the image's longer side; all zero where
+        stars are round.
     trail_px : float
-        Median length of the trail, pixels.
+        Median length of the trails, pixels.
     stars : int
         Stars that the estimate rests on; 0 if it is only assumed.
     """
 
     sigma_px: float
-    trail_field: npt.NDArray[np.float64]
+    flow: Array
     trail_px: float
     stars: int
 
@@ -61,7 +75,7 @@ def adaptive_moments(
     start_sigma: float,
     largest: int,
     saturation: float,
-    moments: npt.NDArray[np.float64],
+    moments: Array,
 ) -> bool:
     """Centre and covariance of a bright star: (x, y, c_xx, c_xy, c_yy) into `moments`; False if there is none.
 
@@ -90,7 +104,7 @@ def adaptive_moments(
         if left < 0 or top < 0 or right >= width or bottom >= height:
             return False
         determinant = c_xx * c_yy - c_xy * c_xy
-        if not determinant > 1e-4:
+        if not determinant > 1e-4:  # a line has no inverse
             return False
         i_xx, i_xy, i_yy = c_yy / determinant, -c_xy / determinant, c_xx / determinant
         total = m_x = m_y = m_xx = m_xy = m_yy = 0.0
@@ -99,7 +113,7 @@ def adaptive_moments(
             for column in range(left, right + 1):
                 dx = column - x
                 distance2 = i_xx * dx * dx + 2.0 * i_xy * dx * dy + i_yy * dy * dy
-                if distance2 > 12.0:
+                if distance2 > _WEIGHT_END:
                     continue
                 if image[row, column] >= saturation:
                     return False
@@ -140,71 +154,43 @@ def moments_of(
     start_sigma: float,
     largest: int,
     saturation: float,
-    wanted: int,
-    table: npt.NDArray[np.float64],
+    table: Array,
 ) -> int:
-    """Fill `table` (n, 5) with the moments of up to `wanted` peaks, in their order; return how many were usable."""
+    """Fill `table` (n, 5) with the moments of the first peaks that have them; return how many.
+
+    Peaks that come to the place of an earlier one (several on one trail) count once.
+    """
     count = 0
     for k in range(peaks.shape[0]):
-        if count == wanted:
+        if count == table.shape[0]:
             break
         x, y = float(peaks[k, 0]), float(peaks[k, 1])
         background = interpolate_at(level, block, x, y)
-        if adaptive_moments(image, x, y, background, start_sigma, largest, saturation, table[count]):
+        if not adaptive_moments(image, x, y, background, start_sigma, largest, saturation, table[count]):
+            continue
+        again = False
+        for earlier in range(count):
+            off = abs(table[earlier, 0] - table[count, 0]) + abs(table[earlier, 1] - table[count, 1])
+            again = again or off < 2.0  # pixels
+        if not again:
             count += 1
     return count
 
 
-def quadratic_terms(
-    x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], width: int, height: int
-) -> npt.NDArray[np.float64]:
-    """Terms (n, 6) of a quadratic in the image position, scaled to ±1 at the edges."""
-    u = (2.0 * x + 1.0) / width - 1.0
-    v = (2.0 * y + 1.0) / height - 1.0
-    return np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
-
-
 @compiled_loops
-def trail_at(
-    field: npt.NDArray[np.float64], x: float, y: float, width: int, height: int
-) -> tuple[float, float]:
-    """Trail (dx, dy) in pixels at an image position, up to its sign, from the coefficients of `SpotShape`."""
-    u = (2.0 * x + 1.0) / width - 1.0
-    v = (2.0 * y + 1.0) / height - 1.0
-    xx = (
-        field[0, 0]
-        + u * (field[1, 0] + u * field[3, 0] + v * field[4, 0])
-        + v * (field[2, 0] + v * field[5, 0])
-    )
-    xy = (
-        field[0, 1]
-        + u * (field[1, 1] + u * field[3, 1] + v * field[4, 1])
-        + v * (field[2, 1] + v * field[5, 1])
-    )
-    yy = (
-        field[0, 2]
-        + u * (field[1, 2] + u * field[3, 2] + v * field[4, 2])
-        + v * (field[2, 2] + v * field[5, 2])
-    )
-    # the part of rank one: the larger eigenvalue and its direction
-    half = 0.5 * (xx - yy)
-    root = math.sqrt(half * half + xy * xy)
-    largest = 0.5 * (xx + yy) + root
-    if largest <= 0.0 or root <= 0.0:
-        return 0.0, 0.0
-    angle = 0.5 * math.atan2(xy, half)
-    length = math.sqrt(largest)
-    return length * math.cos(angle), length * math.sin(angle)
+def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
+    """Trail (dx, dy) in pixels at an image position, up to its sense."""
+    half = 0.5 * max(width, height)
+    u = (x - 0.5 * (width - 1)) / half
+    v = (y - 0.5 * (height - 1)) / half
+    inward = flow[3] * u + flow[4] * v
+    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
 
 
 def shape_from_moments(
-    table: npt.NDArray[np.float64],
-    width: int,
-    height: int,
-    known_sigma_px: float | None,
-    assumed_sigma_px: float,
+    table: Array, width: int, height: int, known_sigma_px: float | None, assumed_sigma_px: float
 ) -> SpotShape:
-    """Spot and trail from the moments of bright stars.
+    """Spot and trails from the moments of bright stars.
 
     Parameters
     ----------
@@ -217,48 +203,114 @@ def shape_from_moments(
     assumed_sigma_px : float
         Width to assume where too few stars tell.
     """
-    none = np.zeros((6, 3))
-    assumed = assumed_sigma_px if known_sigma_px is None else known_sigma_px
+    still = np.zeros(FLOW_TERMS)
     if len(table) < _LEAST_FOR_SPOT:
-        return SpotShape(assumed, none, 0.0, 0)
+        return SpotShape(known_sigma_px or assumed_sigma_px, still, 0.0, 0)
     c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
-    root = np.hypot(0.5 * (c_xx - c_yy), c_xy)
-    small = 0.5 * (c_xx + c_yy) - root
-    # noise splits the eigenvalues of a round spot; where the split is common to all stars it is a trail
-    trail = math.sqrt(12.0 * float(np.median(root)) * 2.0)
-    spot = float(np.median(0.5 * (c_xx + c_yy)))
-    direction = math.hypot(
-        float(np.mean((c_xx - c_yy) / (2.0 * root + 1e-12))), float(np.mean(c_xy / (root + 1e-12)))
-    )
-    lined_up = direction > 0.5 or trail > 2.0
-    if trail > _ROUND_BELOW_PX and lined_up:
-        spot = float(np.median(small))
-        sigma2 = max(spot - _PIXEL_VARIANCE, _LEAST_SIGMA_PX**2)
-        sigma = math.sqrt(sigma2) if known_sigma_px is None else known_sigma_px
-        products = 12.0 * np.column_stack(
-            [c_xx - sigma**2 - _PIXEL_VARIANCE, c_xy, c_yy - sigma**2 - _PIXEL_VARIANCE]
+    mean, split = 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
+    across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else float(np.median(mean - split))
+    across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
+    length = trail_length(mean + split, across)
+    if float(np.median(length)) > _ROUND_BELOW_PX:
+        angle = 0.5 * np.arctan2(2.0 * c_xy, c_xx - c_yy)
+        trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        half = 0.5 * max(width, height)
+        places = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / half
+        flow = fit_flow(places, trails)
+        drawn = _flow_terms(places) @ flow
+        typical = float(np.median(np.hypot(drawn[:, 0], drawn[:, 1])))
+        left_over = np.median(_mismatch(trails, drawn)) / max(float(np.median(length)), 1e-9)
+        if typical > _ROUND_BELOW_PX and left_over < _UNEXPLAINED:
+            return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
+    return SpotShape(_sigma(float(np.median(mean)), known_sigma_px), still, 0.0, len(table))
+
+
+def _sigma(variance: float, known: float | None) -> float:
+    """Standard deviation of the spot from its variance on pixels."""
+    return known or math.sqrt(max(variance - _PIXEL_VARIANCE, _LEAST_SIGMA_PX**2))
+
+
+@lru_cache(maxsize=1)
+def _box_share() -> tuple[Array, Array]:
+    """Half-length z of a box in sigmas of a Gaussian weight, and 1 − 2zφ(z)/(2Φ(z) − 1) for it."""
+    z = np.linspace(1e-3, 4.0, 2000)
+    bell = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    inside = np.array([math.erf(value / math.sqrt(2.0)) for value in z])
+    return z, 1.0 - 2.0 * z * bell / inside
+
+
+def trail_length(along: Array, across: float) -> Array:
+    """Lengths (n,) of trails from the adaptive variance along them (n,) and that across.
+
+    A trail is a box of half-length h convolved with the spot. Under a Gaussian weight of variance C (in units of the
+    spot's) its second moment is C/(C + 1) + (C/(C + 1))²·(C + 1)·s, s being the share by which a Gaussian of
+    variance C + 1 is cut down on (−h, h); adapted moments have the moment C/2, so that s = (C − 1)/2C.
+    """
+    ratio = np.maximum(along / across, 1.0)
+    z, share = _box_share()
+    cut = np.interp((ratio - 1.0) / (2.0 * ratio), share, z, left=0.0)
+    return np.asarray(2.0 * cut * np.sqrt(ratio + 1.0) * math.sqrt(across), dtype=np.float64)
+
+
+def _flow_terms(places: Array) -> Array:
+    """Matrix (n, 2, 5) that turns a flow into trails at places (n, 2)."""
+    u, v = places[:, 0], places[:, 1]
+    one, none = np.ones_like(u), np.zeros_like(u)
+    dx = np.column_stack([one, none, -v, u * u, u * v])
+    dy = np.column_stack([none, one, u, u * v, v * v])
+    return np.stack([dx, dy], axis=1)
+
+
+def _mismatch(trails: Array, drawn: Array) -> Array:
+    """Distances (n,) between seen and drawn trails, in the sense that fits better."""
+    forth = np.linalg.norm(trails - drawn, axis=-1)
+    back = np.linalg.norm(trails + drawn, axis=-1)
+    return np.asarray(np.minimum(forth, back), dtype=np.float64)
+
+
+def fit_flow(places: Array, trails: Array) -> Array:
+    """Flow (5,) through trails (n, 2), up to their senses, at places (n, 2).
+
+    Starts are translation and roll through two of the brightest stars in either relative sense, and pure
+    translations; the one that leaves least is refined by least squares without outliers. Few stars get fewer terms.
+    """
+    terms = _flow_terms(places)
+    count = len(trails)
+    best = np.zeros(FLOW_TERMS)
+    least = math.inf
+    for start in _starts(terms, trails):
+        left = float(
+            np.mean(np.minimum(_mismatch(trails, terms @ start), 0.5 * np.linalg.norm(trails, axis=1)))
         )
-        return SpotShape(sigma, _fit_field(table, products, width, height), trail, len(table))
-    sigma2 = max(spot - _PIXEL_VARIANCE, _LEAST_SIGMA_PX**2)
-    return SpotShape(math.sqrt(sigma2) if known_sigma_px is None else known_sigma_px, none, 0.0, len(table))
-
-
-def _fit_field(
-    table: npt.NDArray[np.float64], products: npt.NDArray[np.float64], width: int, height: int
-) -> npt.NDArray[np.float64]:
-    """Least-squares quadratic (6, 3) through the trail's products, outliers dropped once; constant for few stars."""
-    field = np.zeros((6, 3))
-    centre = np.median(products, axis=0)
-    off = np.abs(products - centre).sum(axis=1)
-    if len(table) < _LEAST_FOR_FIELD:
-        field[0] = centre
-        return field
-    terms = quadratic_terms(table[:, 0], table[:, 1], width, height)
-    keep = np.ones(len(table), dtype=bool)
-    for _ in range(2):
-        field = np.linalg.lstsq(terms[keep], products[keep], rcond=None)[0].astype(np.float64)
-        off = np.abs(products - terms @ field).sum(axis=1)
-        keep = off <= _CLIP * max(float(np.median(off)), 1e-3)
-        if np.count_nonzero(keep) < _LEAST_FOR_FIELD:
+        if left < least:
+            best, least = start, left
+    used = 2 if count < _LEAST_FOR_ROLL else 3 if count < _LEAST_FOR_FLOW else FLOW_TERMS
+    for _ in range(_ROUNDS):
+        drawn = terms @ best
+        sense = np.where(np.sum(trails * drawn, axis=1) < 0.0, -1.0, 1.0)
+        off = _mismatch(trails, drawn)
+        keep = off <= max(_CLIP * float(np.median(off)), 0.1)
+        if np.count_nonzero(keep) < used:
             break
-    return field
+        system = terms[keep][:, :, :used].reshape(-1, used)
+        best = np.zeros(FLOW_TERMS)
+        best[:used] = np.linalg.lstsq(system, (sense[:, None] * trails)[keep].ravel(), rcond=None)[0]
+    return best
+
+
+def _starts(terms: Array, trails: Array) -> list[Array]:
+    """First guesses of a flow: translations along single stars' trails, translation and roll through pairs."""
+    starts = []
+    few = min(len(trails), 8)
+    for k in range(few):
+        start = np.zeros(FLOW_TERMS)
+        start[:2] = trails[k]
+        starts.append(start)
+    for i, j in list(itertools.combinations(range(few), 2))[:_MOST_PAIRS]:
+        for sense in (1.0, -1.0):
+            system = terms[[i, j]][:, :, :3].reshape(4, 3)
+            wanted = np.concatenate([trails[i], sense * trails[j]])
+            start = np.zeros(FLOW_TERMS)
+            start[:3] = np.linalg.lstsq(system, wanted, rcond=None)[0]
+            starts.append(start)
+    return starts

@@ -69,16 +69,16 @@ def _ring(
     y: int,
     radius_x: int,
     radius_y: int,
+    circle: npt.NDArray[np.float64],
     values: npt.NDArray[np.float64],
 ) -> tuple[float, float]:
     """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window."""
     height, width = image.shape
     count = 0
     for k in range(_RING_PIXELS):
-        angle = 2.0 * math.pi * k / _RING_PIXELS
-        out = 1.0 if k % 2 == 0 else 2.5
-        column = x + round((radius_x + out) * math.cos(angle))
-        row = y + round((radius_y + out) * math.sin(angle))
+        out = 1.5 if k % 2 == 0 else 3.0
+        column = x + math.floor((radius_x + out) * circle[0, k] + 0.5)
+        row = y + math.floor((radius_y + out) * circle[1, k] + 0.5)
         if 0 <= column < width and 0 <= row < height:
             key = float(image[row, column])
             j = count - 1
@@ -158,6 +158,25 @@ def _sky(
 
 
 @compiled_loops
+def _middle(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float
+) -> tuple[float, float]:
+    """First guess of a star's place: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
+    height, width = image.shape
+    if not (0 < column < width - 1 and 0 < row < height - 1):
+        return float(column), float(row)
+    total = 1e-6
+    x = y = 0.0
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            light = max(float(image[row + dy, column + dx]) - sky, 0.0)
+            total += light
+            x += light * dx
+            y += light * dy
+    return column + min(max(1.5 * x / total, -0.7), 0.7), row + min(max(1.5 * y / total, -0.7), 0.7)
+
+
+@compiled_loops
 def lay_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -166,7 +185,7 @@ def lay_windows(
     noise: npt.NDArray[np.float32],
     block: float,
     spot: tuple[float, float, float],
-    field: npt.NDArray[np.float64],
+    flow: npt.NDArray[np.float64],
     windows: npt.NDArray[np.float64],
 ) -> int:
     """Lay a window around every candidate.
@@ -183,8 +202,8 @@ def lay_windows(
         Grid of the background, and the side of its blocks.
     spot : (float, float, float)
         Standard deviation of the spot, pixels; saturation and the typical noise of a pixel, counts.
-    field : ndarray (6, 3)
-        Field of trails (`SpotShape`).
+    flow : ndarray (5,)
+        Flow of the trails (`SpotShape`).
     windows : ndarray (n, WINDOW_COLUMNS)
         Filled; COLUMNS tells where there is none, and why.
 
@@ -196,6 +215,10 @@ def lay_windows(
     height, width = image.shape
     sigma, saturation, typical_noise = spot
     ring = np.empty(_RING_PIXELS)
+    circle = np.empty((2, _RING_PIXELS))
+    for k in range(_RING_PIXELS):
+        circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
+        circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
     visited = np.zeros((height, width), np.uint8)
     stack = np.empty((2 * MOST_SATURATED, 2), np.int32)
     patch = np.zeros(3)
@@ -210,23 +233,26 @@ def lay_windows(
                 window[COLUMNS] = SEEN_BEFORE if count < 0 else EXTENDED
                 continue
         x, y, extra = patch[0], patch[1], patch[2]
-        trail_x, trail_y = trail_at(field, x, y, width, height)
+        trail_x, trail_y = trail_at(flow, x, y, width, height)
         radius = light_radius(sigma, float(flux[k]), typical_noise)
         radius_x = min(math.ceil(radius + 0.5 * abs(trail_x) + extra), LARGEST_HALF_WIDTH)
         radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
         centre_x, centre_y = round(x), round(y)
-        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, ring)
-        window[BASE], window[NOISE] = _sky(
+        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, circle, ring)
+        sky_level, window[NOISE] = _sky(
             around,
             spread,
             interpolate_at(level, block, x, y),
             interpolate_at(noise, block, x, y),
             typical_noise,
         )
+        window[BASE] = sky_level
         left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)
         columns = min(centre_x + radius_x, width - 1) - left + 1
         rows = min(centre_y + radius_y, height - 1) - top + 1
         window[LEFT], window[TOP] = left, top
+        if extra == 0.0:
+            x, y = _middle(image, column, row, sky_level)
         window[START_X], window[START_Y], window[PATCH] = x, y, extra
         window[TRAIL_X], window[TRAIL_Y] = trail_x, trail_y
         window[RADIUS_X], window[RADIUS_Y] = radius_x, radius_y
