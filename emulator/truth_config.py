@@ -23,7 +23,7 @@ from emulator.truth_file import read_truth_file
 from emulator.truth_live import LiveTruth
 from starid.attitude import Attitude
 
-Rate: TypeAlias = tuple[float, float, float]
+Rate: TypeAlias = Annotated[list[float], Field(min_length=3, max_length=3)]
 """Body rate in the sensor frame, degrees a second."""
 
 

@@ -1,0 +1,148 @@
+"""A device on a stepped clock, with a pipeline that sees the truth without making pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from emulator.clock import SteppedClock
+from emulator.device import Device
+from emulator.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
+from emulator.imager import Answer, Asked, DirectImager
+from emulator.profile import Profile
+from emulator.state_store import MemoryStore, StateStore
+from emulator.truth import FixedTruth, TruthSource
+from protocol.icd import load_icd
+from protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starid.attitude import Attitude
+
+ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+STARS = (
+    MatchedStar(32349, 86.0, 824.6, -1.44, 900.0),
+    MatchedStar(101772, 578.0, 618.6, 0.18, 700.0),
+    MatchedStar(27989, 361.0, 282.7, 0.45, 600.0),
+    MatchedStar(21421, 793.0, 65.7, 0.87, 500.0),
+)
+
+
+@dataclass
+class FakePicture:
+    """Answers each request at once: the attitude is the truth, unless it is told to fail."""
+
+    requests: list[Asked] = field(default_factory=list)
+    fail: str = ""
+    turn_rad: float = 0.0
+    last_index: int = -1
+
+    def handle(self, request: Asked) -> Answer:
+        """Answer a request as the pipeline does."""
+        self.requests.append(request)
+        if isinstance(request, ImageRequest):
+            pixels = bytes(n % 251 for n in range(request.edge)) * request.edge
+            return ImageResult(request.edge, self.last_index, pixels if self.last_index >= 0 else b"")
+        self.last_index = request.index
+        if not request.solve:
+            return FrameResult(request.index, solved=False)
+        tracked = request.predicted_xyzw is not None
+        if self.fail:
+            return FrameResult(request.index, reason=self.fail, tracked=tracked, detected=2)
+        attitude = Attitude(np.array(request.attitude_xyzw)).rotated((self.turn_rad, 0.0, 0.0))
+        x, y, z, w = attitude.quaternion_xyzw.tolist()
+        return FrameResult(
+            request.index,
+            valid=True,
+            reason="ok",
+            tracked=tracked,
+            quaternion_xyzw=(x, y, z, w),
+            sigma_cross_arcsec=1.5,
+            sigma_roll_arcsec=6.0,
+            detected=40,
+            refused=3,
+            matched=35,
+            stars=STARS,
+            probability_false=1e-12,
+            rms_px=0.1,
+            background_dn=8.2,
+            noise_dn=0.61,
+        )
+
+    @property
+    def frames(self) -> list[FrameRequest]:
+        """The requests for frames."""
+        return [request for request in self.requests if isinstance(request, FrameRequest)]
+
+
+class Bench:
+    """A device, its stepped clock, and short ways to command and read it."""
+
+    def __init__(
+        self,
+        profile: Profile | None = None,
+        store: StateStore | None = None,
+        truth: TruthSource | None = None,
+    ) -> None:
+        self.clock = SteppedClock()
+        self.picture = FakePicture()
+        self.icd = load_icd()
+        self.store = store or MemoryStore()
+        self.device = Device(
+            profile or Profile(),
+            self.icd,
+            self.clock,
+            DirectImager(self.picture.handle),
+            self.store,
+            truth or FixedTruth(ORION),
+        )
+
+    def start(self) -> Bench:
+        """Power on and boot."""
+        self.device.power_on()
+        self.device.pipeline_ready({})
+        self.step(1.0)
+        return self
+
+    def step(self, seconds: float) -> None:
+        """Let run time pass."""
+        end_ns = self.clock.now_ns() + round(seconds * 1e9)
+        while (event := self.device.scheduler.pop_due(end_ns)) is not None:
+            self.clock.set_ns(max(event.due_ns, self.clock.now_ns()))
+            event.action(event.due_ns)
+        self.clock.set_ns(end_ns)
+
+    def send(self, name: str, data: bytes | None = None, **values: object) -> list[Reply]:
+        """Send a telecommand; return all replies."""
+        row = self.icd.telecommands[name]
+        return self.device.handle(Request.of(row.id, row.encode(values) if data is None else data))
+
+    def command(self, name: str, **values: object) -> ErrorCode:
+        """Send a telecommand; return what it was answered with."""
+        reply = self.send(name, **values)[0]
+        assert (reply.kind is ReplyKind.ACK) == (reply.code is ErrorCode.OK)
+        return ErrorCode(reply.code)
+
+    def read(self, name: str) -> dict:
+        """Read telemetry in physical units."""
+        row = self.icd.telemetry[name]
+        (reply,) = self.device.handle(Request.of(row.id))
+        assert reply.kind is ReplyKind.TELEMETRY, reply
+        return row.decode(reply.data)
+
+    @property
+    def mode(self) -> str:
+        """Present mode."""
+        return self.device.modes.mode.value
+
+
+@pytest.fixture()
+def bench() -> Bench:
+    """A device in standby."""
+    return Bench().start()
+
+
+@pytest.fixture()
+def make_bench() -> Callable[..., Bench]:
+    """Make devices of one's own."""
+    return Bench

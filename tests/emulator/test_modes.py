@@ -1,0 +1,78 @@
+import pytest
+
+from emulator.modes import Cause, Mode, Modes
+
+
+def modes_in(mode: Mode) -> Modes:
+    modes = Modes()
+    modes.mode = mode
+    return modes
+
+
+ALLOWED = {
+    (Mode.STANDBY, Mode.STANDBY),
+    (Mode.STANDBY, Mode.LOST_IN_SPACE),
+    (Mode.STANDBY, Mode.TRACKING),
+    (Mode.LOST_IN_SPACE, Mode.STANDBY),
+    (Mode.LOST_IN_SPACE, Mode.LOST_IN_SPACE),
+    (Mode.LOST_IN_SPACE, Mode.TRACKING),
+    (Mode.TRACKING, Mode.STANDBY),
+    (Mode.TRACKING, Mode.LOST_IN_SPACE),
+    (Mode.TRACKING, Mode.TRACKING),
+    (Mode.ERROR, Mode.STANDBY),
+}
+
+
+@pytest.mark.parametrize("wanted", Mode)
+@pytest.mark.parametrize("here", Mode)
+def test_commands_lead_only_where_the_machine_allows(here, wanted):
+    modes = modes_in(here)
+    assert modes.command(wanted, has_attitude=True) == ((here, wanted) in ALLOWED)
+    assert modes.mode is (wanted if (here, wanted) in ALLOWED else here)
+
+
+def test_tracking_needs_an_attitude():
+    modes = modes_in(Mode.STANDBY)
+    assert not modes.command(Mode.TRACKING, has_attitude=False)
+    assert modes.mode is Mode.STANDBY
+
+
+@pytest.mark.parametrize(
+    ("here", "valid", "tracked", "enabled", "there"),
+    [
+        (Mode.LOST_IN_SPACE, True, False, True, Mode.TRACKING),
+        (Mode.LOST_IN_SPACE, True, False, False, Mode.LOST_IN_SPACE),
+        (Mode.LOST_IN_SPACE, False, False, True, Mode.LOST_IN_SPACE),
+        (Mode.TRACKING, True, True, True, Mode.TRACKING),
+        (Mode.TRACKING, False, True, True, Mode.LOST_IN_SPACE),
+        (Mode.TRACKING, True, True, False, Mode.LOST_IN_SPACE),
+        (Mode.STANDBY, True, False, True, Mode.STANDBY),
+        (Mode.ERROR, True, True, True, Mode.ERROR),
+    ],
+)
+def test_results_change_the_mode(here, valid, tracked, enabled, there):
+    modes = modes_in(here)
+    modes.solved(valid=valid, tracked=tracked, tracking_enabled=enabled)
+    assert modes.mode is there
+
+
+def test_changes_are_told_with_their_cause():
+    seen = []
+    modes = Modes(seen.append)
+    modes.booted()
+    modes.fail("sensor")
+    assert modes.error == "sensor"
+    modes.command(Mode.STANDBY, has_attitude=False)
+    modes.command(Mode.STANDBY, has_attitude=False)
+    assert modes.error == ""
+    assert [(t.after, t.cause) for t in seen] == [
+        (Mode.STANDBY, Cause.BOOTED),
+        (Mode.ERROR, Cause.FAULT),
+        (Mode.STANDBY, Cause.COMMAND),
+    ]
+
+
+def test_boot_ends_only_from_boot():
+    modes = modes_in(Mode.ERROR)
+    modes.booted()
+    assert modes.mode is Mode.ERROR

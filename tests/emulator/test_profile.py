@@ -1,0 +1,105 @@
+import pytest
+
+from emulator.errors import EmulatorError
+from emulator.profile import configs_folder, load_profile
+from emulator.truth_config import SlewConfig
+
+
+def write(tmp_path, text, name="mine.toml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return str(path)
+
+
+def refusal(*args) -> str:
+    with pytest.raises(EmulatorError) as caught:
+        load_profile(*args)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in (configs_folder() / "profiles").glob("*.toml")))
+def test_every_profile_of_the_product_is_valid(name):
+    assert load_profile(name).name == name
+
+
+def test_default_profile_is_the_unit_of_the_issue():
+    profile = load_profile()
+    assert (profile.camera.width, profile.camera.height, profile.camera.fov_deg) == (937, 937, 42.0)
+    assert profile.parameters["update_rate"] == 1.0
+    assert profile.links.serial.dialect == "b"
+
+
+def test_a_profile_extends_another_table_by_table(tmp_path):
+    path = write(
+        tmp_path,
+        'extends = "demo"\nname = "mine"\n[links.serial]\ndialect = "a"\n[parameters]\nexposure = 50\n',
+    )
+    profile = load_profile(path)
+    assert profile.links.serial.dialect == "a"
+    assert profile.links.serial.baud == 921600
+    assert profile.parameters == {"exposure": 50, "update_rate": 5.0}
+    assert isinstance(profile.truth, SlewConfig)
+    assert profile.folder == tmp_path
+
+
+def test_another_kind_of_truth_replaces_the_whole_table(tmp_path):
+    path = write(tmp_path, 'extends = "demo"\n[truth]\nkind = "rate"\nrate_deg_s = [0.0, 0.1, 0.0]\n')
+    assert load_profile(path).truth.kind == "rate"
+
+
+def test_a_profile_extends_a_path_beside_it(tmp_path):
+    write(tmp_path, "[run]\nseed = 77\n", "base.toml")
+    assert load_profile(write(tmp_path, 'extends = "base.toml"\n')).run.seed == 77
+
+
+def test_overrides_are_toml_or_text():
+    profile = load_profile(
+        "demo", ["run.seed=5", "run.clock=stepped", "camera.distortion=[0.1]", "truth.kind=fixed"]
+    )
+    assert (profile.run.seed, profile.run.clock, profile.camera.distortion) == (5, "stepped", [0.1])
+    assert profile.truth.kind == "fixed"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean 'seed'?"),
+        ("[rum]\nseed = 1\n", "rum: unknown key; did you mean 'run'?"),
+        ("[run]\nseed = -1\n", "run.seed: input should be greater than or equal to 0 (given: -1)"),
+        ("[run]\nseed = '1'\n", "run.seed: input should be a valid integer (given: '1')"),
+        ("[links.can]\naddress = 255\n", "links.can.address"),
+        ("[truth]\nkind = 'wobble'\n", "truth"),
+        ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: field required"),
+        ("[truth]\nkind = 'rate'\nrate_rad_s = [0, 0, 1]\n", "truth.rate_"),
+        ("[truth]\nkind = 'fixed'\nattitude = {ra_deg = 1.0}\n", "give ra_deg and dec_deg"),
+        ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),
+        ("[truth]\nkind = 'slew'\nsegments = [{do = 'hold', secs = 1.0}]\n", "truth.segments.0.sec"),
+        ("[parameters]\nserial_baud = 9600\n", "parameters.serial_baud: set links.serial.baud instead"),
+        ("[run\n", "not TOML"),
+        ('extends = "no_such"\n', "no_such"),
+        ("extends = 3\n", "extends"),
+    ],
+)
+def test_a_bad_profile_is_named_with_file_key_and_remedy(tmp_path, text, said):
+    path = write(tmp_path, text)
+    message = refusal(path)
+    assert said in message
+    if "no_such" not in said:
+        assert path in message
+
+
+def test_a_profile_that_extends_itself_is_refused(tmp_path):
+    path = write(tmp_path, 'extends = "mine.toml"\n')
+    assert "extend itself" in refusal(path)
+
+
+def test_unknown_names_tell_the_known_ones():
+    assert "cubestar" in refusal("cubestr")
+
+
+@pytest.mark.parametrize("override", ["seed", "run.seed", "=3", "run.seed.x=3", ".=1"])
+def test_a_bad_override_is_named(override):
+    assert override in refusal(
+        "cubestar", [override, *(["run.seed=1"] if override == "run.seed.x=3" else [])]
+    )

@@ -1,0 +1,124 @@
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.errors import EmulatorError
+from emulator.state_store import STATE_FILE, FileStore
+
+STATE = {"boot_count": 3, "parameters": {"exposure": 50, "analog_gain": 1.5, "serial_dialect": "a"}}
+
+
+def test_state_comes_back(tmp_path):
+    store = FileStore(tmp_path / "deep" / "state")
+    assert store.load() == {}
+    store.save(STATE)
+    store.close()
+    again = FileStore(tmp_path / "deep" / "state")
+    assert again.load() == STATE
+    assert not again.corrupt
+    again.close()
+
+
+def test_a_folder_serves_one_emulator_at_a_time(tmp_path):
+    store = FileStore(tmp_path)
+    with pytest.raises(EmulatorError, match="in use by another"):
+        FileStore(tmp_path)
+    store.close()
+    FileStore(tmp_path).close()
+
+
+def test_a_folder_that_cannot_be_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(EmulatorError, match="--state-dir"):
+        FileStore(tmp_path / "file")
+
+
+def damaged(data: bytes, kind: str) -> bytes:
+    return {
+        "truncated": data[: len(data) // 2],
+        "empty": b"",
+        "other": b'{"format": 1}',
+        "list": b"[]",
+        "changed": data.replace(b"50", b"51"),
+        "binary": bytes(range(256)),
+        "other format": data.replace(b'"format": 1', b'"format": 2'),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["truncated", "empty", "other", "list", "changed", "binary", "other format"])
+def test_a_corrupt_file_gives_defaults_and_a_flag_and_is_set_aside(tmp_path, kind):
+    store = FileStore(tmp_path)
+    store.save(STATE)
+    path = tmp_path / STATE_FILE
+    bad = damaged(path.read_bytes(), kind)
+    path.write_bytes(bad)
+    assert store.load() == {}
+    assert store.corrupt
+    assert (tmp_path / (STATE_FILE + ".corrupt")).read_bytes() == bad
+    store.save(STATE)
+    assert store.load() == STATE
+    store.close()
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(junk=st.binary(max_size=300))
+def test_no_content_of_the_file_is_a_crash(tmp_path_factory, junk):
+    folder = tmp_path_factory.mktemp("state")
+    store = FileStore(folder)
+    (folder / STATE_FILE).write_bytes(junk)
+    assert store.load() == {}
+    assert store.corrupt
+    store.close()
+
+
+def test_a_failing_disk_leaves_the_old_state(tmp_path, monkeypatch):
+    store = FileStore(tmp_path)
+    store.save(STATE)
+
+    def full(_fd):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(EmulatorError, match="No space left"):
+        store.save({"boot_count": 4})
+    monkeypatch.undo()
+    assert store.load() == STATE
+    store.close()
+
+
+@pytest.mark.process()
+def test_a_killed_writer_leaves_a_whole_state(tmp_path):
+    program = textwrap.dedent(
+        """
+        import sys
+        from pathlib import Path
+        from emulator.state_store import FileStore
+        store = FileStore(Path(sys.argv[1]))
+        n = 0
+        while True:
+            n += 1
+            store.save({"boot_count": n, "parameters": {"x": "y" * 20000}})
+            print(n, flush=True)
+        """
+    )
+    for _ in range(5):
+        process = subprocess.Popen(
+            [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(7):
+            last = int(process.stdout.readline())
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        store = FileStore(tmp_path)
+        state = store.load()
+        assert not store.corrupt
+        assert state["boot_count"] >= last
+        assert json.dumps(state)
+        store.close()
