@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Final
 
 import can
+from can.interfaces.socketcan import SocketcanBus
 
 from protocol.can_framing import CanFrame
 from protocol.errors import ProtocolError
@@ -23,6 +24,10 @@ CanTransport = Transport[CanFrame]
 
 DEFAULT_BITRATE: Final = 1_000_000
 
+RECEIVE_BUFFER: Final = 4 * 1024 * 1024
+"""Receive buffer of a kernel CAN socket (bytes), where the system allows it."""
+
+_SO_RCVBUFFORCE: Final = 33
 _SIOCGIFFLAGS: Final = 0x8913
 _IFF_UP: Final = 1
 _FORMS: Final = "auto, a kernel interface (vcan0), socketcand:HOST:PORT/BUS, virtual:NAME, udp_multicast:GROUP, slcan:PORT"
@@ -98,9 +103,20 @@ def _python_can(interface: str, channel: str, bitrate: int) -> CanTransport:
 
 
 def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
-    if interface == "socketcan":
-        _check_kernel(channel)
-    return can.Bus(interface=interface, channel=channel, **options)
+    if interface != "socketcan":
+        return can.Bus(interface=interface, channel=channel, **options)
+    _check_kernel(channel)
+    bus = SocketcanBus(channel)
+    _widen(bus.socket)
+    return bus
+
+
+def _widen(kernel_socket: socket.socket) -> None:
+    """Give a socket a buffer for a burst of some thousand frames, as far as we may: the kernel drops what overflows."""
+    try:
+        kernel_socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
+    except PermissionError:
+        kernel_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
 
 
 def _check_kernel(channel: str) -> None:

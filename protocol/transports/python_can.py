@@ -28,6 +28,9 @@ READ_TIMEOUT_S: Final = 0.2
 READS_PER_TURN: Final = 256
 """Frames read before the loop serves others."""
 
+SENDS_PER_TURN: Final = 64
+"""Frames sent before the loop serves others."""
+
 ECHO_S: Final = 0.5
 """How long an own frame is expected to come back on buses that echo."""
 
@@ -56,7 +59,7 @@ class PythonCanTransport(Transport[CanFrame]):
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._queue: deque[CanFrame] = deque()
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.Handle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
         self._comeback: asyncio.Task[None] | None = None
@@ -153,12 +156,17 @@ class PythonCanTransport(Transport[CanFrame]):
             return False
         self._queue.append(item)
         if self._timer is None:
-            self._work()
+            self._idle.clear()
+            self._timer = asyncio.get_running_loop().call_soon(self._work)
         return True
 
     def _work(self) -> None:
+        """Send what the bus takes, a few frames a turn: the kernel drops what nobody reads in between."""
         self._timer = None
-        while self._queue and self._bus is not None:
+        loop = asyncio.get_running_loop()
+        for _ in range(SENDS_PER_TURN):
+            if not self._queue or self._bus is None:
+                break
             frame = self._queue[0]
             try:
                 self._bus.send(_message(frame), timeout=0)
@@ -166,15 +174,17 @@ class PythonCanTransport(Transport[CanFrame]):
                 if not _is_full(error):
                     self._lost(str(error))
                     return
-                self._idle.clear()
-                self._timer = asyncio.get_running_loop().call_later(RETRY_S, self._work)
+                self._timer = loop.call_later(RETRY_S, self._work)
                 return
             self._queue.popleft()
             self.statistics.sent += 1
             if self._echoes is not None:
                 bare = CanFrame(frame.id, frame.data, frame.extended, frame.remote)
                 self._echoes.append((time.monotonic(), bare))
-        self._idle.set()
+        if self._queue:
+            self._timer = loop.call_soon(self._work)
+        else:
+            self._idle.set()
 
     def _lost(self, why: str) -> None:
         if self._closing or self._bus is None:

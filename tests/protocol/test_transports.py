@@ -543,7 +543,7 @@ def test_a_server_that_is_no_socketcand_is_told(greeting: bytes) -> None:
         pytest.param(
             "can77",
             "no such interface",
-            marks=pytest.mark.skipif(not HAS_VCAN, reason="this kernel has no CAN"),
+            marks=[pytest.mark.socketcan, pytest.mark.skipif(not HAS_VCAN, reason="this kernel has no CAN")],
         ),
     ],
 )
