@@ -63,9 +63,9 @@ class CalibrationFrame:
         Measured positions, pixels.
     reference : ndarray (n, 3)
         Catalogue directions of the same stars, unit vectors, ICRS.
-    sigma_px : ndarray (n,), optional
-        Standard deviation of each position on each axis; without it all are equal and the noise is
-        estimated from the residuals.
+    sigma_px : ndarray (n,) or (n, 2), optional
+        Standard deviation of each position, the same on both axes or along x and y; without it all are
+        equal and the noise is estimated from the residuals.
     attitude : Attitude, optional
         Start value; without it Wahba's problem is solved with the start camera.
     """
@@ -88,9 +88,17 @@ class CalibrationFrame:
             raise StaridError(f"calibration: a frame with {n} matched stars; at least 2 needed")
         if self.sigma_px is not None:
             sigma = np.asarray(self.sigma_px, dtype=np.float64)
-            if sigma.shape != (n,) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+            if sigma.shape not in ((n,), (n, 2)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
                 raise StaridError(f"calibration: {n} positive finite standard deviations needed in a frame")
             object.__setattr__(self, "sigma_px", sigma)
+
+    @property
+    def axis_sigmas(self) -> Array:
+        """Standard deviations (n, 2) along x and y, pixels; ones where none were given."""
+        n = len(self.xy_px)
+        if self.sigma_px is None:
+            return np.ones((n, 2))
+        return np.broadcast_to(self.sigma_px if self.sigma_px.ndim == 2 else self.sigma_px[:, None], (n, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +213,7 @@ class _Bundle:
     def __init__(self, frames: Sequence[CalibrationFrame], camera: Camera, estimate: Sequence[str]) -> None:
         self.frames = tuple(frames)
         self.camera = camera
-        self.sigmas = tuple(np.ones(len(f.xy_px)) if f.sigma_px is None else f.sigma_px for f in frames)
+        self.sigmas = tuple(frame.axis_sigmas for frame in frames)
         self.has_sigmas = all(f.sigma_px is not None for f in frames)
         self.used: tuple[NDArray[np.bool_], ...] = tuple(
             np.ones(len(f.xy_px), dtype=np.bool_) for f in frames
@@ -247,7 +255,7 @@ class _Bundle:
 
     def distances(self, residuals: list[Array]) -> list[Array]:
         """Residuals over standard deviation, lengths (n,)."""
-        return [np.hypot(r[:, 0], r[:, 1]) / s for r, s in zip(residuals, self.sigmas, strict=True)]
+        return [np.linalg.norm(r / s, axis=1) for r, s in zip(residuals, self.sigmas, strict=True)]
 
     def scale(self, distances: list[Array]) -> float:
         """Spread of the residuals on one axis, from the median of their lengths, in standard deviations."""
@@ -315,7 +323,7 @@ class _Bundle:
             distortion=cast("tuple[float, float, float, float, float]", tuple(distortion)),
         )
         lengths = np.concatenate([(r[u] ** 2).sum(axis=1) for r, u in zip(residuals, self.used, strict=True)])
-        weights = np.concatenate([s[u] ** -2.0 for s, u in zip(self.sigmas, self.used, strict=True)])
+        weights = np.concatenate([s[u].ravel() ** -2.0 for s, u in zip(self.sigmas, self.used, strict=True)])
         return Calibration(
             camera=camera,
             attitudes=state.attitudes,
@@ -345,15 +353,16 @@ class _System:
         for frame, attitude, used, sigma in frames:
             vectors = attitude.to_sensor(frame.reference[used])
             residual = frame.xy_px[used] - project_kernel(params, vectors)[0]
-            lengths = np.hypot(residual[:, 0], residual[:, 1]) / (sigma[used] * scale)
+            lengths = np.linalg.norm(residual / sigma[used], axis=1) / scale
             weight = sigma[used] ** -2.0
             if robust:
-                weight = weight * np.minimum(1.0, _HUBER / np.maximum(lengths, _HUBER))
+                weight = weight * np.minimum(1.0, _HUBER / np.maximum(lengths, _HUBER))[:, None]
             by_camera = _camera_slopes(params, vectors) @ bundle.freedom
             by_turn = _turn_slopes(params, vectors)
-            weighted = by_turn * weight[:, None, None]
-            self.cc = self.cc + np.einsum("nij,nik->jk", by_camera * weight[:, None, None], by_camera)
-            self.gc = self.gc + np.einsum("nij,n,ni->j", by_camera, weight, residual)
+            weighted = by_turn * weight[:, :, None]
+            pulled = by_camera * weight[:, :, None]
+            self.cc = self.cc + np.einsum("nij,nik->jk", pulled, by_camera)
+            self.gc = self.gc + np.einsum("nij,ni->j", pulled, residual)
             self.ca.append(np.einsum("nij,nik->jk", by_camera, weighted).reshape(p, 3))
             self.aa.append(np.einsum("nij,nik->jk", weighted, by_turn))
             self.ga.append(np.einsum("nij,ni->j", weighted, residual))

@@ -116,8 +116,8 @@ def self_calibrate(
     refused: dict[int, str] = {}
     faintest = -np.inf
     for index, stars in enumerate(frames):
-        sigma = _axis_sigma(stars)
-        solution = identifier.identify(stars.xy_px, stars.flux, sigma)
+        sigma = _floored_sigma(stars)
+        solution = identifier.identify(stars.xy_px, stars.flux, None if sigma is None else _one_axis(sigma))
         if not solution.valid:
             refused[index] = solution.reason.value
             continue
@@ -146,14 +146,18 @@ def self_calibrate(
     return SelfCalibration(result, indices, refused)
 
 
-def _axis_sigma(stars: Stars) -> Array | None:
-    """Error of each position on one axis, with a floor for what no detector knows of itself."""
+def _floored_sigma(stars: Stars) -> Array | None:
+    """Errors of the positions as given, with a floor for what no detector knows of itself."""
     if stars.xy_sigma_px is None:
         return None
-    sigma = np.asarray(stars.xy_sigma_px, dtype=np.float64)
-    squares = sigma**2 if sigma.ndim == 1 else np.mean(sigma**2, axis=1)
-    floored: Array = np.sqrt(squares + _SIGMA_FLOOR_PX**2)
+    floored: Array = np.hypot(stars.xy_sigma_px, _SIGMA_FLOOR_PX)
     return floored
+
+
+def _one_axis(sigma: Array) -> Array:
+    """Error on one axis (n,) of errors (n,) or (n, 2)."""
+    mean: Array = sigma if sigma.ndim == 1 else np.sqrt(np.mean(sigma**2, axis=1))
+    return mean
 
 
 def _frame(
@@ -180,7 +184,7 @@ def _rematched(
     _, of_detection = cKDTree(measured).query(xy)
     chosen = np.flatnonzero(np.isfinite(distance))
     chosen = chosen[of_detection[of_catalog[chosen]] == chosen]
-    return _frame(stars, _axis_sigma(stars), chosen, sky.vectors[near[of_catalog[chosen]]], attitude)
+    return _frame(stars, _floored_sigma(stars), chosen, sky.vectors[near[of_catalog[chosen]]], attitude)
 
 
 def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:
@@ -211,10 +215,9 @@ def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], noise: floa
     """Sum of squared residuals in units of the noise, each star's share bounded."""
     total = 0.0
     for residual, frame in zip(result.residual_px, frames, strict=True):
-        sigma = np.full(len(residual), noise)
-        if frame.sigma_px is not None:
-            sigma = noise * frame.sigma_px / np.sqrt(1.0 / np.mean(frame.sigma_px**-2.0))
-        total += float(np.minimum((residual**2).sum(axis=1) / sigma**2, _WINDOW_SIGMAS**2).sum())
+        sigma = frame.axis_sigmas
+        squares = ((residual / sigma) ** 2).sum(axis=1) / (noise**2 * np.mean(sigma**-2.0))
+        total += float(np.minimum(squares, _WINDOW_SIGMAS**2).sum())
     return total
 
 

@@ -161,6 +161,22 @@ def test_given_sigmas_weigh_the_stars(sky: StarCatalog) -> None:
     assert error < 4.0 * weighted.sigmas["fx"]
 
 
+def test_errors_may_differ_along_x_and_y(sky: StarCatalog) -> None:
+    """Trails blur x only: the camera is as good as the sharp axis allows, and the covariance knows it."""
+    frames, _ = simulated(sky, WIDE, 4, 10)
+    rng = np.random.default_rng(10)
+    trailed = []
+    for frame in frames:
+        shift = np.column_stack([rng.normal(0.0, 3.0, len(frame.xy_px)), np.zeros(len(frame.xy_px))])
+        sigma = np.broadcast_to([np.hypot(3.0, SIGMA_PX), SIGMA_PX], shift.shape)
+        trailed.append(CalibrationFrame(frame.xy_px + shift, frame.reference, sigma))
+    result = calibrate(trailed, DEFAULT_CAMERA, WITH_ASPECT)
+    assert result.sigmas["fy"] < 0.5 * result.sigmas["fx"]
+    error = (values(result.camera) - values(WIDE))[:8]
+    assert 0.1 < error @ np.linalg.solve(result.covariance[:8, :8], error) / 8.0 < 3.0
+    assert abs(error[1]) < 4.0 * result.sigmas["fy"]
+
+
 def test_bad_calibrations_are_refused(sky: StarCatalog) -> None:
     frames, _ = simulated(sky, WIDE, 1, 8)
     with pytest.raises(StaridError, match="'k9'"):
