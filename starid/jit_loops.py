@@ -7,6 +7,8 @@ from typing import TypeVar, cast
 
 from numba import njit
 
+from starid.jit import stamped
+
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 
@@ -16,10 +18,11 @@ def compiled_loops(function: Kernel) -> Kernel:
     Without numba's test of every divisor a loop over pixels has no branch left and becomes vector instructions.
     The result is cached on disk and runs free of the interpreter's lock.
     """
-    return cast("Kernel", njit(cache=True, nogil=True, error_model="numpy")(function))
+    return cast("Kernel", stamped(njit(cache=True, nogil=True, error_model="numpy")(function)))
 
 
 def compiled_sums(function: Kernel) -> Kernel:
     """As `compiled_loops`, and sums may be taken in any order, so that they become vector instructions too."""
     fast = {"reassoc", "nsz", "contract"}
-    return cast("Kernel", njit(cache=True, nogil=True, error_model="numpy", fastmath=fast)(function))
+    kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath=fast)(function)
+    return cast("Kernel", stamped(kernel))

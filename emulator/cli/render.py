@@ -90,7 +90,7 @@ def _equipment(
     if profile is not None:
         from emulator.profile import load_profile
 
-        loaded, _ = load_profile(profile)
+        loaded = load_profile(profile)
         values = loaded.camera.values()
         sensor = sensor.with_(**loaded.sensor)
     if fov is not None or size is not None or model is not None:
