@@ -92,7 +92,7 @@ def test_a_failing_disk_leaves_the_old_state(tmp_path, monkeypatch):
     store.close()
 
 
-@pytest.mark.process()
+@pytest.mark.process
 def test_a_killed_writer_leaves_a_whole_state(tmp_path):
     program = textwrap.dedent(
         """
