@@ -18,9 +18,7 @@ from emulator.cycle import FrameCycle
 from emulator.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
 from emulator.imager import Answer, Imager
 from emulator.scheduler import Scheduler
-
-FRAME_BYTES: Final = 128
-"""Bytes of one frame of a download."""
+from protocol.image_transfer import FRAME_SIZE
 
 STORE_S: Final = 0.1
 """Time that the device takes to store an image, seconds."""
@@ -197,14 +195,14 @@ class ImageStore:
     @property
     def frames(self) -> int:
         """Number of frames of the open download; 0 if none is open."""
-        return 0 if self.download is None else len(self.download.pixels) // FRAME_BYTES
+        return 0 if self.download is None else len(self.download.pixels) // FRAME_SIZE
 
     def frame_bytes(self) -> bytes:
         """Return the loaded frame of the open download."""
         if self.download is None:
-            return bytes(FRAME_BYTES)
-        start = self.frame * FRAME_BYTES
-        return self.download.pixels[start : start + FRAME_BYTES]
+            return bytes(FRAME_SIZE)
+        start = self.frame * FRAME_SIZE
+        return self.download.pixels[start : start + FRAME_SIZE]
 
 
 def edge_of(size_name: str) -> int:

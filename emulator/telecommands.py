@@ -190,7 +190,7 @@ def _set_hole_map(part: int) -> Handler:
     def set_hole_map(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
         """120 to 127: tell which packets have arrived."""
         data = values["map"]
-        device.files.set_hole_map(part, data if isinstance(data, bytes) else b"")
+        device.files.arrived.set_part(part, data if isinstance(data, bytes) else b"")
         return []
 
     return set_hole_map

@@ -11,6 +11,7 @@ from emulator.file_download import hole_map_values
 from emulator.frames import MatchedStar
 from emulator.refusal import Refused
 from emulator.reported import Reported, reported
+from protocol.image_transfer import frame_checksum
 from protocol.messages import ErrorCode
 from protocol.values import Value
 
@@ -276,7 +277,7 @@ def image_frame(device: Device) -> Values:
 def image_frame_info(device: Device) -> Values:
     """193: number and checksum of the loaded frame."""
     data = device.images.frame_bytes()
-    return {"frame": device.images.frame, "checksum": sum(data) % 256}
+    return {"frame": device.images.frame, "checksum": frame_checksum(data)}
 
 
 def image_status(device: Device) -> Values:

@@ -1,0 +1,178 @@
+"""Image capture and both ways of download, over the device's own requests."""
+
+import binascii
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from emulator.images import StoredImage
+from protocol.messages import ErrorCode, ReplyKind, Request
+
+
+def save(bench, size="size_64"):
+    assert bench.command("save_image", image_size=size) is ErrorCode.OK
+    bench.step(1.3)
+    assert bench.read("image_status") == {"percent": 100, "status": "ok"}
+
+
+def download(bench, edge, size_name):
+    assert bench.command("init_image_download", image_size=size_name) is ErrorCode.OK
+    pixels = b""
+    for frame in range(edge * edge // 128):
+        assert bench.command("advance_image_download", next_frame=frame) is ErrorCode.OK
+        data = bench.read("image_frame")["data"]
+        assert bench.read("image_frame_info") == {"frame": frame, "checksum": sum(data) % 256}
+        pixels += data
+    return np.frombuffer(pixels, np.uint8).reshape(edge, edge)
+
+
+@pytest.mark.parametrize("edge", [64, 128, 256])
+def test_an_image_is_captured_in_standby_and_downloaded_by_frames(bench, edge):
+    save(bench, f"size_{edge}")
+    image = download(bench, edge, f"size_{edge}")
+    assert (image == np.arange(edge, dtype=np.uint8)[np.newaxis] % 251).all()
+    assert not bench.picture.frames[-1].solve
+    assert bench.read("device_status")["image_stored"]
+
+
+def test_capture_takes_the_next_frame_while_frames_run(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    count = len(bench.picture.frames)
+    bench.command("save_image", image_size="size_64")
+    assert bench.read("image_status")["status"] == "waiting_sensor"
+    assert bench.read("image_status")["percent"] == 0
+    bench.step(0.61)
+    assert bench.read("image_status") == {"percent": 50, "status": "waiting_frame"}
+    bench.step(0.1)
+    assert bench.read("image_status") == {"percent": 100, "status": "ok"}
+    assert bench.device.images.stored.frame == bench.picture.frames[count].index
+    assert all(request.solve for request in bench.picture.frames)
+
+
+def test_only_one_capture_at_a_time(bench):
+    bench.command("save_image", image_size="size_64")
+    assert bench.command("save_image", image_size="size_64") is ErrorCode.BUSY
+    assert bench.command("init_image_download", image_size="size_64") is ErrorCode.BUSY
+    bench.step(1.0)
+    assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
+
+
+def test_other_cameras_do_not_exist(bench):
+    assert bench.command("save_image", camera="camera_1", image_size="size_64") is ErrorCode.INVALID_PARAMETER
+
+
+def test_download_needs_an_image_and_its_frames(bench):
+    assert bench.command("init_image_download", image_size="size_64") is ErrorCode.SEQUENCE
+    assert bench.command("advance_image_download", next_frame=0) is ErrorCode.SEQUENCE
+    save(bench, "size_64")
+    assert bench.command("init_image_download", image_size="size_128") is ErrorCode.INVALID_PARAMETER
+    assert bench.command("init_image_download", image_size="size_64") is ErrorCode.OK
+    assert bench.command("advance_image_download", next_frame=31) is ErrorCode.OK
+    assert bench.command("advance_image_download", next_frame=32) is ErrorCode.INVALID_PARAMETER
+    assert bench.read("image_frame_info")["frame"] == 31
+
+
+def test_the_image_stays_while_another_is_captured(bench):
+    save(bench, "size_64")
+    bench.command("init_image_download", image_size="size_64")
+    bench.command("advance_image_download", next_frame=3)
+    before = bench.read("image_frame")["data"]
+    first = bench.device.images.download
+    bench.command("save_image", image_size="size_128")
+    bench.step(1.0)
+    assert bench.device.images.stored.edge == 128
+    assert bench.device.images.download is first
+    assert bench.read("image_frame")["data"] == before
+
+
+def test_the_last_frame_can_be_downloaded_without_a_capture(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    assert bench.command("init_image_download", sram=1, image_size="size_64") is ErrorCode.OK
+    assert not bench.read("acknowledge")["processed"]
+    row = bench.icd.telemetry["image_frame"]
+    assert bench.device.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
+    bench.step(0.2)
+    assert bench.read("acknowledge")["processed"]
+    assert bench.device.images.download.frame == bench.picture.frames[-1].index
+    assert len(bench.read("image_frame")["data"]) == 128
+
+
+def test_without_any_frame_there_is_no_last_one(bench):
+    bench.command("init_image_download", sram=1, image_size="size_64")
+    bench.step(0.2)
+    assert bench.read("acknowledge")["error"] == "sequence"
+
+
+def test_a_smaller_size_is_the_mean_over_squares():
+    pixels = np.random.default_rng(1).integers(0, 256, (128, 128), dtype=np.uint8)
+    small = StoredImage(128, pixels.tobytes(), 0, 1).binned(64)
+    expected = cv2.resize(pixels.astype(np.float64), (64, 64), interpolation=cv2.INTER_AREA)
+    got = np.frombuffer(small.pixels, np.uint8).reshape(64, 64)
+    assert np.abs(got - expected).max() <= 0.5
+
+
+def test_a_reset_forgets_images(bench):
+    save(bench)
+    bench.command("reset")
+    bench.step(1.0)
+    assert not bench.read("device_status")["image_stored"]
+
+
+# --- files in bursts ---
+
+
+def load(bench, file_type, offset, length, counter=0):
+    return bench.command(
+        "load_file_block", file_type=file_type, file_counter=counter, offset=offset, length=length
+    )
+
+
+def test_the_image_comes_as_a_bmp_file_by_bursts_with_holes(bench):
+    save(bench, "size_64")
+    assert load(bench, "index", 0, 12) is ErrorCode.OK
+    index = bench.device.files.data
+    kind, number, edge, size, _frame = struct.unpack("<BBHII", index)
+    assert (kind, edge) == (4, 64)
+    file = b""
+    while len(file) < size:
+        length = min(2000, size - len(file))
+        assert load(bench, "bmp", len(file), length, number) is ErrorCode.OK
+        block = bench.read("file_block")
+        assert (block["ready"], block["length"]) == (True, length)
+        packets = bench.send("start_burst", ignore_hole_map=True)[1:]
+        assert {(p.kind, p.id, len(p.data)) for p in packets} == {(ReplyKind.BURST, 119, 22)}
+        parts = dict(struct.unpack("<H20s", p.data) for p in packets)
+        data = b"".join(parts[n] for n in range(len(parts)))[:length]
+        assert binascii.crc_hqx(data, 0xFFFF) == block["checksum"]
+        file += data
+    image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (64, 64)
+    assert (image == np.arange(64, dtype=np.uint8)[np.newaxis]).all()
+
+
+def test_a_burst_sends_only_what_the_hole_map_lacks(bench):
+    save(bench, "size_64")
+    load(bench, "bmp", 0, 4000)
+    arrived = bytearray(16)
+    for number in (0, 5, 127):
+        arrived[number // 8] |= 1 << number % 8
+    bench.command("set_hole_map_1", map=bytes(arrived))
+    bench.command("set_hole_map_2", map=b"\xff" * 16)
+    assert bench.read("hole_map_2")["map"] == b"\xff" * 16
+    numbers = [struct.unpack_from("<H", p.data)[0] for p in bench.send("start_burst")[1:]]
+    assert numbers == [n for n in range(128) if n not in {0, 5, 127}]
+
+
+@pytest.mark.parametrize(
+    ("file_type", "offset", "length"),
+    [("jpg", 0, 10), ("telemetry", 0, 10), ("bmp", 5100, 200), ("index", 0, 13)],
+)
+def test_files_that_are_not_there_are_refused(bench, file_type, offset, length):
+    save(bench, "size_64")
+    assert load(bench, file_type, offset, length) is ErrorCode.INVALID_PARAMETER
+    assert bench.read("file_block") == {"ready": False, "parameter_error": True, "checksum": 0, "length": 0}
+    assert bench.command("start_burst") is ErrorCode.SEQUENCE
