@@ -19,8 +19,8 @@ from hil_tests.errors import EmulatorProcessError
 
 STARHIL: Final = "from emulator.cli.app import main; main()"
 """What the command `starhil` does, for a Python whose script folder is not known."""
-READY_WITHIN_S: Final = 60.0
-"""A first start may have to compile and to read the star catalogue; a warm one takes about 3 s."""
+READY_WITHIN_S: Final = 300.0
+"""A first start on a machine compiles for minutes; a warm one takes about 3 s."""
 STOP_WITHIN_S: Final = 15.0
 SHOWN_LINES: Final = 5
 """Lines of the emulator's own output that an error message carries."""
