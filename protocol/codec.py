@@ -132,7 +132,7 @@ class Field:
 
     @cached_property
     def empty(self) -> bool | int | float | str | bytes:
-        """The value that telemetry carries where none is given: the default, else zero."""
+        """The value that telemetry carries where none is given: the default, else zero moved into the limits."""
         if self.default is not None:
             return self.default
         match self.kind:
@@ -146,7 +146,8 @@ class Field:
             case "text":
                 return ""
             case "float":
-                return 0.0
+                low, high = self.physical_limits
+                return min(max(0.0, low), high)
             case _:
                 return min(max(0, self.raw_limits[0]), self.raw_limits[1]) * self.scale + self.bias
 
@@ -374,11 +375,4 @@ class Row:
 
     def example(self) -> dict[str, Value]:
         """Return values that the row accepts: defaults, else zeros moved into the limits."""
-        return {name: self._example_of(item) for name, item in self.named_fields.items()}
-
-    @staticmethod
-    def _example_of(item: Field) -> Value:
-        if item.kind == "float" and item.default is None:
-            low, high = item.physical_limits
-            return min(max(0.0, low), high)
-        return item.empty
+        return {name: item.empty for name, item in self.named_fields.items()}

@@ -18,7 +18,7 @@ REMOTE_FLAG: Final = 0x40000000
 MAX_COMMAND: Final = 256
 """Longest command that is taken; a frame needs at most 60 characters."""
 
-_NOT_HEX: Final = b"0123456789abcdefABCDEF "
+_HEX: Final = b"0123456789abcdefABCDEF "
 
 
 class CommandError(ProtocolError):
@@ -51,7 +51,7 @@ class CommandSplitter:
 def parse_send(command: bytes) -> CanFrame:
     """Read `send ID LEN B B …`. Raises CommandError naming what is wrong."""
     words = command.split()
-    if len(words) < 3 or command[5:].translate(None, _NOT_HEX):
+    if len(words) < 3 or words[0] != b"send" or command[len(words[0]) :].translate(None, _HEX):
         raise CommandError("malformed send: must be send ID LENGTH BYTES in hexadecimal")
     identifier, length, digits = words[1], int(words[2], 16), words[3:]
     if len(digits) != length or length > 8:
