@@ -223,7 +223,9 @@ def test_a_corrupt_store_gives_defaults_and_a_flag(make_bench, tmp_path):
 
 def test_stored_values_that_are_no_longer_allowed_are_passed_over(make_bench, tmp_path):
     store = FileStore(tmp_path)
-    store.save({"boot_count": "x", "parameters": {"exposure": 1e9, "colour": 3, "analog_gain": 2.0, "k1": None}})
+    store.save(
+        {"boot_count": "x", "parameters": {"exposure": 1e9, "colour": 3, "analog_gain": 2.0, "k1": None}}
+    )
     bench = make_bench(store=store).start()
     assert bench.device.parameters["exposure"] == 100
     assert bench.device.parameters["analog_gain"] == 2.0
@@ -268,7 +270,9 @@ def test_time_is_set_and_used_for_stamps(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(1.0)
     attitude = bench.read("precise_attitude")
-    assert attitude["time_of_exposure"] == pytest.approx(1_800_000_000.300, abs=1e-6)  # half of 100 ms after the start
+    assert attitude["time_of_exposure"] == pytest.approx(
+        1_800_000_000.300, abs=1e-6
+    )  # half of 100 ms after the start
     assert attitude["time_set"]
 
 
@@ -295,7 +299,14 @@ def test_attitude_agrees_with_the_truth_in_every_row(make_bench):
     assert (precise["stars_detected"], precise["stars_matched"]) == (40, 35)
     assert (precise["uncertainty_cross"], precise["uncertainty_roll"]) == (1.5, 6.0)
     combined = bench.read("star_tracker")
-    for row in ("star_performance_1", "star_performance_2", "star_magnitudes", "star_timing", "rates", "quaternion"):
+    for row in (
+        "star_performance_1",
+        "star_performance_2",
+        "star_magnitudes",
+        "star_timing",
+        "rates",
+        "quaternion",
+    ):
         for name, value in bench.read(row).items():
             assert combined[name] == value, name
 
@@ -314,7 +325,9 @@ def test_tracking_predicts_with_the_rate(make_bench):
     bench.command("set_parameter", parameter=28, value=0.0)  # prediction off: the last attitude as it was
     bench.step(1.0)
     last = bench.picture.frames[-1]
-    off = Attitude(np.array(last.predicted_xyzw)).error_to(Attitude(np.array(last.attitude_xyzw))).total_arcsec
+    off = (
+        Attitude(np.array(last.predicted_xyzw)).error_to(Attitude(np.array(last.attitude_xyzw))).total_arcsec
+    )
     assert off == pytest.approx(0.5 * 3600.0, rel=1e-6)
 
 
@@ -385,7 +398,11 @@ def test_three_brightest_stars_are_reported(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(1.5)
     first, second = bench.read("star_1_raw"), bench.read("star_2_raw")
-    assert first == {"star_1_catalogue": 32349, "star_1_x": pytest.approx(-382.0), "star_1_y": pytest.approx(356.6)}
+    assert first == {
+        "star_1_catalogue": 32349,
+        "star_1_x": pytest.approx(-382.0),
+        "star_1_y": pytest.approx(356.6),
+    }
     assert second["star_2_catalogue"] == 101772 % 65536
     magnitudes = bench.read("star_magnitudes")
     assert magnitudes["magnitude_1"] == pytest.approx(-1.44, abs=CENTIMAG)
@@ -405,7 +422,7 @@ def test_performance_and_timing_come_from_the_frame(bench):
     }  # fmt: skip
     assert two["sample_period"] == 1000
     assert two["confidence_1"] == 100
-    assert two["capture_ok"] and two["detection_ok"] and two["identification_ok"] and two["attitude_ok"]
+    assert all(two[f"{step}_ok"] for step in ("capture", "detection", "identification", "attitude"))
     model = Profile().timing
     assert timing["capture_duration"] == round(100 + model.readout_s * 1e3)
     assert timing["detection_duration"] == round((model.detect_s + 40 * model.detect_per_star_s) * 1e3)
@@ -467,7 +484,9 @@ def test_delay_time_moves_the_exposure(make_bench):
 
 def test_star_config_sets_all_or_nothing(bench):
     config = bench.read("star_config")
-    assert bench.command("set_star_config", **{**config, "exposure": 77, "focal_length": 1300.0}) is ErrorCode.OK
+    assert (
+        bench.command("set_star_config", **{**config, "exposure": 77, "focal_length": 1300.0}) is ErrorCode.OK
+    )
     assert bench.read("star_config")["exposure"] == 77
     good = bench.icd.telecommands["set_star_config"].encode({**config, "exposure": 88})
     bad = good[:17] + b"\x00" + good[18:]  # error margin 0
@@ -533,7 +552,9 @@ def test_camera_constants_become_defaults_unless_set(make_bench):
     assert bench.device.parameters["centroid_x"] == 500.0
 
 
-@pytest.mark.parametrize("parameters", [{"exposur": 3}, {"exposure": -1}, {"exposure": "long"}, {"exposure": [1]}])
+@pytest.mark.parametrize(
+    "parameters", [{"exposur": 3}, {"exposure": -1}, {"exposure": "long"}, {"exposure": [1]}]
+)
 def test_a_profile_with_bad_parameters_is_refused(make_bench, parameters):
     with pytest.raises(EmulatorError, match="parameters"):
         make_bench(Profile(parameters=parameters))
