@@ -1,0 +1,91 @@
+"""The commands `starhil icd` and `starhil hub` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import pytest
+
+from protocol.candump import read_candump
+from protocol.icd import load_icd
+
+STARHIL = [sys.executable, "-c", "from emulator.cli.app import main; main()"]
+
+
+def starhil(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*STARHIL, *arguments], capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_export_writes_stdout_or_a_whole_file(tmp_path: Path) -> None:
+    told = starhil("icd", "export", "markdown")
+    assert (told.returncode, told.stderr) == (0, "")
+    file = tmp_path / "icd.md"
+    written = starhil("icd", "export", "markdown", "-o", str(file))
+    assert (written.returncode, written.stdout, written.stderr) == (0, "", "")
+    assert file.read_text() == told.stdout
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_list_tells_every_row_and_parameter() -> None:
+    told = json.loads(starhil("icd", "list", "--json").stdout)
+    icd = load_icd()
+    assert [(row["id"], row["name"], row["size"]) for row in told["rows"]] == [
+        (r.id, r.name, r.size) for r in icd.rows
+    ]
+    assert [parameter["name"] for parameter in told["parameters"]] == list(icd.parameters)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("icd", "export", "html", "-o", "/does/not/exist/icd.html"),
+            "starhil: /does/not/exist/icd.html: cannot write",
+        ),
+        (
+            ("icd", "export", "html", "--icd", "/does/not/exist"),
+            "starhil: /does/not/exist: cannot read the interface",
+        ),
+        (("hub", "--host", "203.0.113.1", "--port", "1"), "starhil: CAN hub: cannot listen at 203.0.113.1:1"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_status_2(arguments: tuple[str, ...], message: str) -> None:
+    result = starhil(*arguments)
+    assert result.returncode == 2
+    assert result.stderr.startswith(message)
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.process
+def test_the_hub_as_a_process_serves_two_clients_logs_and_ends_on_sigterm(tmp_path: Path) -> None:
+    log = tmp_path / "bus.log"
+    with subprocess.Popen(
+        [*STARHIL, "hub", "--port", "0", "--log", str(log)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            ready = process.stdout.readline()
+            assert ready.startswith("ready can=socketcand:127.0.0.1:")
+            port = int(ready.rpartition(":")[2].partition("/")[0])
+            message = can.Message(arbitration_id=0x08AA0401, data=b"\x1f\x02")
+            with (
+                can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="vcan0") as one,
+                can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="vcan0") as two,
+            ):
+                one.send(message)
+                received = two.recv(10)
+            assert received is not None
+            assert (received.arbitration_id, received.data) == (0x08AA0401, b"\x1f\x02")
+        finally:
+            process.send_signal(signal.SIGTERM)
+        last = process.stdout.read()
+        assert process.wait(10) == 0
+    assert last == "frames=1 delivered=1 dropped=0 errors=0\n"
+    assert [(channel, frame.id, frame.data) for channel, frame in read_candump(log)] == [
+        ("vcan0", 0x08AA0401, b"\x1f\x02")
+    ]
