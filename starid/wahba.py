@@ -84,7 +84,7 @@ def solve_wahba(
         raise StaridError(f"wahba: {n} positive finite weights needed")
     profile = (b * (w / w.sum())[:, None]).T @ r
     singular = np.linalg.svd(profile, compute_uv=False)
-    if singular[1] + np.copysign(singular[2], np.linalg.det(profile)) < _LEAST_GAP:
+    if singular[1] + np.copysign(singular[2], _determinant(profile)) < _LEAST_GAP:
         raise StaridError(
             "wahba: the directions leave the attitude undetermined; stars apart from each other needed"
         )
@@ -144,15 +144,16 @@ def _directions(name: str, values: ArrayLike) -> Matrix:
 
 def _davenport_matrix(profile: Matrix) -> Matrix:
     """K (4, 4) of the attitude profile matrix B = Σ w b rᵀ."""
-    z = np.array(
-        [profile[1, 2] - profile[2, 1], profile[2, 0] - profile[0, 2], profile[0, 1] - profile[1, 0]]
+    (a, b, c), (d, e, f), (g, h, i) = profile.tolist()
+    x, y, z = f - h, g - c, b - d
+    return np.array(
+        [
+            [a - e - i, b + d, c + g, x],
+            [b + d, e - a - i, f + h, y],
+            [c + g, f + h, i - a - e, z],
+            [x, y, z, a + e + i],
+        ]
     )
-    sigma = np.trace(profile)
-    k = np.empty((4, 4))
-    k[:3, :3] = profile + profile.T - sigma * np.eye(3)
-    k[:3, 3] = k[3, :3] = z
-    k[3, 3] = sigma
-    return k
 
 
 def _attitude(quaternion: Matrix) -> Attitude:
@@ -166,9 +167,10 @@ def _largest_eigenvalue(profile: Matrix) -> float:
     ψ(λ) = (λ² − ‖B‖²)² − 8λ det B − 4‖adj B‖². All roots are real, so from above the steps shrink
     monotonically; they end when they no longer do.
     """
-    norm2 = float(np.sum(profile * profile))
-    determinant = float(np.linalg.det(profile))
-    adjoint2 = float(np.sum(_adjoint(profile) ** 2))
+    norm2 = float(np.vdot(profile, profile))
+    determinant = _determinant(profile)
+    adjoint = _adjoint(profile)
+    adjoint2 = float(np.vdot(adjoint, adjoint))
     value, last = 1.0, np.inf
     for _ in range(_NEWTON_STEPS):
         excess = value * value - norm2
@@ -184,8 +186,20 @@ def _largest_eigenvalue(profile: Matrix) -> float:
 
 def _adjoint(m: Matrix) -> Matrix:
     """Adjoint (transposed cofactors) of a 3×3 matrix."""
-    rows: Matrix = np.array([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])]).T
-    return rows
+    (a, b, c), (d, e, f), (g, h, i) = m.tolist()
+    return np.array(
+        [
+            [e * i - f * h, c * h - b * i, b * f - c * e],
+            [f * g - d * i, a * i - c * g, c * d - a * f],
+            [d * h - e * g, b * g - a * h, a * e - b * d],
+        ]
+    )
+
+
+def _determinant(m: Matrix) -> float:
+    """Determinant of a 3×3 matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = m.tolist()
+    return float(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g))
 
 
 def _polished(profile: Matrix, quaternion_at: Callable[[float], Matrix]) -> Matrix:
@@ -226,14 +240,14 @@ def _davenport(profile: Matrix) -> Attitude:
 def _svd(profile: Matrix) -> Attitude:
     """B = U Σ Vᵀ, A = U diag(1, 1, det U det V) Vᵀ."""
     u, _, vt = np.linalg.svd(profile)
-    u[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    u[:, 2] *= np.sign(_determinant(u) * _determinant(vt))
     return Attitude.from_matrix(u @ vt)
 
 
 def _foam(profile: Matrix) -> Attitude:
     """A = [(κ + ‖B‖²) B + λ adj Bᵀ − B Bᵀ B] / ζ, ζ = κλ − det B, κ = ½(λ² − ‖B‖²)."""
     norm2 = float(np.sum(profile * profile))
-    determinant = float(np.linalg.det(profile))
+    determinant = _determinant(profile)
     cofactors = _adjoint(profile).T
     cubic = profile @ profile.T @ profile
 
@@ -267,7 +281,7 @@ def _quest_vector(profile: Matrix) -> Callable[[float], Matrix]:
     k = _davenport_matrix(profile)
     sigma, z = float(k[3, 3]), k[:3, 3]
     s = k[:3, :3] + sigma * np.eye(3)
-    kappa, delta = float(np.trace(_adjoint(s))), float(np.linalg.det(s))
+    kappa, delta = float(np.trace(_adjoint(s))), _determinant(s)
     sz = s @ z
     ssz = s @ sz
 
