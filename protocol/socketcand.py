@@ -7,6 +7,8 @@ asked never see remote frames, because the plain protocol cannot tell them from 
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Final
 
 from protocol.can_framing import MAX_EXTENDED_ID, MAX_STANDARD_ID, CanFrame
@@ -18,7 +20,7 @@ REMOTE_FLAG: Final = 0x40000000
 MAX_COMMAND: Final = 256
 """Longest command that is taken; a frame needs at most 60 characters."""
 
-_HEX: Final = b"0123456789abcdefABCDEF "
+_SEND: Final = re.compile(rb"send +([0-9A-Fa-f]{1,8}) +([0-8])((?: +[0-9A-Fa-f]{1,2})*) *")
 
 
 class CommandError(ProtocolError):
@@ -50,17 +52,15 @@ class CommandSplitter:
 
 def parse_send(command: bytes) -> CanFrame:
     """Read `send ID LEN B B …`. Raises CommandError naming what is wrong."""
-    words = command.split()
-    if len(words) < 3 or words[0] != b"send" or command[len(words[0]) :].translate(None, _HEX):
-        raise CommandError("malformed send: must be send ID LENGTH BYTES in hexadecimal")
-    identifier, length, digits = words[1], int(words[2], 16), words[3:]
-    if len(digits) != length or length > 8:
+    match = _SEND.fullmatch(command)
+    if match is None:
+        raise CommandError("malformed send: must be send ID LENGTH BYTES, all in hexadecimal")
+    identifier, length, digits = match[1], int(match[2]), match[3].split()
+    if len(digits) != length:
         raise CommandError(f"send with length {length} has {len(digits)} bytes")
     data = b"".join(digits)
     if len(data) != 2 * length:
         data = b"".join(digit.zfill(2) for digit in digits)
-        if len(data) != 2 * length:
-            raise CommandError("send with a byte of more than two digits")
     extended, remote, number = parse_identifier(identifier)
     return CanFrame(number, bytes.fromhex(data.decode()), extended, remote)
 
@@ -69,9 +69,10 @@ def parse_identifier(digits: bytes) -> tuple[bool, bool, int]:
     """Read an identifier: up to three digits for 11 bits, eight for 29; return extended, remote, number."""
     number = int(digits, 16)
     extended, remote = len(digits) == 8, False
-    if extended and number & REMOTE_FLAG:
-        extended, remote = bool(number & EXTENDED_FLAG), True
-    number &= MAX_EXTENDED_ID
+    if extended and number > MAX_EXTENDED_ID:
+        if number & REMOTE_FLAG:
+            extended, remote = bool(number & EXTENDED_FLAG), True
+        number &= MAX_EXTENDED_ID
     if len(digits) not in (1, 2, 3, 8) or (not extended and number > MAX_STANDARD_ID):
         raise CommandError(f"identifier {digits.decode()} has neither up to 3 digits (11-bit) nor 8 (29-bit)")
     return extended, remote, number
@@ -103,6 +104,9 @@ def parse_frame(command: bytes) -> CanFrame:
     try:
         extended, remote, number = parse_identifier(words[1])
         data = bytes.fromhex(words[3].decode()) if len(words) == 4 else b""
-        return CanFrame(number, data, extended, remote, float(words[2]))
+        seconds = float(words[2])
+        if not math.isfinite(seconds):
+            raise CommandError("time stamp is no number")
+        return CanFrame(number, data, extended, remote, seconds)
     except (ValueError, ProtocolError):
         raise CommandError(f"malformed frame: {command[:40].decode(errors='replace')}") from None
