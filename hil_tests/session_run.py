@@ -117,8 +117,8 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
             serial="auto" if "serial" in wanted else None,
             can="auto" if "can" in wanted else None,
         )
-    if not request.start and "auto" in (options.serial, options.can):
-        raise BenchError("'auto' needs --start: without it name the port or channel")
+    if not request.start and options.serial == "auto":
+        raise BenchError("--serial auto needs --start: without it name the port")
     return replace(options, timeout_s=script.timeout_s, retries=script.retries)
 
 

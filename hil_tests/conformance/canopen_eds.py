@@ -1,0 +1,192 @@
+"""CANopen conformance: the data sheet by itself, whether it is complete and consistent (CiA 306)."""
+
+from __future__ import annotations
+
+import configparser
+import re
+from typing import Final
+
+from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
+
+from hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
+from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+MANDATORY: Final = (0x1000, 0x1001, 0x1018)
+ACCESS: Final = {"ro", "rw", "wo", "const", "rwr", "rww"}
+LISTS: Final = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
+RESTRICTED: Final = (
+    (0, 0x7F),
+    (0x101, 0x180),
+    (0x581, 0x5FF),
+    (0x601, 0x67F),
+    (0x6E0, 0x6FF),
+    (0x701, 0x7FF),
+)
+
+
+def _file(probe: CanopenProbe) -> configparser.RawConfigParser:
+    if not probe.eds:
+        raise CaseSkipped("no data sheet as a file")
+    parser = configparser.RawConfigParser(inline_comment_prefixes=(";",), strict=True)
+    try:
+        parser.read_string(probe.eds)
+    except configparser.Error as error:
+        check(condition=False, expected="a file of sections with keys, each once", seen=error)
+    return parser
+
+
+@case(_CASES, "canopen.eds.mandatory", "mandatory objects are described", "CiA 301 7.5.1")
+def mandatory(probe: CanopenProbe) -> None:
+    """1000h, 1001h and 1018h are in every data sheet."""
+    missing = [f"{index:04X}h" for index in MANDATORY if index not in probe.od]
+    check(not missing, "1000h, 1001h and 1018h", f"missing {', '.join(missing)}")
+
+
+@case(_CASES, "canopen.eds.lists", "object lists and sections agree", "CiA 306 4.6.2")
+def lists(probe: CanopenProbe) -> None:
+    """Each listed object has a section, each section is listed, in the list of its range, once."""
+    parser = _file(probe)
+    listed: list[int] = []
+    for name in LISTS:
+        if not parser.has_section(name):
+            continue
+        members = [
+            int(parser.get(name, str(number)), 0)
+            for number in range(1, parser.getint(name, "SupportedObjects") + 1)
+        ]
+        manufacturer = [index for index in members if 0x2000 <= index < 0x6000]
+        check(
+            (name == "ManufacturerObjects") == bool(manufacturer) or not members, f"ranges of {name}", members
+        )
+        listed += members
+    sections = {int(name, 16) for name in parser.sections() if re.fullmatch("[0-9A-Fa-f]{4}", name)}
+    check_equal(sorted(listed), sorted(sections), "listed objects")
+
+
+@case(_CASES, "canopen.eds.types", "every variable has a type, a name and an access", "CiA 306 4.6.3")
+def types(probe: CanopenProbe) -> None:
+    """Data types are those of CiA 301, access types those of CiA 306."""
+    known = set(ODVariable.STRUCT_TYPES) | set(datatypes.DATA_TYPES)
+    known |= {datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE}
+    for item in probe.variables():
+        check(item.data_type in known, f"known data type of {item.qualname}", item.data_type)
+        check(item.access_type in ACCESS, f"known access type of {item.qualname}", item.access_type)
+        check(item.name, f"name of {item.index:04X}h:{item.subindex:02X}h", "none")
+
+
+@case(_CASES, "canopen.eds.limits", "limits and defaults fit each other and their type", "CiA 306 4.6.3")
+def limits(probe: CanopenProbe) -> None:
+    """Low limit, default and high limit are in order and in the range of the type."""
+    for item in probe.variables():
+        if not is_integer(item):
+            continue
+        bits = 8 * (size_of(item) or 1)
+        signed = item.data_type in datatypes.SIGNED_TYPES
+        lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+        low = lowest if item.min is None else item.min
+        high = highest if item.max is None else item.max
+        check(lowest <= low <= high <= highest, f"limits of {item.qualname} in order", f"{low} to {high}")
+        if item.default is not None:
+            check(low <= item.default <= high, f"default of {item.qualname} in {low} to {high}", item.default)
+
+
+@case(_CASES, "canopen.eds.sub-index-0", "sub-index 0 tells the highest sub-index", "CiA 301 7.4.3")
+def sub_index_0(probe: CanopenProbe) -> None:
+    """Records and arrays have a sub-index 0, an UNSIGNED8, whose constant is the highest sub-index."""
+    for index in sorted(probe.od.indices):
+        item = probe.od.indices[index]
+        if not isinstance(item, ODRecord | ODArray):
+            continue
+        check(0 in item.subindices, f"sub-index 0 of {index:04X}h", "none")
+        first = item.subindices[0]
+        check_equal(first.data_type, datatypes.UNSIGNED8, f"data type of {index:04X}h:00h")
+        if first.access_type == "const" or (first.access_type == "ro" and index != 0x1003):
+            check_equal(first.default, max(item.subindices), f"highest sub-index of {index:04X}h")
+
+
+@case(_CASES, "canopen.eds.pdo-count", "number of PDOs agrees with the records", "CiA 306 4.5")
+def pdo_count(probe: CanopenProbe) -> None:
+    """NrOfRXPDO and NrOfTXPDO count the communication records, and each has its mapping record."""
+    information = probe.od.device_information
+    for first, told in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
+        indices = probe.pdo_indices(first)
+        check_equal(int(told or 0), len(indices), f"number of PDOs from {first:04X}h on")
+        missing = [f"{index + 0x200:04X}h" for index in indices if index + 0x200 not in probe.od]
+        check(not missing, "a mapping record for each PDO", f"missing {missing}")
+
+
+@case(_CASES, "canopen.eds.mapping", "default mappings name objects that can be mapped", "CiA 301 7.5.2.36")
+def mapping(probe: CanopenProbe) -> None:
+    """Object, length, mappability, direction, and 64 bits at most."""
+    for first in (0x1600, 0x1A00):
+        for index in probe.pdo_indices(first):
+            record = probe.od.indices[index]
+            if isinstance(record, ODVariable):
+                continue
+            total = 0
+            for number in range(1, (record.subindices[0].default or 0) + 1):
+                value = record.subindices[number].default or 0
+                total += value & 0xFF
+                if value >> 16 < 0x20:
+                    continue
+                item = probe.od.get_variable(value >> 16, value >> 8 & 0xFF)
+                where = f"{index:04X}h:{number:02X}h"
+                check(item is not None, f"{where} names an object of the data sheet", f"{value:08X}")
+                if item is not None:
+                    usable = item.readable if first == 0x1A00 else item.writable
+                    check(
+                        item.pdo_mappable and usable, f"{item.qualname} can be mapped", f"{where} {value:08X}"
+                    )
+                    check_equal(value & 0xFF, 8 * (size_of(item) or 0), f"bits of {item.qualname} in {where}")
+            check(total <= 64, f"{index:04X}h maps at most 64 bits", total)
+
+
+@case(_CASES, "canopen.eds.cob-ids", "default identifiers are free, allowed and distinct", "CiA 301 7.3.5")
+def cob_ids(probe: CanopenProbe) -> None:
+    """Identifiers of valid PDOs, SYNC, TIME and EMCY are not restricted, and no two messages share one."""
+    used: dict[int, str] = {}
+    for index in (0x1005, 0x1012, 0x1014, *probe.pdo_indices(0x1400), *probe.pdo_indices(0x1800)):
+        item = probe.od.get_variable(index, 0 if index < 0x1400 else 1)
+        if item is None or item.default is None or (index >= 0x1014 and item.default >> 31):
+            continue
+        identifier = item.default & 0x1FFFFFFF
+        restricted = any(low <= identifier <= high for low, high in RESTRICTED)
+        check(not restricted, f"identifier of {index:04X}h allowed", f"0x{identifier:03X}")
+        check(identifier not in used, f"identifier of {index:04X}h of its own", used.get(identifier))
+        used[identifier] = f"0x{identifier:03X} is that of {index:04X}h"
+
+
+@case(_CASES, "canopen.eds.identity", "device information agrees with the identity object", "CiA 306 4.5")
+def identity(probe: CanopenProbe) -> None:
+    """Vendor, product and revision stand in both places."""
+    information = probe.od.device_information
+    told = (information.vendor_number, information.product_number, information.revision_number)
+    for subindex, number in enumerate(told, 1):
+        item = probe.od.get_variable(0x1018, subindex)
+        if item is not None and item.default is not None and number is not None:
+            check_equal(item.default, number, f"1018h:{subindex:02X}h")
+
+
+@case(_CASES, "canopen.eds.bit-rates", "at least one bit rate is supported", "CiA 306 4.5")
+def bit_rates(probe: CanopenProbe) -> None:
+    """BaudRate_... entries."""
+    check(probe.od.device_information.allowed_baudrates, "a supported bit rate", "none")
+
+
+@case(
+    _CASES, "canopen.eds.stored", "the data sheet that the node serves is the one given", "CiA 301 7.5.2.21"
+)
+def stored(probe: CanopenProbe) -> None:
+    """1021h, if there is one, gives the text of the file."""
+    probe.require(0x1021)
+    parser = _file(probe)
+    served = configparser.RawConfigParser(inline_comment_prefixes=(";",))
+    served.read_string(probe.read(0x1021).decode("ascii", errors="replace"))
+    for name in parser.sections():
+        if name != "FileInfo":
+            check(served.has_section(name), f"section {name} in 1021h", "none")
+            check_equal(dict(served.items(name)), dict(parser.items(name)), f"section {name}")
+
+
+CASES = tuple(_CASES)

@@ -1,0 +1,388 @@
+"""CANopen conformance: NMT slave and error control (CiA 301 7.2.8, 7.3.2)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_INCOMPATIBLE,
+    PRE_OPERATIONAL,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    START,
+    STOP,
+    CanopenProbe,
+)
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+NMT_CLAUSE: Final = "CiA 301 7.3.2.2"
+CONTROL_CLAUSE: Final = "CiA 301 7.2.8.3"
+STATE_OF: Final = {START: 0x05, STOP: 0x04, PRE_OPERATIONAL: 0x7F}
+OTHER_NODE: Final = 0x05
+"""A node-ID that stands for a watched node; nobody else on the bus may have it."""
+
+
+def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
+    probe.set(0x1017, 0, heartbeat_ms, 2)
+
+
+def _state(probe: CanopenProbe) -> int:
+    """Return the state that the next heartbeat tells."""
+    probe.drain()
+    return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]
+
+
+@case(
+    _CASES,
+    "canopen.nmt.boot-up",
+    "boot-up message, then PRE-OPERATIONAL by itself",
+    f"{NMT_CLAUSE}.1",
+    intrusive=True,
+)
+def boot_up(probe: CanopenProbe) -> None:
+    """After each reset one frame 700h + node-ID with one byte 00, and SDO works."""
+    for command in (RESET_COMMUNICATION, RESET_NODE):
+        probe.drain()
+        probe.command(command)
+        probe.expect_boot_up()
+        _prepare(probe)
+        check_equal(_state(probe), 0x7F, "state")
+
+
+@case(
+    _CASES, "canopen.nmt.boot-up-once", "one boot-up message a reset", f"{CONTROL_CLAUSE}.3", intrusive=True
+)
+def boot_up_once(probe: CanopenProbe) -> None:
+    """No second frame 00."""
+    probe.reset_communication()
+    data = probe.wait_for(0x700 + probe.node, 0.2, lambda data: data == b"\0")
+    check(data is None, "one boot-up message", "two")
+
+
+@case(
+    _CASES,
+    "canopen.nmt.commands",
+    "start, stop and enter PRE-OPERATIONAL from every state",
+    f"{NMT_CLAUSE}",
+    intrusive=True,
+)
+def commands(probe: CanopenProbe) -> None:
+    """All nine changes, addressed to the node."""
+    _prepare(probe)
+    for before in STATE_OF:
+        for command, state in STATE_OF.items():
+            probe.command(before)
+            probe.command(command)
+            check_equal(_state(probe), state, f"state after commands {before} and {command}:")
+
+
+@case(_CASES, "canopen.nmt.broadcast", "commands to all nodes", f"{CONTROL_CLAUSE}", intrusive=True)
+def broadcast(probe: CanopenProbe) -> None:
+    """Node-ID 0 stands for every node; only for a bus with nothing else in operation."""
+    _prepare(probe)
+    for command, state in STATE_OF.items():
+        probe.command(command, 0)
+        check_equal(_state(probe), state, f"state after command {command} to all:")
+
+
+@case(
+    _CASES,
+    "canopen.nmt.other-node",
+    "commands to another node are not obeyed",
+    f"{NMT_CLAUSE}",
+    intrusive=True,
+)
+def other_node(probe: CanopenProbe) -> None:
+    """Start for the next node-ID."""
+    _prepare(probe)
+    probe.command(START, probe.node % 127 + 1)
+    check_equal(_state(probe), 0x7F, "state")
+
+
+@case(
+    _CASES,
+    "canopen.nmt.malformed",
+    "frames that are no NMT command are not obeyed",
+    f"{NMT_CLAUSE}",
+    intrusive=True,
+)
+def malformed(probe: CanopenProbe) -> None:
+    """Unknown specifier, one byte, three bytes, extended frame."""
+    _prepare(probe)
+    node = bytes([probe.node])
+    for data in (b"\x03" + node, b"\x01", b"\x01" + node + b"\0"):
+        probe.send(0x000, data)
+        check_equal(_state(probe), 0x7F, f"state after {data.hex()}:")
+    probe.send(0x000, b"\x01" + node, extended=True)
+    check_equal(_state(probe), 0x7F, "state after an extended frame:")
+
+
+@case(_CASES, "canopen.nmt.reset-states", "resets work from every state", f"{NMT_CLAUSE}", intrusive=True)
+def reset_states(probe: CanopenProbe) -> None:
+    """Reset node and reset communication from OPERATIONAL and STOPPED."""
+    for before in (START, STOP):
+        for command in (RESET_COMMUNICATION, RESET_NODE):
+            probe.command(before)
+            probe.drain()
+            probe.command(command)
+            probe.expect_boot_up()
+
+
+@case(
+    _CASES,
+    "canopen.nmt.reset-communication",
+    "reset communication restores the communication profile",
+    f"{NMT_CLAUSE}",
+    intrusive=True,
+)
+def reset_communication(probe: CanopenProbe) -> None:
+    """A changed heartbeat time has its stored value again."""
+    before = probe.number(0x1017)
+    probe.set(0x1017, 0, before ^ 0x55, 2)
+    probe.reset_communication()
+    check_equal(probe.number(0x1017), before, "1017h")
+
+
+@case(
+    _CASES,
+    "canopen.nmt.sdo-states",
+    "SDO in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED",
+    f"{NMT_CLAUSE}.5",
+    intrusive=True,
+)
+def sdo_states(probe: CanopenProbe) -> None:
+    """As the table of states and communication objects has it."""
+    for command, answered in ((PRE_OPERATIONAL, True), (START, True), (STOP, False)):
+        probe.command(command)
+        answer = probe.ask("40 00 10 00", 0.2)
+        check_equal(answer is not None, answered, f"SDO answered after command {command}:")
+
+
+# Heartbeat
+
+
+@case(
+    _CASES,
+    "canopen.error-control.heartbeat",
+    "heartbeat at its period with the state",
+    f"{CONTROL_CLAUSE}.2",
+    intrusive=True,
+)
+def heartbeat(probe: CanopenProbe) -> None:
+    """One byte, bit 7 clear; period within a fifth over five heartbeats of 100 ms."""
+    _prepare(probe, 100)
+    probe.drain()
+    found = probe.count(0x700 + probe.node, 0.75)
+    check(len(found) >= 6, "six heartbeats in 0.75 s", len(found))
+    check(all(data == b"\x7f" for _, data in found), "heartbeats 7f", [data.hex() for _, data in found])
+    mean = (found[5][0] - found[0][0]) / 5
+    check(0.08 <= mean <= 0.12, "period 0.1 s", f"{mean:.4f} s")
+
+
+@case(
+    _CASES,
+    "canopen.error-control.heartbeat-off",
+    "no heartbeat with time 0",
+    f"{CONTROL_CLAUSE}.2",
+    intrusive=True,
+)
+def heartbeat_off(probe: CanopenProbe) -> None:
+    """1017h set to 0."""
+    _prepare(probe, 50)
+    _prepare(probe, 0)
+    probe.drain()
+    probe.expect_silence(0x700 + probe.node, "heartbeat", 0.3)
+
+
+@case(
+    _CASES,
+    "canopen.error-control.heartbeat-stopped",
+    "heartbeat goes on in STOPPED",
+    f"{NMT_CLAUSE}.5",
+    intrusive=True,
+)
+def heartbeat_stopped(probe: CanopenProbe) -> None:
+    """With state 04."""
+    _prepare(probe)
+    probe.command(STOP)
+    check_equal(_state(probe), 0x04, "state")
+
+
+# Node guarding
+
+
+def _guard(probe: CanopenProbe) -> int:
+    probe.send(0x700 + probe.node, remote=True)
+    return probe.expect(0x700 + probe.node, "answer to node guarding")[0]
+
+
+def _prepare_guarding(probe: CanopenProbe) -> None:
+    probe.require(0x100C)
+    _prepare(probe, 0)
+    probe.drain()
+
+
+@case(
+    _CASES,
+    "canopen.error-control.guarding",
+    "node guarding with toggle bit",
+    f"{CONTROL_CLAUSE}.1",
+    intrusive=True,
+)
+def guarding(probe: CanopenProbe) -> None:
+    """The toggle bit begins at 0 after a reset and alternates; the state is right."""
+    _prepare_guarding(probe)
+    check_equal([_guard(probe) for _ in range(3)], [0x7F, 0xFF, 0x7F], "answers")
+    probe.command(START)
+    check_equal(_guard(probe), 0x85, "answer in OPERATIONAL")
+    probe.command(STOP)
+    check_equal(_guard(probe), 0x04, "answer in STOPPED")
+    probe.command(PRE_OPERATIONAL)
+    _guard(probe)
+    probe.reset_communication()
+    _prepare(probe, 0)
+    probe.drain()
+    check_equal(_guard(probe), 0x7F, "first answer after the reset")
+
+
+@case(
+    _CASES,
+    "canopen.error-control.guarding-or-heartbeat",
+    "no node guarding while the heartbeat is on",
+    f"{CONTROL_CLAUSE}.1",
+    intrusive=True,
+)
+def guarding_or_heartbeat(probe: CanopenProbe) -> None:
+    """A remote request is not answered with 1017h set."""
+    probe.require(0x100C)
+    _prepare(probe, 5000)
+    probe.drain()
+    probe.send(0x700 + probe.node, remote=True)
+    probe.expect_silence(0x700 + probe.node, "answer to node guarding", 0.2)
+
+
+@case(_CASES, "canopen.error-control.life-guarding", "life guarding", f"{CONTROL_CLAUSE}.1", intrusive=True)
+def life_guarding(probe: CanopenProbe) -> None:
+    """It begins with the first request; when they end, EMCY 8130h comes and OPERATIONAL is left."""
+    _prepare_guarding(probe)
+    probe.require(0x100D)
+    probe.set(0x100C, 0, 50, 2)
+    probe.set(0x100D, 0, 4, 1)
+    probe.command(START)
+    emergency = _emergency(probe)
+    probe.expect_silence(emergency, "EMCY before the first request", 0.4)
+    for _ in range(3):
+        _guard(probe)
+        probe.expect_silence(emergency, "EMCY while it is guarded", 0.15)
+    data = probe.expect(emergency, "EMCY 8130h", 0.3)
+    check_equal(data[:2], b"\x30\x81", "error code")
+    check_equal(_guard(probe) & 0x7F, 0x7F, "state")
+
+
+# Heartbeat consumer
+
+
+def _emergency(probe: CanopenProbe) -> int:
+    probe.require(0x1014)
+    return probe.number(0x1014) & 0x7FF
+
+
+def _watch(probe: CanopenProbe) -> int:
+    probe.require(0x1016)
+    _prepare(probe, 0)
+    probe.set(0x1016, 1, OTHER_NODE << 16 | 100)
+    return _emergency(probe)
+
+
+@case(
+    _CASES,
+    "canopen.error-control.consumer-start",
+    "a watch begins with the first heartbeat",
+    f"{CONTROL_CLAUSE}.2",
+    intrusive=True,
+)
+def consumer_start(probe: CanopenProbe) -> None:
+    """No EMCY while the watched node was never heard."""
+    emergency = _watch(probe)
+    probe.expect_silence(emergency, "EMCY", 0.4)
+
+
+@case(
+    _CASES,
+    "canopen.error-control.consumer",
+    "a watched node falls silent and comes back",
+    f"{CONTROL_CLAUSE}.2",
+    intrusive=True,
+)
+def consumer(probe: CanopenProbe) -> None:
+    """EMCY 8130h after the time, not before; error register set; EMCY 0000h when it is heard again."""
+    emergency = _watch(probe)
+    for _ in range(3):
+        probe.send(0x700 + OTHER_NODE, b"\x05")
+        probe.expect_silence(emergency, "EMCY while it is heard", 0.07)
+    data = probe.expect(emergency, "EMCY 8130h", 0.3)
+    check_equal(data[:2], b"\x30\x81", "error code")
+    check(data[2] & 0x11 == 0x11, "error register with generic and communication", data[2])
+    check_equal(probe.number(0x1001), data[2], "1001h")
+    probe.send(0x700 + OTHER_NODE, b"\x05")
+    data = probe.expect(emergency, "EMCY 0000h", 0.3)
+    check_equal(data[:3], bytes(3), "error code and register")
+
+
+@case(
+    _CASES,
+    "canopen.error-control.behaviour",
+    "error behaviour when a watched node falls silent",
+    "CiA 301 7.5.2.32",
+    intrusive=True,
+)
+def behaviour(probe: CanopenProbe) -> None:
+    """1029h:01h at 0 leads to PRE-OPERATIONAL, at 1 to no change, at 2 to STOPPED."""
+    probe.require(0x1029)
+    for value, state in ((0, 0x7F), (1, 0x05), (2, 0x04)):
+        probe.command(PRE_OPERATIONAL)
+        _watch(probe)
+        probe.set(0x1029, 1, value, 1)
+        _prepare(probe)
+        probe.command(START)
+        probe.send(0x700 + OTHER_NODE, b"\x05")
+        probe.wait_for(0x7FF, 0.2)
+        check_equal(_state(probe), state, f"state with 1029h:01h at {value}:")
+
+
+@case(
+    _CASES,
+    "canopen.error-control.consumer-twice",
+    "one node is watched by one entry",
+    "CiA 301 7.5.2.18",
+    intrusive=True,
+)
+def consumer_twice(probe: CanopenProbe) -> None:
+    """A second entry for the same node is refused by 0604 0043h."""
+    _watch(probe)
+    item = probe.od.get_variable(0x1016, 2)
+    if item is None:
+        raise CaseSkipped("1016h has one entry")
+    probe.expect_refusal(0x1016, 2, OTHER_NODE << 16 | 200, 4, ABORT_INCOMPATIBLE)
+    probe.set(0x1016, 2, (OTHER_NODE + 1) << 16 | 200)
+
+
+@case(
+    _CASES,
+    "canopen.error-control.consumer-off",
+    "a watch with time 0 is off",
+    "CiA 301 7.5.2.18",
+    intrusive=True,
+)
+def consumer_off(probe: CanopenProbe) -> None:
+    """Heard once, then switched off: no EMCY."""
+    emergency = _watch(probe)
+    probe.send(0x700 + OTHER_NODE, b"\x05")
+    probe.set(0x1016, 1, 0)
+    data = probe.wait_for(emergency, 0.4)
+    if data is not None:
+        raise CaseFailed("no EMCY", data.hex(" "))
+
+
+CASES = tuple(_CASES)

@@ -1,0 +1,278 @@
+"""CANopen conformance: the object dictionary that the node serves against its data sheet."""
+
+from __future__ import annotations
+
+from canopen.objectdictionary import ODVariable, datatypes
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_DEVICE_STATE,
+    ABORT_GENERAL,
+    ABORT_LENGTH,
+    ABORT_LENGTH_HIGH,
+    ABORT_LENGTH_LOW,
+    ABORT_NO_DATA,
+    ABORT_NO_OBJECT,
+    ABORT_NO_SUBINDEX,
+    ABORT_NOT_STORED,
+    ABORT_READ_ONLY,
+    ABORT_VALUE,
+    ABORT_VALUE_HIGH,
+    ABORT_VALUE_LOW,
+    ABORT_WRITE_ONLY,
+    CanopenProbe,
+    is_integer,
+    multiplexer,
+    size_of,
+)
+from hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+NOT_NOW = {ABORT_NO_DATA, ABORT_GENERAL, ABORT_DEVICE_STATE, ABORT_NOT_STORED}
+"""Aborts by which a node says that an object exists and has no value now."""
+
+
+def _readable(probe: CanopenProbe, indices: range) -> None:
+    for item in probe.variables():
+        if item.index not in indices or not item.readable or item.data_type == datatypes.DOMAIN:
+            continue
+        seen = probe.try_read(item.index, item.subindex)
+        where = f"{item.index:04X}h:{item.subindex:02X}h"
+        if isinstance(seen, int):
+            check(seen in NOT_NOW, f"{where} ({item.qualname}) read", f"abort 0x{seen:08X}")
+        elif size_of(item) is not None:
+            check_equal(len(seen), size_of(item), f"bytes of {where} ({item.qualname})")
+
+
+@case(
+    _CASES,
+    "canopen.od.communication",
+    "every object of the communication profile can be read",
+    "CiA 301 7.5.2",
+)
+def communication(probe: CanopenProbe) -> None:
+    """1000h to 1FFFh, each in the length of its type."""
+    _readable(probe, range(0x1000, 0x2000))
+
+
+@case(_CASES, "canopen.od.manufacturer", "every object of the manufacturer can be read", "CiA 301 7.4.1")
+def manufacturer(probe: CanopenProbe) -> None:
+    """2000h to 5FFFh, each in the length of its type."""
+    _readable(probe, range(0x2000, 0x6000))
+
+
+@case(_CASES, "canopen.od.profile", "every object of the device profile area can be read", "CiA 301 7.4.1")
+def profile(probe: CanopenProbe) -> None:
+    """6000h to 9FFFh, each in the length of its type."""
+    _readable(probe, range(0x6000, 0xA000))
+
+
+@case(
+    _CASES,
+    "canopen.od.defaults",
+    "after a reset the defaults are those of the data sheet",
+    "CiA 301 7.5.2",
+    intrusive=True,
+)
+def defaults(probe: CanopenProbe) -> None:
+    """Communication profile, integers, in a node whose parameters were not stored."""
+    if 0x1011 in probe.od:
+        probe.set(0x1011, 1, b"load")
+    probe.reset_communication()
+    for item in probe.variables():
+        wanted = is_integer(item) and item.default is not None and item.readable
+        if not wanted or item.index >= 0x2000 or item.index in {0x1001, 0x1003, 0x1013}:
+            continue
+        seen = probe.try_read(item.index, item.subindex)
+        if isinstance(seen, bytes):
+            check_equal(
+                item.decode_raw(seen),
+                item.default,
+                f"{item.index:04X}h:{item.subindex:02X}h ({item.qualname})",
+            )
+
+
+@case(_CASES, "canopen.od.texts", "names and versions are those of the data sheet", "CiA 301 7.5.2.7")
+def texts(probe: CanopenProbe) -> None:
+    """1008h to 100Ah, as far as the data sheet gives them."""
+    for index in (0x1008, 0x1009, 0x100A):
+        item = probe.od.get_variable(index)
+        if item is not None and item.default is not None:
+            check_equal(
+                probe.read(index).decode("ascii", errors="replace"), str(item.default), f"{index:04X}h"
+            )
+
+
+@case(_CASES, "canopen.od.identity", "identity is that of the data sheet", "CiA 301 7.5.2.19")
+def identity(probe: CanopenProbe) -> None:
+    """1000h and 1018h."""
+    for index, subindex in ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3)):
+        item = probe.od.get_variable(index, subindex)
+        if item is not None and item.default is not None:
+            check_equal(probe.number(index, subindex), item.default, f"{index:04X}h:{subindex:02X}h")
+
+
+@case(_CASES, "canopen.od.sub-index-0", "sub-index 0 of a record is its highest sub-index", "CiA 301 7.4.3")
+def sub_index_0(probe: CanopenProbe) -> None:
+    """Every record and array whose sub-index 0 is constant."""
+    for item in probe.variables():
+        group = probe.od.indices[item.index]
+        if item.subindex == 0 and item.access_type == "const" and not isinstance(group, ODVariable):
+            check_equal(probe.number(item.index, 0), max(group.subindices), f"{item.index:04X}h:00h")
+
+
+@case(_CASES, "canopen.od.write-only", "write-only objects are not read", "CiA 301 7.2.4.3.17")
+def write_only(probe: CanopenProbe) -> None:
+    """All of them, abort 0601 0001h."""
+    probe.find("write-only object", lambda item: item.access_type == "wo")
+    for item in probe.variables():
+        if item.access_type == "wo":
+            probe.expect_abort(b"\x40" + multiplexer(item.index, item.subindex), ABORT_WRITE_ONLY)
+
+
+@case(
+    _CASES,
+    "canopen.od.read-only",
+    "read-only and constant objects are not written",
+    "CiA 301 7.2.4.3.17",
+    intrusive=True,
+)
+def read_only(probe: CanopenProbe) -> None:
+    """All of them, abort 0601 0002h."""
+    for item in probe.variables():
+        if item.access_type in {"ro", "const"}:
+            size = min(size_of(item) or 1, 4)
+            command = bytes([0x23 | (4 - size) << 2])
+            if size_of(item) in {1, 2, 4}:
+                probe.expect_abort(command + multiplexer(item.index, item.subindex), ABORT_READ_ONLY)
+
+
+@case(
+    _CASES,
+    "canopen.od.no-object",
+    "objects that the data sheet does not have do not exist",
+    "CiA 301 7.2.4.3.17",
+    intrusive=True,
+)
+def no_object(probe: CanopenProbe) -> None:
+    """The gaps at both ends of each run of objects, abort 0602 0000h, reading and writing."""
+    present = {index for index in probe.od.indices if index >= 0x1000}
+    gaps = sorted({near for index in present for near in (index - 1, index + 1) if near >= 0x1000} - present)
+    for index in [0x0000, 0x0005, *gaps, 0xFFFF]:
+        if index not in present:
+            probe.expect_abort(b"\x40" + multiplexer(index, 0), ABORT_NO_OBJECT)
+            probe.expect_abort(b"\x2f" + multiplexer(index, 0), ABORT_NO_OBJECT)
+
+
+@case(
+    _CASES,
+    "canopen.od.no-sub-index",
+    "sub-indices beyond the data sheet do not exist",
+    "CiA 301 7.2.4.3.17",
+    intrusive=True,
+)
+def no_sub_index(probe: CanopenProbe) -> None:
+    """The first beyond each record and sub-index 1 of each variable, abort 0609 0011h."""
+    for index in sorted(probe.od.indices):
+        if index < 0x1000:
+            continue
+        item = probe.od.indices[index]
+        beyond = 1 if isinstance(item, ODVariable) else max(item.subindices) + 1
+        if beyond < 0xFF:
+            probe.expect_abort(b"\x40" + multiplexer(index, beyond), ABORT_NO_SUBINDEX)
+            probe.expect_abort(b"\x2f" + multiplexer(index, beyond), ABORT_NO_SUBINDEX)
+
+
+@case(_CASES, "canopen.od.length-high", "too long a value is refused", "CiA 301 7.2.4.3.17", intrusive=True)
+def length_high(probe: CanopenProbe) -> None:
+    """Expedited writes with one byte too many, abort 0607 0010h or 0607 0012h."""
+    for item in probe.variables():
+        size = size_of(item)
+        if item.writable and size is not None and size < 4 and item.index not in {0x1010, 0x1011}:
+            command = bytes([0x23 | (3 - size) << 2])
+            probe.expect_abort(
+                command + multiplexer(item.index, item.subindex), ABORT_LENGTH, ABORT_LENGTH_HIGH
+            )
+
+
+@case(_CASES, "canopen.od.length-low", "too short a value is refused", "CiA 301 7.2.4.3.17", intrusive=True)
+def length_low(probe: CanopenProbe) -> None:
+    """Expedited writes with one byte too few, abort 0607 0010h or 0607 0013h."""
+    for item in probe.variables():
+        size = size_of(item)
+        if item.writable and size is not None and 1 < size <= 5:
+            command = bytes([0x23 | (5 - size) << 2])
+            probe.expect_abort(
+                command + multiplexer(item.index, item.subindex), ABORT_LENGTH, ABORT_LENGTH_LOW
+            )
+
+
+def _bounded(probe: CanopenProbe) -> list[ODVariable]:
+    probe.find(
+        "object with limits", lambda item: item.writable and (item.min is not None or item.max is not None)
+    )
+    return [
+        item for item in probe.variables() if item.writable and is_integer(item) and (size_of(item) or 9) <= 4
+    ]
+
+
+@case(
+    _CASES,
+    "canopen.od.value-high",
+    "values above the limit are refused",
+    "CiA 301 7.2.4.3.17",
+    intrusive=True,
+)
+def value_high(probe: CanopenProbe) -> None:
+    """One above each high limit that the type can hold, abort 0609 0031h or 0609 0030h."""
+    for item in _bounded(probe):
+        size = size_of(item) or 4
+        signed = item.data_type in datatypes.SIGNED_TYPES
+        highest = (1 << 8 * size - signed) - 1
+        if item.max is not None and item.max < highest:
+            data = (int(item.max) + 1).to_bytes(size, "little", signed=signed)
+            probe.expect_refusal(item.index, item.subindex, data, size, ABORT_VALUE_HIGH, ABORT_VALUE)
+
+
+@case(
+    _CASES, "canopen.od.value-low", "values below the limit are refused", "CiA 301 7.2.4.3.17", intrusive=True
+)
+def value_low(probe: CanopenProbe) -> None:
+    """One below each low limit that the type can hold, abort 0609 0032h or 0609 0030h."""
+    for item in _bounded(probe):
+        size = size_of(item) or 4
+        signed = item.data_type in datatypes.SIGNED_TYPES
+        lowest = -(1 << 8 * size - 1) if signed else 0
+        if item.min is not None and item.min > lowest:
+            data = (int(item.min) - 1).to_bytes(size, "little", signed=signed)
+            probe.expect_refusal(item.index, item.subindex, data, size, ABORT_VALUE_LOW, ABORT_VALUE)
+
+
+@case(_CASES, "canopen.od.write-back", "what is written is read back", "CiA 301 7.2.4.3", intrusive=True)
+def write_back(probe: CanopenProbe) -> None:
+    """Limits and default of a writable application object, then its old value again."""
+    found = 0
+    for item in probe.variables():
+        size = size_of(item)
+        bounded = item.min is not None and item.max is not None
+        if (
+            item.index < 0x2000
+            or item.access_type != "rw"
+            or not is_integer(item)
+            or not bounded
+            or size not in {1, 2, 4}
+        ):
+            continue
+        before = probe.read(item.index, item.subindex)
+        for value in (item.min, item.max):
+            data = int(value or 0).to_bytes(
+                size or 4, "little", signed=item.data_type in datatypes.SIGNED_TYPES
+            )
+            if probe.write(item.index, item.subindex, data) == 0:
+                found += 1
+                check_equal(probe.read(item.index, item.subindex), data, f"{item.qualname}")
+        probe.set(item.index, item.subindex, before)
+    if not found:
+        raise CaseFailed("an object that takes its limits", "none")
+
+
+CASES = tuple(_CASES)

@@ -1,0 +1,346 @@
+"""The tester's side of a CANopen node: frames and short SDO requests, with a log of all that was sent and seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import Final, Protocol
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from hil_tests.conformance.case import CaseFailed, CaseSkipped
+from protocol.can_framing import CanFrame
+
+NMT: Final = 0x000
+SYNC: Final = 0x080
+TIME: Final = 0x100
+LSS_FROM_SLAVE: Final = 0x7E4
+LSS_TO_SLAVE: Final = 0x7E5
+
+START: Final = 1
+STOP: Final = 2
+PRE_OPERATIONAL: Final = 128
+RESET_NODE: Final = 129
+RESET_COMMUNICATION: Final = 130
+
+STATES: Final = {0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL", 0x00: "boot-up"}
+
+PDO_OFF: Final = 1 << 31
+NO_RTR: Final = 1 << 30
+
+ABORT_TOGGLE: Final = 0x05030000
+ABORT_TIMEOUT: Final = 0x05040000
+ABORT_COMMAND: Final = 0x05040001
+ABORT_BLOCK_SIZE: Final = 0x05040002
+ABORT_SEQUENCE: Final = 0x05040003
+ABORT_CRC: Final = 0x05040004
+ABORT_ACCESS: Final = 0x06010000
+ABORT_WRITE_ONLY: Final = 0x06010001
+ABORT_READ_ONLY: Final = 0x06010002
+ABORT_NO_OBJECT: Final = 0x06020000
+ABORT_NOT_MAPPABLE: Final = 0x06040041
+ABORT_PDO_LENGTH: Final = 0x06040042
+ABORT_INCOMPATIBLE: Final = 0x06040043
+ABORT_LENGTH: Final = 0x06070010
+ABORT_LENGTH_HIGH: Final = 0x06070012
+ABORT_LENGTH_LOW: Final = 0x06070013
+ABORT_NO_SUBINDEX: Final = 0x06090011
+ABORT_VALUE: Final = 0x06090030
+ABORT_VALUE_HIGH: Final = 0x06090031
+ABORT_VALUE_LOW: Final = 0x06090032
+ABORT_GENERAL: Final = 0x08000000
+ABORT_NOT_STORED: Final = 0x08000020
+ABORT_DEVICE_STATE: Final = 0x08000022
+ABORT_NO_DATA: Final = 0x08000024
+
+
+class FrameBus(Protocol):
+    """A CAN bus as the cases use it: synchronous, with its own time."""
+
+    def send(self, frame: CanFrame) -> None:
+        """Send a frame."""
+
+    def receive(self, timeout_s: float) -> CanFrame | None:
+        """Return the next frame of another node, None if none comes in time."""
+
+    def now(self) -> float:
+        """Time, s."""
+
+
+class CanopenProbe:
+    """Talks to one node.
+
+    Parameters
+    ----------
+    bus
+        The bus that the node is on.
+    node
+        Its node-ID.
+    od
+        Its object dictionary, from its data sheet.
+    eds
+        Text of the data sheet; empty if there is none.
+    timeout_s
+        Longest time for an answer.
+    """
+
+    def __init__(
+        self, bus: FrameBus, node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
+    ) -> None:
+        self.bus = bus
+        self.node = node
+        self.od = od
+        self.eds = eds
+        self.timeout_s = timeout_s
+        self.log: list[str] = []
+        self._kept: list[CanFrame] = []
+
+    # Frames
+
+    def send(
+        self, identifier: int, data: bytes | str = b"", *, remote: bool = False, extended: bool = False
+    ) -> None:
+        """Send a frame; text is hexadecimal."""
+        payload = bytes.fromhex(data) if isinstance(data, str) else data
+        frame = CanFrame(identifier, payload, extended=extended, remote=remote)
+        self.log.append(f"{self.bus.now():.4f} -> {_frame_text(frame)}")
+        self.bus.send(frame)
+
+    def receive(self, timeout_s: float) -> CanFrame | None:
+        """Return the next frame, None if none comes in time."""
+        frame = self.bus.receive(timeout_s)
+        if frame is not None:
+            self.log.append(f"{self.bus.now():.4f} <- {_frame_text(frame)}")
+        return frame
+
+    def drain(self) -> None:
+        """Let go of what has already come."""
+        while self.receive(0.0) is not None:
+            pass
+
+    def wait_for(
+        self,
+        identifiers: int | Collection[int],
+        timeout_s: float | None = None,
+        accept: Callable[[bytes], bool] = lambda _data: True,
+    ) -> bytes | None:
+        """Return the data of the next frame with one of the identifiers that is accepted, None if none comes."""
+        wanted = {identifiers} if isinstance(identifiers, int) else identifiers
+        end = self.bus.now() + (self.timeout_s if timeout_s is None else timeout_s)
+        while (left := end - self.bus.now()) >= 0:
+            frame = self.receive(left)
+            if frame is None:
+                return None
+            if frame.id in wanted and not frame.extended and not frame.remote and accept(frame.data):
+                return frame.data
+        return None
+
+    def expect(
+        self,
+        identifier: int,
+        what: str,
+        timeout_s: float | None = None,
+        accept: Callable[[bytes], bool] = lambda _data: True,
+    ) -> bytes:
+        """Return the data of the next such frame; fail if none comes."""
+        data = self.wait_for(identifier, timeout_s, accept)
+        if data is None:
+            raise CaseFailed(f"{what} with identifier 0x{identifier:03X}", "nothing")
+        return data
+
+    def expect_silence(self, identifiers: int | Collection[int], what: str, for_s: float = 0.1) -> None:
+        """Fail if a frame with one of the identifiers comes within a time."""
+        data = self.wait_for(identifiers, for_s)
+        if data is not None:
+            raise CaseFailed(f"no {what}", data.hex(" ") or "an empty frame")
+
+    def count(self, identifier: int, for_s: float) -> list[tuple[float, bytes]]:
+        """Return time and data of the frames with an identifier within a time."""
+        end, found = self.bus.now() + for_s, []
+        while (left := end - self.bus.now()) > 0:
+            data = self.wait_for(identifier, left)
+            if data is None:
+                break
+            found.append((self.bus.now(), data))
+        return found
+
+    # SDO
+
+    def ask(self, request: str | bytes, timeout_s: float | None = None) -> bytes | None:
+        """Send an SDO request, padded to 8 bytes; return the answer, None if none comes."""
+        data = bytes.fromhex(request) if isinstance(request, str) else request
+        self.send(0x600 + self.node, data.ljust(8, b"\0"))
+        return self.wait_for(0x580 + self.node, timeout_s)
+
+    def expect_answer(self, request: str | bytes, answer: str) -> bytes:
+        """Fail unless an SDO request gets this answer; `..` in it stands for any byte."""
+        seen = self.ask(request)
+        wanted = answer.replace(" ", "")
+        if seen is None:
+            raise CaseFailed(f"SDO answer {answer}", "nothing")
+        pairs = zip(wanted[::2] + "", wanted[1::2], seen.hex()[::2], seen.hex()[1::2], strict=False)
+        if len(wanted) != len(seen.hex()) or any(a + b not in {"..", c + d} for a, b, c, d in pairs):
+            raise CaseFailed(f"SDO answer {answer}", seen.hex(" "))
+        return seen
+
+    def expect_abort(self, request: str | bytes, *codes: int, multiplexer: str | None = None) -> None:
+        """Fail unless an SDO request is aborted with one of the codes, and for its own object."""
+        data = bytes.fromhex(request) if isinstance(request, str) else request
+        self.check_abort(
+            self.ask(data), *codes, multiplexer=data[1:4].hex() if multiplexer is None else multiplexer
+        )
+
+    def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str) -> None:
+        """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer stands for any."""
+        expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
+        if seen is None:
+            raise CaseFailed(expected, "nothing")
+        if len(seen) != 8 or seen[0] != 0x80 or int.from_bytes(seen[4:], "little") not in codes:
+            raise CaseFailed(expected, seen.hex(" "))
+        if multiplexer and seen[1:4].hex() != multiplexer:
+            raise CaseFailed(f"{expected} for object {multiplexer}", seen.hex(" "))
+
+    def read(self, index: int, subindex: int = 0) -> bytes:
+        """Read an object, expedited or segmented; fail if that is not possible."""
+        result = self.try_read(index, subindex)
+        if isinstance(result, int):
+            raise CaseFailed(f"a value of {index:04X}h:{subindex:02X}h", f"abort 0x{result:08X}")
+        return result
+
+    def try_read(self, index: int, subindex: int = 0) -> bytes | int:
+        """Read an object; return its value, or the abort code as a number."""
+        answer = self.ask(bytes([0x40]) + multiplexer(index, subindex))
+        if answer is None or len(answer) != 8:
+            raise CaseFailed(f"an answer to reading {index:04X}h:{subindex:02X}h", _seen(answer))
+        if answer[0] == 0x80:
+            return int.from_bytes(answer[4:], "little")
+        if answer[0] & 0x02:
+            return answer[4 : 8 - (answer[0] >> 2 & 3)]
+        data, toggle = b"", 0
+        while True:
+            part = self.ask(bytes([0x60 | toggle]))
+            if part is None or len(part) != 8 or part[0] & 0xF0 != toggle:
+                raise CaseFailed(f"a segment of {index:04X}h:{subindex:02X}h", _seen(part))
+            data += part[1 : 8 - (part[0] >> 1 & 7)]
+            if part[0] & 1:
+                return data
+            toggle ^= 0x10
+
+    def number(self, index: int, subindex: int = 0) -> int:
+        """Read an unsigned number."""
+        return int.from_bytes(self.read(index, subindex), "little")
+
+    def write(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> int:
+        """Write up to 4 bytes; return 0 or the abort code."""
+        data = value if isinstance(value, bytes) else value.to_bytes(size, "little")
+        command = bytes([0x23 | (4 - len(data)) << 2])
+        answer = self.ask(command + multiplexer(index, subindex) + data)
+        if answer is None or len(answer) != 8 or answer[0] not in {0x60, 0x80}:
+            raise CaseFailed(f"an answer to writing {index:04X}h:{subindex:02X}h", _seen(answer))
+        if answer[1:4] != multiplexer(index, subindex):
+            raise CaseFailed(f"an answer for {index:04X}h:{subindex:02X}h", answer.hex(" "))
+        return 0 if answer[0] == 0x60 else int.from_bytes(answer[4:], "little")
+
+    def set(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> None:
+        """Write; fail if it is refused."""
+        code = self.write(index, subindex, value, size)
+        if code:
+            raise CaseFailed(f"{index:04X}h:{subindex:02X}h taken", f"abort 0x{code:08X}")
+
+    def expect_refusal(self, index: int, subindex: int, value: int | bytes, size: int, *codes: int) -> None:
+        """Fail unless a write is refused with one of the codes."""
+        code = self.write(index, subindex, value, size)
+        if code not in codes:
+            names = " or ".join(f"0x{wanted:08X}" for wanted in codes)
+            raise CaseFailed(f"abort {names}", f"abort 0x{code:08X}" if code else "the value taken")
+
+    # States
+
+    def command(self, specifier: int, node: int | None = None) -> None:
+        """Send an NMT command."""
+        self.send(NMT, bytes([specifier, self.node if node is None else node]))
+
+    def reset_communication(self) -> None:
+        """Reset the communication and wait for the boot-up message, so that all is at its stored values."""
+        self.drain()
+        self.command(RESET_COMMUNICATION)
+        self.expect_boot_up()
+
+    def expect_boot_up(self) -> None:
+        """Fail unless the boot-up message comes."""
+        data = self.expect(0x700 + self.node, "boot-up message", 5.0)
+        if data != b"\0":
+            raise CaseFailed("boot-up message 00", data.hex(" "))
+
+    def quiet(self) -> None:
+        """Switch off the heartbeat and all PDOs, so that only what a case provokes is on the bus."""
+        if 0x1017 in self.od:
+            self.set(0x1017, 0, 0, 2)
+        for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):
+            self.set(index, 1, self.number(index, 1) | PDO_OFF)
+
+    def expect_state(self, state: int) -> None:
+        """Fail unless the node is in a state: it tells by a heartbeat, switched on for it if it must be."""
+        if state == 0x04:
+            data = self.wait_for(0x700 + self.node, 2.5)
+        else:
+            self.set(0x1017, 0, 20, 2)
+            self.drain()
+            data = self.wait_for(0x700 + self.node, 1.0)
+        if data is None or data[0] & 0x7F != state:
+            raise CaseFailed(f"state {STATES[state]}", _seen(data))
+
+    # What the dictionary has
+
+    def variables(self) -> list[ODVariable]:
+        """Return all variables of the data sheet, without those that only describe data types."""
+        found: list[ODVariable] = []
+        for index in sorted(self.od.indices):
+            if index < 0x1000:
+                continue
+            item = self.od.indices[index]
+            if isinstance(item, ODVariable):
+                found.append(item)
+            else:
+                found += [item.subindices[subindex] for subindex in sorted(item.subindices)]
+        return found
+
+    def find(self, what: str, wanted: Callable[[ODVariable], bool]) -> ODVariable:
+        """Return the first variable that is wanted; skip the case if there is none."""
+        for item in self.variables():
+            if wanted(item):
+                return item
+        raise CaseSkipped(f"the data sheet has no {what}")
+
+    def require(self, index: int) -> None:
+        """Skip the case if an object is not there."""
+        if index not in self.od:
+            raise CaseSkipped(f"the data sheet has no object {index:04X}h")
+
+    def pdo_indices(self, first: int) -> list[int]:
+        """Return the indices of communication records from 1400h or 1800h on."""
+        return [index for index in sorted(self.od.indices) if first <= index < first + 0x200]
+
+
+def multiplexer(index: int, subindex: int) -> bytes:
+    """Return index and sub-index as an SDO carries them."""
+    return index.to_bytes(2, "little") + bytes([subindex])
+
+
+def size_of(item: ODVariable) -> int | None:
+    """Bytes of a variable, None if its length is free."""
+    packer = ODVariable.STRUCT_TYPES.get(item.data_type if item.data_type is not None else -1)
+    return None if packer is None else packer.size
+
+
+def is_integer(item: ODVariable) -> bool:
+    """Tell whether a variable is an integer."""
+    return item.data_type in datatypes.INTEGER_TYPES
+
+
+def _frame_text(frame: CanFrame) -> str:
+    identifier = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    return f"{identifier}#{'R' if frame.remote else frame.data.hex().upper()}"
+
+
+def _seen(data: bytes | None) -> str:
+    return "nothing" if data is None else data.hex(" ")

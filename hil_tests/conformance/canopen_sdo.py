@@ -1,0 +1,337 @@
+"""CANopen conformance: SDO server, expedited and segmented transfer (CiA 301 7.2.4)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from canopen.objectdictionary import ODVariable, datatypes
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_COMMAND,
+    ABORT_LENGTH,
+    ABORT_LENGTH_HIGH,
+    ABORT_LENGTH_LOW,
+    ABORT_TIMEOUT,
+    ABORT_TOGGLE,
+    STOP,
+    CanopenProbe,
+    is_integer,
+    multiplexer,
+    size_of,
+)
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+CLAUSE: Final = "CiA 301 7.2.4.3"
+LONGEST_TIMEOUT_S: Final = 12.0
+
+
+def long_text(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
+    """Return a readable text of more than 14 bytes, for transfers of at least three segments."""
+    for item in probe.variables():
+        if item.data_type in {datatypes.VISIBLE_STRING, datatypes.OCTET_STRING} and item.readable:
+            value = probe.try_read(item.index, item.subindex)
+            if isinstance(value, bytes) and len(value) > 14:
+                return item, value
+    raise CaseSkipped("no readable text of more than 14 bytes")
+
+
+def writable_number(probe: CanopenProbe) -> ODVariable:
+    """Return a 16-bit number that can be written without effect: the heartbeat time, else another."""
+    if 0x1017 in probe.od:
+        item = probe.od.get_variable(0x1017)
+        if item is not None:
+            return item
+    return probe.find(
+        "writable 16-bit number",
+        lambda item: item.access_type == "rw" and is_integer(item) and size_of(item) == 2,
+    )
+
+
+def upload(item: ODVariable) -> bytes:
+    """Return the request that begins to read an object."""
+    return b"\x40" + multiplexer(item.index, item.subindex)
+
+
+def mux(item: ODVariable) -> str:
+    """Return an object's multiplexer as hexadecimal text."""
+    return multiplexer(item.index, item.subindex).hex()
+
+
+def expect_no_transfer(probe: CanopenProbe) -> None:
+    """Fail unless a segment request finds no transfer under way."""
+    probe.check_abort(probe.ask("60"), ABORT_COMMAND, multiplexer="")
+
+
+@case(_CASES, "canopen.sdo.expedited-upload", "expedited upload tells its size", f"{CLAUSE}.6")
+def expedited_upload(probe: CanopenProbe) -> None:
+    """Objects of 1, 2 and 4 bytes: e and s set, n right, unused bytes zero."""
+    for size, command in ((1, 0x4F), (2, 0x4B), (4, 0x43)):
+        fitting = [
+            item for item in probe.variables() if item.readable and is_integer(item) and size_of(item) == size
+        ]
+        if not fitting:
+            continue
+        item = fitting[0]
+        answer = probe.expect_answer(upload(item), f"{command:02x} {mux(item)} .. .. .. ..")
+        check(not any(answer[4 + size :]), "unused bytes 00", answer)
+
+
+@case(
+    _CASES, "canopen.sdo.expedited-download", "expedited download is confirmed", f"{CLAUSE}.3", intrusive=True
+)
+def expedited_download(probe: CanopenProbe) -> None:
+    """60h, the multiplexer, four zeros; the value has changed."""
+    item = writable_number(probe)
+    probe.expect_answer(
+        b"\x2b" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
+    )
+    check_equal(probe.number(item.index, item.subindex), 12345, "value")
+
+
+@case(_CASES, "canopen.sdo.no-size", "expedited download without a size", f"{CLAUSE}.3", intrusive=True)
+def no_size(probe: CanopenProbe) -> None:
+    """With s cleared the object's own size counts."""
+    item = writable_number(probe)
+    probe.expect_answer(
+        b"\x22" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
+    )
+    check_equal(probe.number(item.index, item.subindex), 12345, "value")
+
+
+@case(_CASES, "canopen.sdo.segmented-upload", "segmented upload: size, toggle, last segment", f"{CLAUSE}.7")
+def segmented_upload(probe: CanopenProbe) -> None:
+    """Size in the first answer, toggle bit alternating from 0, c in the last segment only, n right."""
+    item, value = long_text(probe)
+    probe.expect_answer(upload(item), f"41 {mux(item)} {len(value).to_bytes(4, 'little').hex()}")
+    toggle, data = 0, b""
+    while len(data) < len(value):
+        left = len(value) - len(data)
+        used = min(7, left)
+        command = toggle | (7 - used) << 1 | (left <= 7)
+        answer = probe.expect_answer(bytes([0x60 | toggle]), f"{command:02x}" + " .." * 7)
+        data += answer[1 : 1 + used]
+        check(not any(answer[1 + used :]), "unused bytes 00", answer)
+        toggle ^= 0x10
+    check_equal(data, value, "value")
+    expect_no_transfer(probe)
+
+
+@case(_CASES, "canopen.sdo.upload-toggle", "toggle bit not alternated in an upload", f"{CLAUSE}.17")
+def upload_toggle(probe: CanopenProbe) -> None:
+    """Abort 0503 0000h at the first and at a later segment; the transfer has ended."""
+    item, _ = long_text(probe)
+    probe.ask(upload(item))
+    probe.check_abort(probe.ask("70"), ABORT_TOGGLE, multiplexer=mux(item))
+    expect_no_transfer(probe)
+    probe.ask(upload(item))
+    probe.ask("60")
+    probe.check_abort(probe.ask("60"), ABORT_TOGGLE, multiplexer=mux(item))
+    expect_no_transfer(probe)
+
+
+@case(
+    _CASES, "canopen.sdo.segmented-download", "segmented download of a number", f"{CLAUSE}.4", intrusive=True
+)
+def segmented_download(probe: CanopenProbe) -> None:
+    """A 16-bit number in one segment, with its size announced and without."""
+    item = writable_number(probe)
+    for command, size, value in ((0x21, 2, b"\x39\x30"), (0x20, 0, b"\x38\x30")):
+        request = bytes([command]) + multiplexer(item.index, item.subindex) + size.to_bytes(4, "little")
+        probe.expect_answer(request, f"60 {mux(item)} 00000000")
+        probe.expect_answer(bytes([5 << 1 | 1]) + value, "20 00000000000000")
+        check_equal(probe.read(item.index, item.subindex), value, "value")
+
+
+@case(
+    _CASES,
+    "canopen.sdo.download-in-parts",
+    "segmented download in two segments",
+    f"{CLAUSE}.4",
+    intrusive=True,
+)
+def download_in_parts(probe: CanopenProbe) -> None:
+    """One byte a segment: toggle bit echoed, nothing written before the end."""
+    item = writable_number(probe)
+    before = probe.read(item.index, item.subindex)
+    value = bytes([before[0] ^ 0x55, before[1] ^ 0x01])
+    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.expect_answer(bytes([6 << 1]) + value[:1], "20 00000000000000")
+    probe.expect_answer(bytes([0x10 | 6 << 1 | 1]) + value[1:], "30 00000000000000")
+    check_equal(probe.read(item.index, item.subindex), value, "value")
+
+
+@case(
+    _CASES,
+    "canopen.sdo.download-toggle",
+    "toggle bit not alternated in a download",
+    f"{CLAUSE}.17",
+    intrusive=True,
+)
+def download_toggle(probe: CanopenProbe) -> None:
+    """Abort 0503 0000h; the object keeps its value and the transfer has ended."""
+    item = writable_number(probe)
+    before = probe.read(item.index, item.subindex)
+    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.check_abort(probe.ask(bytes([0x10 | 5 << 1 | 1, 0x11, 0x11])), ABORT_TOGGLE, multiplexer=mux(item))
+    probe.check_abort(probe.ask("01"), ABORT_COMMAND, multiplexer="")
+    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.ask(bytes([6 << 1, 0x11]))
+    probe.check_abort(probe.ask(bytes([6 << 1 | 1, 0x11])), ABORT_TOGGLE, multiplexer=mux(item))
+    check_equal(probe.read(item.index, item.subindex), before, "value as before")
+
+
+@case(
+    _CASES, "canopen.sdo.announced-high", "announced size above the object's", f"{CLAUSE}.17", intrusive=True
+)
+def announced_high(probe: CanopenProbe) -> None:
+    """Abort 0607 0010h or 0607 0012h, at once or at the end."""
+    item = writable_number(probe)
+    answer = probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x03\0\0\0")
+    if answer is not None and answer[0] == 0x60:
+        answer = probe.ask(bytes([4 << 1 | 1, 1, 1, 1]))
+    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
+
+
+@case(
+    _CASES, "canopen.sdo.sent-high", "more bytes sent than the object takes", f"{CLAUSE}.17", intrusive=True
+)
+def sent_high(probe: CanopenProbe) -> None:
+    """Abort 0607 0010h or 0607 0012h."""
+    item = writable_number(probe)
+    probe.ask(b"\x20" + multiplexer(item.index, item.subindex))
+    answer = probe.ask(bytes([4 << 1 | 1, 1, 1, 1]))
+    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
+
+
+@case(
+    _CASES, "canopen.sdo.sent-low", "fewer bytes sent than the object takes", f"{CLAUSE}.17", intrusive=True
+)
+def sent_low(probe: CanopenProbe) -> None:
+    """Abort 0607 0010h or 0607 0013h; the object keeps its value."""
+    item = writable_number(probe)
+    before = probe.read(item.index, item.subindex)
+    probe.ask(b"\x20" + multiplexer(item.index, item.subindex))
+    answer = probe.ask(bytes([6 << 1 | 1, before[0] ^ 1]))
+    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_LOW, multiplexer=mux(item))
+    check_equal(probe.read(item.index, item.subindex), before, "value as before")
+
+
+@case(
+    _CASES, "canopen.sdo.announced-differs", "fewer bytes sent than announced", f"{CLAUSE}.17", intrusive=True
+)
+def announced_differs(probe: CanopenProbe) -> None:
+    """Abort 0607 0010h, 0607 0012h or 0607 0013h."""
+    item = writable_number(probe)
+    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    answer = probe.ask(bytes([6 << 1 | 1, 1]))
+    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, ABORT_LENGTH_LOW, multiplexer=mux(item))
+
+
+@case(_CASES, "canopen.sdo.unknown-command", "unknown command specifier", f"{CLAUSE}.17")
+def unknown_command(probe: CanopenProbe) -> None:
+    """Abort 0504 0001h for 7."""
+    probe.check_abort(probe.ask("e0 00 10 00"), ABORT_COMMAND, multiplexer="")
+
+
+@case(_CASES, "canopen.sdo.no-transfer", "segments without a transfer", f"{CLAUSE}.17")
+def no_transfer(probe: CanopenProbe) -> None:
+    """Abort 0504 0001h for an upload segment, a download segment and ends of blocks."""
+    for request in ("60", "70", "00", "01", "a1", "a2 01 7f", "a3", "c1"):
+        probe.check_abort(probe.ask(request), ABORT_COMMAND, multiplexer="")
+
+
+@case(_CASES, "canopen.sdo.wrong-segment", "download segment within an upload", f"{CLAUSE}.17")
+def wrong_segment(probe: CanopenProbe) -> None:
+    """Abort 0504 0001h; the transfer has ended."""
+    item, _ = long_text(probe)
+    probe.ask(upload(item))
+    probe.check_abort(probe.ask("00"), ABORT_COMMAND, multiplexer="")
+    expect_no_transfer(probe)
+
+
+@case(
+    _CASES, "canopen.sdo.client-abort", "an abort of the client ends the transfer, unanswered", f"{CLAUSE}.17"
+)
+def client_abort(probe: CanopenProbe) -> None:
+    """After 80h nothing is sent, and the next segment finds no transfer."""
+    item, _ = long_text(probe)
+    probe.ask(upload(item))
+    probe.send(
+        0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes.fromhex("00000405")
+    )
+    probe.expect_silence(0x580 + probe.node, "answer to an abort")
+    expect_no_transfer(probe)
+
+
+@case(_CASES, "canopen.sdo.new-request", "a new request replaces the transfer under way", f"{CLAUSE}.6")
+def new_request(probe: CanopenProbe) -> None:
+    """A client that has restarted is served."""
+    item, _ = long_text(probe)
+    probe.ask(upload(item))
+    probe.ask("60")
+    probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
+    expect_no_transfer(probe)
+
+
+@case(_CASES, "canopen.sdo.time-out", "a transfer whose client falls silent ends", f"{CLAUSE}.17")
+def time_out(probe: CanopenProbe) -> None:
+    """Abort 0504 0000h in some seconds."""
+    item, _ = long_text(probe)
+    probe.ask(upload(item))
+    probe.check_abort(
+        probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), ABORT_TIMEOUT, multiplexer=mux(item)
+    )
+    expect_no_transfer(probe)
+
+
+@case(_CASES, "canopen.sdo.wrong-length", "frames of other than 8 bytes are no SDO", f"{CLAUSE}.2")
+def wrong_length(probe: CanopenProbe) -> None:
+    """No answer to 0, 4 and 7 bytes."""
+    for length in (0, 4, 7):
+        probe.send(0x600 + probe.node, bytes.fromhex("40001000000000")[:length])
+        probe.expect_silence(0x580 + probe.node, f"answer to {length} bytes")
+
+
+@case(_CASES, "canopen.sdo.extended", "frames with a 29-bit identifier are no SDO", "CiA 301 7.3.5")
+def extended(probe: CanopenProbe) -> None:
+    """No answer to the same number as an extended identifier."""
+    probe.send(0x600 + probe.node, "40 00 10 00 00 00 00 00", extended=True)
+    probe.expect_silence(0x580 + probe.node, "answer to an extended frame")
+
+
+@case(_CASES, "canopen.sdo.remote", "remote frames are no SDO", "CiA 301 7.2.4")
+def remote(probe: CanopenProbe) -> None:
+    """No answer."""
+    probe.send(0x600 + probe.node, remote=True)
+    probe.expect_silence(0x580 + probe.node, "answer to a remote frame")
+
+
+@case(_CASES, "canopen.sdo.other-node", "requests to another node are not answered", "CiA 301 7.3.5")
+def other_node(probe: CanopenProbe) -> None:
+    """No answer under this node's identifier."""
+    probe.send(0x600 + (probe.node % 127 + 1), "40 00 10 00 00 00 00 00")
+    probe.expect_silence(0x580 + probe.node, "answer to another node's request")
+
+
+@case(_CASES, "canopen.sdo.stopped", "no SDO in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
+def stopped(probe: CanopenProbe) -> None:
+    """No answer; a transfer under way does not go on afterwards."""
+    item, _ = long_text(probe)
+    probe.ask(upload(item))
+    probe.command(STOP)
+    if probe.ask("60", 0.2) is not None or probe.ask("40 00 10 00", 0.2) is not None:
+        raise CaseFailed("no SDO answer in STOPPED", "an answer")
+    probe.command(128)
+    expect_no_transfer(probe)
+
+
+@case(_CASES, "canopen.sdo.server-parameter", "1200h tells the identifiers in use", "CiA 301 7.5.2.33")
+def server_parameter(probe: CanopenProbe) -> None:
+    """600h and 580h plus the node-ID."""
+    probe.require(0x1200)
+    check_equal(probe.number(0x1200, 1), 0x600 + probe.node, "1200h:01h")
+    check_equal(probe.number(0x1200, 2), 0x580 + probe.node, "1200h:02h")
+
+
+CASES = tuple(_CASES)

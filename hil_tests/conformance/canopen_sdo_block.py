@@ -1,0 +1,376 @@
+"""CANopen conformance: SDO block transfer (CiA 301 7.2.4.3.9 to 7.2.4.3.16)."""
+
+from __future__ import annotations
+
+from binascii import crc_hqx
+from typing import Final
+
+from canopen.objectdictionary import ODVariable, datatypes
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_BLOCK_SIZE,
+    ABORT_COMMAND,
+    ABORT_CRC,
+    ABORT_LENGTH,
+    ABORT_LENGTH_HIGH,
+    ABORT_LENGTH_LOW,
+    ABORT_NO_OBJECT,
+    ABORT_READ_ONLY,
+    ABORT_SEQUENCE,
+    ABORT_TIMEOUT,
+    ABORT_WRITE_ONLY,
+    CanopenProbe,
+    multiplexer,
+)
+from hil_tests.conformance.canopen_sdo import (
+    LONGEST_TIMEOUT_S,
+    expect_no_transfer,
+    long_text,
+    mux,
+    writable_number,
+)
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+CLAUSE: Final = "CiA 301 7.2.4.3"
+SEGMENT: Final = 7
+
+
+def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
+    """Return the longest readable text or bulk data of at most 200 kB that the data sheet has: many blocks if it can be."""
+    best: tuple[ODVariable, bytes] | None = None
+    for item in probe.variables():
+        if item.readable and item.data_type in {
+            datatypes.DOMAIN,
+            datatypes.VISIBLE_STRING,
+            datatypes.OCTET_STRING,
+        }:
+            begun = probe.ask(b"\x40" + multiplexer(item.index, item.subindex))
+            probe.send(0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes(4))
+            if begun is None or begun[0] != 0x41:
+                continue
+            size = int.from_bytes(begun[4:], "little")
+            if size <= 200_000 and (best is None or size > len(best[1])):
+                best = item, bytes(size)
+    if best is None:
+        raise CaseSkipped("no readable object of more than 4 bytes")
+    item, _ = best
+    return item, b""
+
+
+def _begin(
+    probe: CanopenProbe, item: ODVariable, size: int = 127, *, crc: bool = True, threshold: int = 0
+) -> bytes:
+    command = 0xA4 if crc else 0xA0
+    answer = probe.ask(bytes([command]) + multiplexer(item.index, item.subindex) + bytes([size, threshold]))
+    if answer is None:
+        raise CaseFailed("an answer to the block upload", "nothing")
+    return answer
+
+
+def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
+    """Send a request and return the segments of the block that it lets go, checking their numbers."""
+    probe.send(0x600 + probe.node, request.ljust(8, b"\0"))
+    found: list[bytes] = []
+    while len(found) < block:
+        frame = probe.expect(0x580 + probe.node, f"segment {len(found) + 1} of the block")
+        check_equal(frame[0] & 0x7F, len(found) + 1, "segment number")
+        found.append(frame)
+        if frame[0] & 0x80:
+            break
+    return found
+
+
+def _upload(probe: CanopenProbe, item: ODVariable, block: int, *, crc: bool = True) -> bytes:
+    """Upload an object in blocks, checking every part of the protocol."""
+    answer = _begin(probe, item, block, crc=crc)
+    check(answer[0] & 0xF9 == 0xC0, "answer C0h to C6h", answer)
+    check_equal(answer[1:4], multiplexer(item.index, item.subindex), "multiplexer")
+    total = int.from_bytes(answer[4:], "little") if answer[0] & 0x02 else None
+    with_crc = bool(answer[0] & 0x04) and crc
+    data, request = b"", b"\xa3"
+    while True:
+        found = _segments(probe, request, block)
+        data += b"".join(frame[1:] for frame in found)
+        request = bytes([0xA2, len(found), block])
+        if found[-1][0] & 0x80:
+            break
+    probe.send(0x600 + probe.node, request.ljust(8, b"\0"))
+    end = probe.expect(0x580 + probe.node, "end of the block upload")
+    check(end[0] & 0xE3 == 0xC1, "end C1h to DDh", end)
+    unused = end[0] >> 2 & 7
+    check(not any(data[len(data) - unused :]), "unused bytes of the last segment 00", data[-SEGMENT:])
+    data = data[: len(data) - unused]
+    if total is not None:
+        check_equal(len(data), total, "bytes")
+    if with_crc:
+        check_equal(int.from_bytes(end[1:3], "little"), crc_hqx(data, 0), "CRC")
+    probe.send(0x600 + probe.node, b"\xa1".ljust(8, b"\0"))
+    probe.expect_silence(0x580 + probe.node, "answer to the end of an upload", 0.05)
+    return data
+
+
+@case(_CASES, "canopen.sdo-block.upload", "block upload with CRC", f"{CLAUSE}.13")
+def upload_with_crc(probe: CanopenProbe) -> None:
+    """Numbers from 1, last bit, unused bytes, size and CRC; the same data as by segments."""
+    item, value = long_text(probe)
+    check_equal(_upload(probe, item, 127), value, "value")
+    expect_no_transfer(probe)
+
+
+@case(
+    _CASES, "canopen.sdo-block.upload-sizes", "block upload in blocks of 1, 2 and 5 segments", f"{CLAUSE}.13"
+)
+def upload_sizes(probe: CanopenProbe) -> None:
+    """The block size is the client's."""
+    item, value = long_text(probe)
+    for block in (1, 2, 5):
+        check_equal(_upload(probe, item, block), value, "value")
+
+
+@case(_CASES, "canopen.sdo-block.upload-without-crc", "block upload without CRC", f"{CLAUSE}.13")
+def upload_without_crc(probe: CanopenProbe) -> None:
+    """A client that does not support the CRC is served."""
+    item, value = long_text(probe)
+    check_equal(_upload(probe, item, 127, crc=False), value, "value")
+
+
+@case(_CASES, "canopen.sdo-block.upload-big", "block upload of many blocks", f"{CLAUSE}.13")
+def upload_big(probe: CanopenProbe) -> None:
+    """The longest object up to 200 kB, twice: the same data, with CRC."""
+    item, _ = _big(probe)
+    first = _upload(probe, item, 127)
+    if len(first) <= SEGMENT * 127:
+        raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
+    check_equal(len(_upload(probe, item, 100)), len(first), "bytes")
+
+
+@case(
+    _CASES,
+    "canopen.sdo-block.upload-repeat",
+    "segments that were not confirmed are sent again",
+    f"{CLAUSE}.14",
+)
+def upload_repeat(probe: CanopenProbe) -> None:
+    """Confirm the first of three, then none, then all."""
+    item, value = long_text(probe)
+    _begin(probe, item, 3)
+    first = _segments(probe, b"\xa3", 3)
+    again = _segments(probe, bytes([0xA2, 1, 2]), 2)
+    check_equal([frame[1:] for frame in again][:1], [first[1][1:]], "second segment again")
+    same = _segments(probe, bytes([0xA2, 0, 2]), 2)
+    check_equal(same, again, "the same block again")
+    check_equal(same[0][1:], value[7:14], "second segment")
+    probe.send(0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes(4))
+
+
+@case(_CASES, "canopen.sdo-block.upload-block-size", "block size 0 and above 127", f"{CLAUSE}.17")
+def upload_block_size(probe: CanopenProbe) -> None:
+    """Abort 0504 0002h at the beginning and in a confirmation."""
+    item, _ = long_text(probe)
+    for size in (0, 128):
+        probe.check_abort(_begin(probe, item, size), ABORT_BLOCK_SIZE, multiplexer=mux(item))
+    for size in (0, 128):
+        _begin(probe, item, 1)
+        _segments(probe, b"\xa3", 1)
+        probe.check_abort(probe.ask(bytes([0xA2, 1, size])), ABORT_BLOCK_SIZE, multiplexer=mux(item))
+
+
+@case(_CASES, "canopen.sdo-block.upload-sequence", "more segments confirmed than were sent", f"{CLAUSE}.17")
+def upload_sequence(probe: CanopenProbe) -> None:
+    """Abort 0504 0003h."""
+    item, _ = long_text(probe)
+    _begin(probe, item, 2)
+    _segments(probe, b"\xa3", 2)
+    probe.check_abort(probe.ask("a2 03 02"), ABORT_SEQUENCE, multiplexer=mux(item))
+
+
+@case(_CASES, "canopen.sdo-block.upload-order", "requests of a block upload out of order", f"{CLAUSE}.17")
+def upload_order(probe: CanopenProbe) -> None:
+    """Abort 0504 0001h for a confirmation before the start, an end before its time, a segment request."""
+    item, _ = long_text(probe)
+    for request in ("a2 01 01", "a1", "60"):
+        _begin(probe, item, 1)
+        probe.check_abort(probe.ask(request), ABORT_COMMAND, multiplexer="")
+    _begin(probe, item, 1)
+    _segments(probe, b"\xa3", 1)
+    probe.check_abort(probe.ask("a1"), ABORT_COMMAND, multiplexer="")
+
+
+@case(_CASES, "canopen.sdo-block.threshold", "protocol switch threshold", f"{CLAUSE}.13")
+def threshold(probe: CanopenProbe) -> None:
+    """An object not above the threshold comes by the upload protocol or by blocks, one above it by blocks."""
+    item, value = long_text(probe)
+    answer = _begin(probe, item, 127, threshold=min(255, len(value)))
+    check(answer[0] in {0x41, 0xC6, 0xC4, 0xC2, 0xC0}, "answer 41h or C6h", answer)
+    probe.send(0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes(4))
+    answer = _begin(probe, item, 127, threshold=7)
+    check(answer[0] & 0xF9 == 0xC0, "answer C6h", answer)
+    probe.send(0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes(4))
+
+
+@case(_CASES, "canopen.sdo-block.upload-refused", "block upload of what cannot be read", f"{CLAUSE}.17")
+def upload_refused(probe: CanopenProbe) -> None:
+    """Abort 0602 0000h and 0601 0001h."""
+    probe.expect_abort("a4 05 00 00 7f 00", ABORT_NO_OBJECT)
+    item = probe.find("write-only object", lambda item: item.access_type == "wo")
+    probe.expect_abort(b"\xa4" + multiplexer(item.index, item.subindex) + b"\x7f\0", ABORT_WRITE_ONLY)
+
+
+@case(
+    _CASES,
+    "canopen.sdo-block.upload-time-out",
+    "a block upload whose client falls silent ends",
+    f"{CLAUSE}.17",
+)
+def upload_time_out(probe: CanopenProbe) -> None:
+    """Abort 0504 0000h in some seconds."""
+    item, _ = long_text(probe)
+    _begin(probe, item, 2)
+    _segments(probe, b"\xa3", 2)
+    probe.check_abort(
+        probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), ABORT_TIMEOUT, multiplexer=mux(item)
+    )
+
+
+def _begin_download(probe: CanopenProbe, item: ODVariable, size: int | None, *, crc: bool = True) -> int:
+    """Begin a block download; return the block size that the node wants."""
+    command = 0xC0 | (0x04 if crc else 0) | (0 if size is None else 0x02)
+    request = bytes([command]) + multiplexer(item.index, item.subindex) + (size or 0).to_bytes(4, "little")
+    answer = probe.ask(request)
+    if answer is None or answer[0] & 0xFB != 0xA0:
+        raise CaseFailed("answer A0h or A4h", "nothing" if answer is None else answer.hex(" "))
+    check_equal(answer[1:4], multiplexer(item.index, item.subindex), "multiplexer")
+    check(1 <= answer[4] <= 127, "block size 1 to 127", answer[4])
+    return answer[4]
+
+
+def _end(probe: CanopenProbe, unused: int, crc: int) -> bytes | None:
+    return probe.ask(bytes([0xC1 | unused << 2]) + crc.to_bytes(2, "little"))
+
+
+@case(_CASES, "canopen.sdo-block.download", "block download with CRC", f"{CLAUSE}.9", intrusive=True)
+def download(probe: CanopenProbe) -> None:
+    """A 16-bit number in one segment: A4h, A2h with number 1, A1h; with and without size and CRC."""
+    item = writable_number(probe)
+    for size, crc, value in ((2, True, b"\x39\x30"), (None, True, b"\x38\x30"), (2, False, b"\x37\x30")):
+        _begin_download(probe, item, size, crc=crc)
+        answer = probe.ask(b"\x81" + value)
+        check(answer is not None and answer[:2] == b"\xa2\x01", "confirmation A2h 01h", answer)
+        answer = _end(probe, 5, crc_hqx(value, 0) if crc else 0)
+        check_equal(answer, b"\xa1" + bytes(7), "end")
+        check_equal(probe.read(item.index, item.subindex), value, "value")
+    expect_no_transfer(probe)
+
+
+@case(
+    _CASES, "canopen.sdo-block.download-crc", "wrong CRC of a block download", f"{CLAUSE}.17", intrusive=True
+)
+def download_crc(probe: CanopenProbe) -> None:
+    """Abort 0504 0004h; the object keeps its value."""
+    item = writable_number(probe)
+    before = probe.read(item.index, item.subindex)
+    value = bytes([before[0] ^ 1, before[1]])
+    _begin_download(probe, item, 2)
+    probe.ask(b"\x81" + value)
+    probe.check_abort(_end(probe, 5, crc_hqx(value, 0) ^ 0x0100), ABORT_CRC, multiplexer=mux(item))
+    check_equal(probe.read(item.index, item.subindex), before, "value as before")
+
+
+@case(
+    _CASES,
+    "canopen.sdo-block.download-gap",
+    "a lost segment is asked for again",
+    f"{CLAUSE}.11",
+    intrusive=True,
+)
+def download_gap(probe: CanopenProbe) -> None:
+    """The last segment with number 2 after none: A2h with number 0; then the block again."""
+    item = writable_number(probe)
+    _begin_download(probe, item, 2)
+    answer = probe.ask(b"\x82\x39\x30")
+    check(answer is not None and answer[:2] == b"\xa2\x00", "confirmation A2h 00h", answer)
+    answer = probe.ask(b"\x81\x39\x30")
+    check(answer is not None and answer[:2] == b"\xa2\x01", "confirmation A2h 01h", answer)
+    answer = _end(probe, 5, crc_hqx(b"\x39\x30", 0))
+    check_equal(answer, b"\xa1" + bytes(7), "end")
+
+
+@case(_CASES, "canopen.sdo-block.download-zero", "segment number 0", f"{CLAUSE}.17", intrusive=True)
+def download_zero(probe: CanopenProbe) -> None:
+    """Abort 0504 0003h, or the segment is passed over; no confirmation of it, and the node is not stuck."""
+    item = writable_number(probe)
+    _begin_download(probe, item, 2)
+    answer = probe.ask(b"\x00\x39\x30")
+    if answer is not None:
+        probe.check_abort(answer, ABORT_SEQUENCE, multiplexer=mux(item))
+    else:
+        probe.send(0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes(4))
+    probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
+
+
+@case(
+    _CASES, "canopen.sdo-block.download-length", "lengths of block downloads", f"{CLAUSE}.17", intrusive=True
+)
+def download_length(probe: CanopenProbe) -> None:
+    """One byte too many, too few, and other than announced, each refused."""
+    item = writable_number(probe)
+    before = probe.read(item.index, item.subindex)
+    for size, unused in ((None, 4), (None, 6), (2, 6)):
+        _begin_download(probe, item, size, crc=False)
+        probe.ask(b"\x81\x39\x30\x01")
+        probe.check_abort(
+            _end(probe, unused, 0), ABORT_LENGTH, ABORT_LENGTH_HIGH, ABORT_LENGTH_LOW, multiplexer=mux(item)
+        )
+    check_equal(probe.read(item.index, item.subindex), before, "value as before")
+
+
+@case(
+    _CASES,
+    "canopen.sdo-block.download-announced",
+    "announced size that the object has not",
+    f"{CLAUSE}.17",
+    intrusive=True,
+)
+def download_announced(probe: CanopenProbe) -> None:
+    """Refused at once or at the end."""
+    item = writable_number(probe)
+    answer = probe.ask(b"\xc2" + multiplexer(item.index, item.subindex) + b"\x03\0\0\0")
+    if answer is not None and answer[0] != 0x80:
+        probe.ask(b"\x81\x39\x30\x01")
+        answer = _end(probe, 4, 0)
+    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
+
+
+@case(
+    _CASES,
+    "canopen.sdo-block.download-abort",
+    "an abort of the client ends a block download",
+    f"{CLAUSE}.17",
+    intrusive=True,
+)
+def download_abort(probe: CanopenProbe) -> None:
+    """80h is no segment."""
+    item = writable_number(probe)
+    _begin_download(probe, item, 2)
+    probe.send(
+        0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes.fromhex("00000405")
+    )
+    probe.expect_silence(0x580 + probe.node, "answer to an abort")
+    expect_no_transfer(probe)
+
+
+@case(
+    _CASES,
+    "canopen.sdo-block.download-refused",
+    "block download to what cannot be written",
+    f"{CLAUSE}.17",
+    intrusive=True,
+)
+def download_refused(probe: CanopenProbe) -> None:
+    """Abort 0601 0002h and 0602 0000h."""
+    probe.expect_abort("c2 00 10 00 04 00 00 00", ABORT_READ_ONLY)
+    probe.expect_abort("c2 05 00 00 04 00 00 00", ABORT_NO_OBJECT)
+
+
+CASES = tuple(_CASES)

@@ -1,0 +1,85 @@
+"""A conformance case: what it checks, where that is written, and how it is run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+ProbeType = TypeVar("ProbeType")
+
+
+class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
+    """The device did something else than it has to.
+
+    Attributes
+    ----------
+    expected, seen
+        What had to come and what came, one line each.
+    """
+
+    def __init__(self, expected: str, seen: str) -> None:
+        super().__init__(f"expected {expected}; seen {seen}")
+        self.expected = expected
+        self.seen = seen
+
+
+class CaseSkipped(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
+    """The device does not have what the case is about; the text says what."""
+
+
+@dataclass(frozen=True)
+class Case(Generic[ProbeType]):
+    """One check.
+
+    Attributes
+    ----------
+    id
+        Dotted name, unique: link, area, check.
+    area
+        Part of the protocol that it belongs to.
+    title
+        What is checked, one line.
+    clause
+        Where that is written: clause of a standard, or the source that confirms it.
+    run
+        Does it with a probe; raises `CaseFailed` or `CaseSkipped`.
+    intrusive
+        Changes settings or state of the device, so that it is not for a unit in use.
+    """
+
+    id: str
+    area: str
+    title: str
+    clause: str
+    run: Callable[[ProbeType], None]
+    intrusive: bool = False
+
+
+def case(
+    cases: list[Case[ProbeType]], identifier: str, title: str, clause: str, *, intrusive: bool = False
+) -> Callable[[Callable[[ProbeType], None]], Callable[[ProbeType], None]]:
+    """Enter a function in a table of cases; the area is the identifier without its last part."""
+
+    def enter(run: Callable[[ProbeType], None]) -> Callable[[ProbeType], None]:
+        area = identifier.rpartition(".")[0]
+        cases.append(Case(identifier, area, title, clause, run, intrusive))
+        return run
+
+    return enter
+
+
+def check(condition: object, expected: str, seen: object) -> None:
+    """Raise `CaseFailed` unless the condition holds."""
+    if not condition:
+        raise CaseFailed(expected, seen.hex() if isinstance(seen, bytes | bytearray) else str(seen))
+
+
+def check_equal(seen: object, expected: object, what: str) -> None:
+    """Raise `CaseFailed` unless two values are equal."""
+    if seen != expected:
+        raise CaseFailed(f"{what} {_text(expected)}", _text(seen))
+
+
+def _text(value: object) -> str:
+    return value.hex(" ") if isinstance(value, bytes | bytearray) else str(value)

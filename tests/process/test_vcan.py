@@ -1,0 +1,192 @@
+"""Emulator, OBC and can-utils as processes of their own on a kernel vcan0 (on machines without one: in a guest)."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import subprocess
+import threading
+import time
+import tty
+
+import can
+import pytest
+
+from hil_tests.client import ObcClient
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.raw_exchange import format_frame
+from protocol.candump import parse_candump, read_candump
+from tests.process.test_sessions import starhil
+
+pytestmark = [pytest.mark.process, pytest.mark.socketcan]
+
+PATIENCE_S = 30.0
+READY_WITHIN_S = 180.0
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory):
+    """An emulator on vcan0."""
+    if not os.path.exists("/sys/class/net/vcan0"):  # noqa: PTH110 -- one look, no path to keep
+        pytest.skip("no vcan0 here; tools/test_on_vcan runs these tests in a guest that has one")
+    state = tmp_path_factory.mktemp("state")
+    command = emulator_command(
+        serial="off", can="auto", seed=1, settings=["truth.attitude.roll_deg=30"], state_dir=state
+    )
+    with EmulatorProcess(command, ready_within_s=READY_WITHIN_S) as process:
+        yield process
+
+
+@pytest.fixture
+def obc(unit):
+    """An OBC on vcan0."""
+    with ObcClient.open(can="vcan0", timeout_s=5.0) as client:
+        yield client
+
+
+@pytest.fixture
+def dump():
+    """A candump process; call it to get what it has seen since."""
+    process = subprocess.Popen(
+        [shutil.which("candump"), "-L", "vcan0"], stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+    lines: list[str] = []
+    reader = threading.Thread(target=lambda: lines.extend(process.stdout), daemon=True)
+    reader.start()
+    time.sleep(0.3)
+
+    def _seen(count: int, within_s: float = 5.0) -> list[str]:
+        deadline = time.monotonic() + within_s
+        while len(lines) < count and time.monotonic() < deadline:
+            time.sleep(0.02)
+        return [format_frame(parse_candump(line)[1]) for line in lines]
+
+    yield _seen
+    process.terminate()
+    process.wait()
+    reader.join()
+    process.stdout.close()
+
+
+def cansend(frame: str, interface: str = "vcan0") -> None:
+    subprocess.run([shutil.which("cansend"), interface, frame], check=True)
+
+
+def test_auto_takes_the_kernel_bus(unit):
+    assert unit.ready["can"] in ("vcan0", "socketcan:vcan0")
+
+
+def test_raw_commands_by_can_utils_are_answered(unit, dump):
+    cansend("04800104#")
+    seen = dump(2)
+    assert seen[0] == "04800104#"
+    assert seen[1].startswith("05800401#53")
+    cansend("01600104#4D")
+    cansend("01670104#")
+    assert dump(6)[2:] == ["01600104#4D", "03600401#03", "01670104#", "02670401#"]
+
+
+def test_a_segmented_command_and_a_segmented_reply(unit, dump):
+    for frame in ("07000104#0001020304050601", "07000104#0708090A0B00"):
+        cansend(frame)
+    seen = dump(3)
+    assert seen[2] == "03000401#01"
+    cansend("04D30104#")
+    reply = dump(4 + 8)[4:]
+    assert [frame[:9] for frame in reply] == ["08D30401#"] * 8
+    assert [frame[-2:] for frame in reply] == [f"{left:02X}" for left in range(7, -1, -1)]
+    assert sum(len(frame[9:]) // 2 - 1 for frame in reply) == 54
+
+
+def test_candump_and_the_bench_log_the_same_frames(unit, dump, tmp_path):
+    script = tmp_path / "short.toml"
+    script.write_text(
+        "[[step]]\nread = 'identification'\nrepeat = 20\nevery_s = 0\n[[step]]\nread = 'precise_attitude'\n"
+    )
+    done = starhil("session", script, "--can", "vcan0", "--log", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    logged = [format_frame(frame) for _, frame in read_candump(tmp_path / "can.log")]
+    assert len(logged) == 2 * 20 + 1 + 8
+    assert dump(len(logged)) == logged
+
+
+@pytest.mark.parametrize("name", ["first_light", "errors"])
+def test_a_session_passes_on_the_kernel_bus(name, tmp_path, unit):
+    done = starhil("session", name, "--can", "auto", "--log", tmp_path)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+
+
+def test_commands_are_answered_while_cangen_floods_the_bus(obc):
+    flood = subprocess.Popen([shutil.which("cangen"), "vcan0", "-g", "2", "-e", "-I", "i", "-L", "8"])
+    try:
+        for _ in range(50):
+            assert len(obc.telemetry("star_tracker", timeout_s=PATIENCE_S)) > 20
+    finally:
+        flood.terminate()
+        flood.wait()
+    assert obc.faults == []
+    assert obc.stray_replies == []
+
+
+def test_the_kernel_sends_periodic_requests_and_each_is_answered(obc):
+    obc.command("clear_counters")
+    with can.Bus(interface="socketcan", channel="vcan0") as bus:
+        request = can.Message(arbitration_id=0x04800204, is_extended_id=True)
+        task = bus.send_periodic(request, 0.02)
+        replies = 0
+        deadline = time.monotonic() + PATIENCE_S
+        while replies < 25 and time.monotonic() < deadline:
+            message = bus.recv(1.0)
+            replies += message is not None and message.arbitration_id == 0x05800402
+        task.stop()
+    assert type(task).__name__ == "CyclicSendTask"
+    assert replies == 25
+    assert obc.telemetry("communication_status")["telemetry_count"] >= 26
+
+
+@contextlib.contextmanager
+def pty_pair():
+    """Two ttys, joined crosswise."""
+    ends = [os.openpty() for _ in range(2)]
+    for master, slave in ends:
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+    stopping = threading.Event()
+
+    def copy():
+        masters = [master for master, _ in ends]
+        while not stopping.is_set():
+            for source in select.select(masters, [], [], 0.05)[0]:
+                os.write(masters[1 - masters.index(source)], os.read(source, 4096))
+
+    thread = threading.Thread(target=copy, daemon=True)
+    thread.start()
+    try:
+        yield tuple(os.ttyname(slave) for _, slave in ends)
+    finally:
+        stopping.set()
+        thread.join()
+        for pair in ends:
+            for descriptor in pair:
+                os.close(descriptor)
+
+
+def test_an_slcan_adapter_on_a_tty(tmp_path):
+    with pty_pair() as (kernel_end, device_end):
+        command = emulator_command(serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state")
+        with EmulatorProcess(command, ready_within_s=READY_WITHIN_S):
+            daemon = subprocess.Popen([shutil.which("slcand"), "-F", "-S", "115200", kernel_end, "slcan0"])
+            try:
+                deadline = time.monotonic() + 5.0
+                while not os.path.exists("/sys/class/net/slcan0"):  # noqa: PTH110 -- one look
+                    assert time.monotonic() < deadline
+                    time.sleep(0.05)
+                subprocess.run([shutil.which("ip"), "link", "set", "slcan0", "up"], check=True)
+                with ObcClient.open(can="slcan0", timeout_s=5.0) as obc:
+                    assert obc.telemetry("identification")["interface_version"] == 1
+                    assert len(obc.telemetry("precise_attitude")) > 10
+            finally:
+                daemon.terminate()
+                daemon.wait()
