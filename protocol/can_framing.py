@@ -7,10 +7,11 @@ last segment is as short as its data.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from protocol.errors import ProtocolError
 from protocol.messages import (
@@ -279,12 +280,13 @@ class _Assembler:
         return fault
 
 
-class CanDeviceReceiver:
-    """The device's end: frames in, requests and faults out. Frames for other addresses are not its business."""
+_Event = TypeVar("_Event")
 
-    def __init__(
-        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
-    ) -> None:
+
+class _Receiver(ABC, Generic[_Event]):
+    """What both ends have in common: frames in, events and faults out."""
+
+    def __init__(self, address: int, max_size: int, timeout_s: float) -> None:
         self.address = address
         """Own address; may be changed while running."""
         self._assembler = _Assembler(max_size, timeout_s)
@@ -298,15 +300,30 @@ class CanDeviceReceiver:
         """Give up segmented messages that have been silent for the time-out."""
         return self._assembler.flush(now)
 
-    def feed(self, frame: CanFrame, now: float) -> list[Request | LinkFault]:
+    def feed(self, frame: CanFrame, now: float) -> list[_Event | LinkFault]:
         """Take a frame that arrived at time `now` (s, any origin) and return what it completes."""
-        events: list[Request | LinkFault] = list(self.flush(now))
-        if not frame.extended or frame.remote:
-            return events
-        identifier = CanIdentifier.unpack(frame.id)
-        if identifier.destination == self.address:
-            events.extend(self._take(identifier, frame, now))
+        events: list[_Event | LinkFault] = list(self.flush(now))
+        if frame.extended and not frame.remote:
+            identifier = CanIdentifier.unpack(frame.id)
+            if self._concerns(identifier):
+                events.extend(self._take(identifier, frame, now))
         return events
+
+    def _concerns(self, identifier: CanIdentifier) -> bool:
+        return identifier.destination == self.address
+
+    @abstractmethod
+    def _take(self, identifier: CanIdentifier, frame: CanFrame, now: float) -> Iterator[_Event | LinkFault]:
+        """Work off a frame that is addressed to this end."""
+
+
+class CanDeviceReceiver(_Receiver[Request]):
+    """The device's end: frames in, requests and faults out. Frames for other addresses are not its business."""
+
+    def __init__(
+        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
+    ) -> None:
+        super().__init__(address, max_size, timeout_s)
 
     def _take(self, identifier: CanIdentifier, frame: CanFrame, now: float) -> Iterator[Request | LinkFault]:
         is_telemetry = identifier.id >= FIRST_TELEMETRY_ID
@@ -345,10 +362,11 @@ _REPLY_TYPES: Final = {
 """Replies of one frame."""
 
 
-class CanHostReceiver:
+class CanHostReceiver(_Receiver[Reply]):
     """The OBC's end: frames in, replies and faults out.
 
-    Frames to other addresses, and requests by other masters, are not its business.
+    Frames to other addresses, and requests by other masters, are not its business; with `device` given, neither are
+    other devices.
     """
 
     def __init__(
@@ -359,28 +377,11 @@ class CanHostReceiver:
         max_size: int = DEFAULT_MAX_SIZE,
         timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
-        self._address = address
+        super().__init__(address, max_size, timeout_s)
         self._device = device
-        self._assembler = _Assembler(max_size, timeout_s)
 
-    @property
-    def busy(self) -> bool:
-        """Whether a segmented message is open, so that `flush` may be due."""
-        return self._assembler.busy
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Give up segmented messages that have been silent for the time-out."""
-        return self._assembler.flush(now)
-
-    def feed(self, frame: CanFrame, now: float) -> list[Reply | LinkFault]:
-        """Take a frame that arrived at time `now` (s, any origin) and return what it completes."""
-        events: list[Reply | LinkFault] = list(self.flush(now))
-        if not frame.extended or frame.remote:
-            return events
-        identifier = CanIdentifier.unpack(frame.id)
-        if identifier.destination == self._address and self._device in (None, identifier.source):
-            events.extend(self._take(identifier, frame, now))
-        return events
+    def _concerns(self, identifier: CanIdentifier) -> bool:
+        return super()._concerns(identifier) and self._device in (None, identifier.source)
 
     def _take(self, identifier: CanIdentifier, frame: CanFrame, now: float) -> Iterator[Reply | LinkFault]:
         match identifier.type:

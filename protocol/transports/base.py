@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from typing import ClassVar, Final, Generic, TypeVar
 
 from protocol.errors import ProtocolError
 
@@ -79,11 +81,63 @@ class Transport(ABC, Generic[Item]):
             self._on_error(TransportError(text))
 
 
+class ReturningTransport(Transport[Item]):
+    """A port or bus that may vanish: tells so once, then tries to get it back with growing pauses."""
+
+    what: ClassVar[str]
+    """Kind of port, the first word of every message."""
+
+    def __init__(self, description: str) -> None:
+        super().__init__(description)
+        self._closing = False
+        self._comeback: asyncio.Task[None] | None = None
+
+    async def _open(self) -> None:
+        await self._connect()
+
+    @abstractmethod
+    async def _connect(self) -> None:
+        """Open the port or raise TransportError."""
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Let go of the port and of what was waiting for it, whatever its state."""
+
+    def _lost(self, why: str) -> None:
+        """Note that the port is gone."""
+        if self._closing or self._comeback is not None:
+            return
+        self._disconnect()
+        self._complain(f"{self.what} {self.description}: lost: {why}; waiting for it to come back")
+        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
+
+    async def _come_back(self) -> None:
+        pause = Backoff()
+        while True:
+            await asyncio.sleep(pause.next())
+            try:
+                await self._connect()
+            except ProtocolError:
+                continue
+            self.statistics.reconnects += 1
+            self._comeback = None
+            return
+
+    async def close(self) -> None:
+        """Give the port back."""
+        self._closing = True
+        if self._comeback is not None:
+            self._comeback.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._comeback
+            self._comeback = None
+        self._disconnect()
+
+
 class Backoff:
     """Waiting times between tries: doubling from the first to the last."""
 
     def __init__(self, first_s: float = 0.05, last_s: float = 1.0) -> None:
-        self._first_s = first_s
         self._last_s = last_s
         self._next_s = first_s
 
@@ -91,7 +145,3 @@ class Backoff:
         """Return the time to wait now (s)."""
         wait, self._next_s = self._next_s, min(2 * self._next_s, self._last_s)
         return wait
-
-    def reset(self) -> None:
-        """Start anew with the first waiting time."""
-        self._next_s = self._first_s

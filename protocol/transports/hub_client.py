@@ -9,9 +9,8 @@ from collections.abc import Awaitable, Callable
 from typing import Final, cast
 
 from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
 from protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
-from protocol.transports.base import Backoff, Transport, TransportError
+from protocol.transports.base import ReturningTransport, TransportError
 
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
 """Bytes that wait for a hub that does not read at most."""
@@ -87,7 +86,7 @@ class _Connection(asyncio.Protocol):
         await self._drained.wait()
 
 
-class HubTransport(Transport[CanFrame]):
+class HubTransport(ReturningTransport[CanFrame]):
     """Frames over a socketcand server.
 
     Parameters
@@ -98,6 +97,8 @@ class HubTransport(Transport[CanFrame]):
         Awaited before each connection; starts a server if none is there (used by `auto`).
     """
 
+    what = "CAN"
+
     def __init__(self, host: str, port: int, bus: str, ensure_server: EnsureServer | None = None) -> None:
         super().__init__(f"socketcand:{host}:{port}/{bus}")
         self._host = host
@@ -105,12 +106,7 @@ class HubTransport(Transport[CanFrame]):
         self._bus = bus
         self._ensure_server = ensure_server
         self._connection: _Connection | None = None
-        self._comeback: asyncio.Task[None] | None = None
         self._outbox: list[bytes] = []
-        self._closing = False
-
-    async def _open(self) -> None:
-        await self._connect()
 
     async def _connect(self) -> None:
         if self._ensure_server is not None:
@@ -118,7 +114,7 @@ class HubTransport(Transport[CanFrame]):
         loop = asyncio.get_running_loop()
         try:
             _, connection = await loop.create_connection(
-                lambda: _Connection(self._take, self._lost), self._host, self._port
+                lambda: _Connection(self._take, self._ended), self._host, self._port
             )
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
@@ -156,21 +152,14 @@ class HubTransport(Transport[CanFrame]):
         self.statistics.received += 1
         self._receive(frame)
 
-    def _lost(self, connection: _Connection, why: str) -> None:
-        if connection is not self._connection or self._closing:
-            return
-        self._connection = None
-        self._complain(f"CAN {self.description}: lost: {why}; waiting for it to come back")
-        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
+    def _ended(self, connection: _Connection, why: str) -> None:
+        if connection is self._connection:
+            self._lost(why)
 
-    async def _come_back(self) -> None:
-        pause = Backoff()
-        while self._connection is None:
-            await asyncio.sleep(pause.next())
-            with contextlib.suppress(ProtocolError):
-                await self._connect()
-        self.statistics.reconnects += 1
-        self._comeback = None
+    def _disconnect(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None and connection.transport is not None:
+            connection.transport.close()
 
     def send(self, item: CanFrame) -> bool:
         """Queue a frame; all frames of one turn of the loop leave together."""
@@ -206,17 +195,8 @@ class HubTransport(Transport[CanFrame]):
 
     async def close(self) -> None:
         """Leave the bus; what was queued is sent first if the hub reads."""
-        self._closing = True
-        if self._comeback is not None:
-            self._comeback.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._comeback
-            self._comeback = None
         if self._outbox:
             self._flush()
-        connection, self._connection = self._connection, None
-        if connection is not None and connection.transport is not None:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(connection.drain(), CLOSE_S)
-            if connection.transport is not None:
-                connection.transport.close()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.drain(), CLOSE_S)
+        await super().close()

@@ -14,7 +14,7 @@ from typing import Final
 import can
 
 from protocol.can_framing import CanFrame
-from protocol.transports.base import Backoff, Transport, TransportError
+from protocol.transports.base import ReturningTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000
 """Frames that wait for the bus at most."""
@@ -37,7 +37,7 @@ ECHO_S: Final = 0.5
 OpenBus = Callable[[], can.BusABC]
 
 
-class PythonCanTransport(Transport[CanFrame]):
+class PythonCanTransport(ReturningTransport[CanFrame]):
     """Frames over a python-can bus.
 
     Parameters
@@ -49,6 +49,8 @@ class PythonCanTransport(Transport[CanFrame]):
     echoes:
         The bus hands back what was sent on it (udp_multicast): the echo is taken out again.
     """
+
+    what = "CAN"
 
     def __init__(self, description: str, open_bus: OpenBus, *, echoes: bool = False) -> None:
         super().__init__(description)
@@ -62,28 +64,35 @@ class PythonCanTransport(Transport[CanFrame]):
         self._timer: asyncio.Handle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
-        self._comeback: asyncio.Task[None] | None = None
-        self._closing = False
 
-    async def _open(self) -> None:
+    async def _connect(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            self._bus = await asyncio.to_thread(self._open_bus)
+            bus = await self._open_in_thread()
         except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise TransportError(f"CAN {self.description}: cannot open: {reason}") from None
-        self._fd = _descriptor(self._bus)
+        self._bus = bus
+        self._fd = _descriptor(bus)
         if self._fd >= 0:
             loop.add_reader(self._fd, self._readable)
         else:
             self._stop = threading.Event()
             self._thread = threading.Thread(
                 target=self._read_in_thread,
-                args=(self._bus, self._stop, loop),
+                args=(bus, self._stop, loop),
                 name="can-reader",
                 daemon=True,
             )
             self._thread.start()
+
+    async def _open_in_thread(self) -> can.BusABC:
+        opening = asyncio.ensure_future(asyncio.to_thread(self._open_bus))
+        try:
+            return await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_shut_down)
+            raise
 
     def _readable(self) -> None:
         for _ in range(READS_PER_TURN):
@@ -186,24 +195,7 @@ class PythonCanTransport(Transport[CanFrame]):
         else:
             self._idle.set()
 
-    def _lost(self, why: str) -> None:
-        if self._closing or self._bus is None:
-            return
-        self._release()
-        self._complain(f"CAN {self.description}: lost: {why}; waiting for it to come back")
-        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
-
-    async def _come_back(self) -> None:
-        pause = Backoff()
-        while self._bus is None:
-            await asyncio.sleep(pause.next())
-            with contextlib.suppress(TransportError):
-                await self._open()
-        self.statistics.reconnects += 1
-        self._comeback = None
-
-    def _release(self) -> None:
-        """Let go of the bus and of what was waiting for it."""
+    def _disconnect(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -225,16 +217,16 @@ class PythonCanTransport(Transport[CanFrame]):
 
     async def close(self) -> None:
         """Leave the bus."""
-        self._closing = True
-        if self._comeback is not None:
-            self._comeback.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._comeback
-            self._comeback = None
-        self._release()
+        await super().close()
         thread, self._thread = self._thread, None
         if thread is not None:
             await asyncio.to_thread(thread.join, 2 * READ_TIMEOUT_S)
+
+
+def _shut_down(opening: asyncio.Future[can.BusABC]) -> None:
+    """Give back a bus that came when nobody waited for it any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().shutdown()
 
 
 def _descriptor(bus: can.BusABC) -> int:

@@ -15,9 +15,8 @@ from urllib.parse import urlsplit
 
 import serial
 
-from protocol.errors import ProtocolError
 from protocol.serial_framing import PacingSchedule
-from protocol.transports.base import Backoff, Transport, TransportError
+from protocol.transports.base import ReturningTransport, Transport, TransportError
 from protocol.transports.paced_writer import PacedWriter
 
 READ_SIZE: Final = 65536
@@ -85,7 +84,6 @@ class _PacedTransport(Transport[bytes]):
         super().__init__(description)
         self._schedule = schedule
         self._writer: PacedWriter | None = None
-        self._closing = False
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
@@ -191,58 +189,29 @@ class PtyTransport(_PacedTransport):
         self._master = self._slave = -1
 
 
-class _LossyTransport(_PacedTransport):
-    """A port that may vanish: tells so once, then tries to get it back with growing pauses."""
+class _ReturningSerial(_PacedTransport, ReturningTransport[bytes]):
+    """A serial port that may vanish."""
 
-    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
-        super().__init__(description, schedule)
-        self._comeback: asyncio.Task[None] | None = None
+    what = "serial"
+
+    async def _connect(self) -> None:
+        await self._attach()
+        self._make_writer()
+
+    def _disconnect(self) -> None:
+        self._detach()
+        self._drop_writer()
 
     @abstractmethod
-    async def _connect(self) -> None:
+    async def _attach(self) -> None:
         """Open the port or raise TransportError."""
 
     @abstractmethod
-    def _disconnect(self) -> None:
+    def _detach(self) -> None:
         """Let go of the port, whatever its state."""
 
-    async def _open(self) -> None:
-        await self._connect()
-        self._make_writer()
 
-    def _lost(self, why: str) -> None:
-        if self._closing or self._comeback is not None:
-            return
-        self._disconnect()
-        self._drop_writer()
-        self._complain(f"serial {self.description}: lost: {why}; waiting for it to come back")
-        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
-
-    async def _come_back(self) -> None:
-        pause = Backoff()
-        while True:
-            await asyncio.sleep(pause.next())
-            try:
-                await self._connect()
-            except ProtocolError:
-                continue
-            self._make_writer()
-            self.statistics.reconnects += 1
-            self._comeback = None
-            return
-
-    async def close(self) -> None:
-        self._closing = True
-        if self._comeback is not None:
-            self._comeback.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._comeback
-            self._comeback = None
-        self._disconnect()
-        self._drop_writer()
-
-
-class TtyTransport(_LossyTransport):
+class TtyTransport(_ReturningSerial):
     """A tty opened by its path, through pyserial."""
 
     def __init__(self, path: str, baud: int, schedule: PacingSchedule | None) -> None:
@@ -251,7 +220,7 @@ class TtyTransport(_LossyTransport):
         self._baud = baud
         self._port: serial.Serial | None = None
 
-    async def _connect(self) -> None:
+    async def _attach(self) -> None:
         path = Path(self._path)
         if path.exists() and not path.is_char_device():
             raise TransportError(f"serial {self._path}: is no tty")
@@ -285,7 +254,7 @@ class TtyTransport(_LossyTransport):
             self._lost(error.strerror or str(error))
             raise
 
-    def _disconnect(self) -> None:
+    def _detach(self) -> None:
         if self._port is not None:
             asyncio.get_running_loop().remove_reader(self._port.fileno())
             with contextlib.suppress(OSError):
@@ -326,10 +295,10 @@ class _StreamProtocol(asyncio.Protocol):
         self._owner.take(self, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._owner.detach(self, exc)
+        self._owner.ended(self, exc)
 
 
-class _TcpTransport(_LossyTransport):
+class _TcpTransport(_ReturningSerial):
     """Common part of both TCP forms."""
 
     def __init__(self, scheme: str, host: str, port: int, schedule: PacingSchedule | None) -> None:
@@ -351,14 +320,14 @@ class _TcpTransport(_LossyTransport):
         if protocol is self._protocol:
             self._take(data)
 
-    def detach(self, protocol: _StreamProtocol, error: Exception | None) -> None:
+    def ended(self, protocol: _StreamProtocol, error: Exception | None) -> None:
         """Note that a connection has ended."""
         if protocol is self._protocol:
             self._stream = self._protocol = None
-            self._ended(str(error) if error else "closed by the peer")
+            self._peer_gone(str(error) if error else "closed by the peer")
 
     @abstractmethod
-    def _ended(self, why: str) -> None:
+    def _peer_gone(self, why: str) -> None:
         """React to the end of the connection."""
 
     def _write(self, data: bytes) -> int:
@@ -369,7 +338,7 @@ class _TcpTransport(_LossyTransport):
         self._stream.write(data)
         return len(data)
 
-    def _disconnect(self) -> None:
+    def _detach(self) -> None:
         if self._stream is not None:
             self._stream.abort()
             self._stream = self._protocol = None
@@ -381,7 +350,7 @@ class _ConnectTransport(_TcpTransport):
     def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
         super().__init__("socket", host, port, schedule)
 
-    async def _connect(self) -> None:
+    async def _attach(self) -> None:
         loop = asyncio.get_running_loop()
         try:
             await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
@@ -391,7 +360,7 @@ class _ConnectTransport(_TcpTransport):
                 f"serial {self.description}: cannot connect: {reason}; start the peer first"
             ) from None
 
-    def _ended(self, why: str) -> None:
+    def _peer_gone(self, why: str) -> None:
         self._lost(why)
 
 
@@ -402,7 +371,7 @@ class _ListenTransport(_TcpTransport):
         super().__init__("listen", host, port, schedule)
         self._server: asyncio.Server | None = None
 
-    async def _connect(self) -> None:
+    async def _attach(self) -> None:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: _StreamProtocol(self), self._host, self._port)
@@ -413,12 +382,12 @@ class _ListenTransport(_TcpTransport):
         self._port = self._server.sockets[0].getsockname()[1]
         self.description = f"socket://{self._host}:{self._port}"
 
-    def _ended(self, why: str) -> None:  # noqa: ARG002 (the peer may come and go)
+    def _peer_gone(self, why: str) -> None:  # noqa: ARG002 (the peer may come and go)
         if self._writer is not None:
             self._writer.clear()
 
-    def _disconnect(self) -> None:
+    def _detach(self) -> None:
         if self._server is not None:
             self._server.close()
             self._server = None
-        super()._disconnect()
+        super()._detach()
