@@ -9,6 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from emulator.clock import Clock, SteppedClock, make_clock
 from emulator.control import ControlServer
@@ -34,8 +35,11 @@ from protocol.values import Value
 
 log = logging.getLogger("starhil.run")
 
-PIPELINE_RESTART_S = 1.0
+PIPELINE_RESTART_S: Final = 0.5
 """Pause before a pipeline that ended by itself is started again, seconds."""
+
+PATIENCE_S: Final = 8.0
+"""Time after which a start that takes long is explained, seconds."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,7 @@ class Emulation:
         self.control: ControlServer | None = None
         self.ended = asyncio.Event()
         self._warming: asyncio.Task[None] | None = None
+        self._reviving: asyncio.Task[None] | None = None
         self._awake = asyncio.Event()
         self._closing = False
 
@@ -228,9 +233,21 @@ class Emulation:
             self._awake.set()
 
     def _pipeline_failed(self, text: str) -> None:
-        if not self._closing:
-            log.error("%s", text)
-            self.device.pipeline_lost()
+        if self._closing:
+            return
+        log.error("%s; starting another", text)
+        self.device.pipeline_lost()
+        self._reviving = asyncio.create_task(self._revive())
+
+    async def _revive(self) -> None:
+        """Start the pipeline anew; the device stays in its error mode until it is commanded out of it."""
+        await asyncio.sleep(PIPELINE_RESTART_S)
+        try:
+            warm = await self.imager.restart()
+        except EmulatorError as error:
+            log.warning("%s; commands other than standby stay refused", error)
+            return
+        self.device.pipeline_ready(camera_constants(warm))
 
     async def ready(self) -> str:
         """Wait until the device takes commands; return the ready line.
@@ -241,10 +258,12 @@ class Emulation:
             The pipeline cannot be made: a missing catalogue, a camera that cannot be.
         """
         awake = asyncio.create_task(self._awake.wait())
+        patience = asyncio.get_running_loop().call_later(PATIENCE_S, _tell_of_first_start)
         warming = self._warming
         if warming is None:
             raise EmulatorError("emulation: not started")
         await asyncio.wait({awake, warming}, return_when=asyncio.FIRST_COMPLETED)
+        patience.cancel()
         if warming.done() and (error := warming.exception()) is not None:
             awake.cancel()
             raise error
@@ -257,10 +276,11 @@ class Emulation:
         self._closing = True
         if self._pump is not None:
             self._pump.stop()
-        if self._warming is not None:
-            self._warming.cancel()
-            with contextlib.suppress(asyncio.CancelledError, EmulatorError):
-                await self._warming
+        for task in (self._warming, self._reviving):
+            if task is not None:
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError, EmulatorError):
+                    await task
         for link in (self.serial, self.can):
             if link is not None:
                 await link.close()
@@ -303,6 +323,10 @@ def camera_constants(warm: Warm) -> dict[str, Value]:
         "p1": p1,
         "p2": p2,
     }
+
+
+def _tell_of_first_start() -> None:
+    log.warning("a first start compiles its kernels, about a minute; the links answer already")
 
 
 def _log_frame(measurement: Measurement) -> None:

@@ -130,10 +130,25 @@ class ProcessImager(_Queue):
         EmulatorError
             It cannot be: the worker's own one-line reason.
         """
+        self._warm = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
         self._write(self._setup)
         self._task = asyncio.create_task(self._read(reader))
         return await self._warm
+
+    async def restart(self) -> Warm:
+        """Start another worker in place of one that has ended, and wait until it is ready.
+
+        Raises
+        ------
+        EmulatorError
+            That one cannot be either.
+        """
+        if self._writer is not None:
+            self._writer.close()
+        self._worker.end()
+        self._worker = WorkerProcess()
+        return await self.start()
 
     def submit(self, request: Asked, done: Done) -> None:
         """Send a request to the worker."""
@@ -214,6 +229,16 @@ class ThreadImager(_Queue):
         self._loop.call_soon_threadsafe(self._warm.set_result, warm)
         while (request := self._requests.get()) is not None:
             self._loop.call_soon_threadsafe(self._answer, picture.handle(request))
+
+    async def restart(self) -> Warm:
+        """Refuse: a thread does not end by itself.
+
+        Raises
+        ------
+        EmulatorError
+            Always.
+        """
+        raise EmulatorError("picture thread: cannot be started again; start the emulator anew")
 
     async def close(self) -> None:
         """End the thread and wait for it."""

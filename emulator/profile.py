@@ -270,7 +270,7 @@ def _override(values: dict[str, Any], override: str) -> None:
             raise EmulatorError(f"--set {override}: {part} is a value, not a section")
         table = below
     if parts[-1] == "kind" and table.get("kind") != value:
-        for other in set(table) - {"attitude"}:
+        for other in set(table) - ({"attitude"} if value != "file" else set()):
             del table[other]
     table[parts[-1]] = value
 

@@ -1,0 +1,218 @@
+"""`starhil run` as a process of its own: ready line, end, bad input, and the same bytes for the same run."""
+
+import json
+import math
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tty
+
+import numpy as np
+import pytest
+
+from protocol.icd import load_icd
+from protocol.messages import Request
+from protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starid.attitude import Attitude
+
+pytestmark = pytest.mark.process
+
+READY_WITHIN_S = 300.0
+"""A first start compiles."""
+REPLY_WITHIN_S = 30.0
+ACCURACY_ARCSEC = 20.0
+ICD = load_icd()
+
+
+class Emulator:
+    """A running emulator with its control channel and serial line."""
+
+    def __init__(self, *arguments: str) -> None:
+        command = [sys.executable, "-c", "from emulator.cli.app import main; main()", "run"]
+        self.process = subprocess.Popen(
+            [*command, "--can", "off", "--control", "auto", *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert select.select([self.process.stdout], [], [], READY_WITHIN_S)[0], "no ready line"
+        line = self.process.stdout.readline()
+        assert line.startswith("ready "), self.process.stderr.read()
+        self.ready = dict(word.split("=", 1) for word in line.split()[1:])
+        host, port = self.ready["control"].rsplit(":", 1)
+        self.control = socket.create_connection((host, int(port)), REPLY_WITHIN_S)
+        self.lines = self.control.makefile("rw")
+        self.fd = os.open(self.ready["serial"], os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self.fd)
+
+    def do(self, action: str, **values):
+        self.lines.write(json.dumps({"do": action, **values}) + "\n")
+        self.lines.flush()
+        answer = json.loads(self.lines.readline())
+        assert answer["ok"], answer
+        return answer
+
+    def ask(self, identifier: int, data: bytes = b""):
+        """Send a request in dialect a; return raw bytes and the reply."""
+        request = Request.of(identifier, data)
+        host = HostReceiver(Dialect.A)
+        host.expect(request, ICD.row_by_id(identifier).size if identifier >= 128 else 0)
+        os.write(self.fd, encode_request(request))
+        raw, replies = b"", []
+        while not replies:
+            assert select.select([self.fd], [], [], REPLY_WITHIN_S)[0], "no reply"
+            data = os.read(self.fd, 4096)
+            raw += data
+            replies = host.feed(data, 0.0)
+        return raw, replies[0]
+
+    def read(self, name: str):
+        row = ICD.telemetry[name]
+        return row.decode(self.ask(row.id)[1].data)
+
+    def command(self, name: str, **values) -> int:
+        row = ICD.telecommands[name]
+        return int(self.ask(row.id, row.encode(values))[1].code)
+
+    def end(self, number=signal.SIGTERM) -> tuple[int, str]:
+        os.close(self.fd)
+        self.control.close()
+        self.process.send_signal(number)
+        _, errors = self.process.communicate(timeout=30)
+        return self.process.returncode, errors
+
+
+@pytest.fixture(scope="module")
+def stepped(tmp_path_factory):
+    """One emulator on the stepped clock for several tests."""
+    link = tmp_path_factory.mktemp("link") / "tty"
+    emulator = Emulator("--clock", "stepped", "--set", "links.serial.dialect=a", "--symlink", str(link))
+    emulator.link = link
+    emulator.do("step", seconds=1.0)
+    yield emulator
+    assert emulator.end() == (0, "")
+    assert not link.is_symlink()
+
+
+def test_a_symlink_leads_to_the_port(stepped):
+    assert stepped.ready["serial"] == str(stepped.link)
+    assert stepped.link.is_symlink()
+
+
+def test_the_real_sky_gives_the_true_attitude(stepped):
+    stepped.do("clear_faults")
+    stepped.do(
+        "set_truth",
+        truth={
+            "kind": "rate",
+            "attitude": {"ra_deg": 210.0, "dec_deg": 55.0},
+            "rate_deg_s": [0.1, -0.2, 0.3],
+        },
+    )
+    assert stepped.command("set_mode", mode="lost_in_space") == 0
+    stepped.do("step", seconds=5.0)
+    values = stepped.read("precise_attitude")
+    truth = stepped.do("truth", unix_s=values["time_of_exposure"])
+    measured = Attitude(np.array([values[f"q_{axis}"] for axis in "xyzw"]))
+    error = measured.error_to(Attitude(np.array(truth["quaternion_xyzw"])))
+    assert values["valid"]
+    assert values["tracking"]
+    assert error.total_arcsec < ACCURACY_ARCSEC
+    assert [values[f"rate_{axis}"] for axis in "xyz"] == pytest.approx([0.1, -0.2, 0.3], abs=0.01)
+    (frame,) = stepped.do("frames", count=1)["frames"]
+    assert frame["frame"] == values["frame_counter"]
+    assert frame["total_arcsec"] == pytest.approx(error.total_arcsec, abs=0.1)
+
+
+def test_an_image_is_what_the_sensor_saw(stepped):
+    stepped.command("save_image", image_size="size_128")
+    stepped.do("step", seconds=2.0)
+    assert stepped.read("image_status")["percent"] == 100
+    assert stepped.command("init_image_download", image_size="size_128") == 0
+    pixels = b""
+    for frame in range(128):
+        assert stepped.command("advance_image_download", next_frame=frame) == 0
+        pixels += stepped.read("image_frame")["data"]
+    image = np.frombuffer(pixels, np.uint8).reshape(128, 128)
+    assert image.max() > image[:100, :100].mean() + 3.0  # stars stand out of the background
+    assert not image[118:].any()  # below the 937 rows there is nothing
+    assert not image[:, 118:].any()
+
+
+def test_a_new_focal_length_ruins_the_attitude_until_it_is_right_again(stepped):
+    stepped.command("set_mode", mode="standby")
+    stepped.command("set_parameter", parameter=15, value=1000.0)
+    stepped.command("set_mode", mode="lost_in_space")
+    stepped.do("step", seconds=3.0)
+    values = stepped.read("precise_attitude")
+    assert not values["valid"]
+    assert values["reason"] in {"no_match", "residual", "too_few_stars", "ambiguous"}
+    stepped.command("default_parameters")
+    stepped.do("step", seconds=3.0)
+    assert stepped.read("precise_attitude")["valid"]
+
+
+def run_bytes() -> bytes:
+    emulator = Emulator("--clock", "stepped", "--seed", "5", "--set", "links.serial.dialect=a")
+    emulator.do("step", seconds=1.0)
+    out = bytearray(emulator.ask(96, b"\x02")[0])
+    for _ in range(4):
+        emulator.do("step", seconds=0.9)
+        for row in ICD.telemetry.values():
+            out += emulator.ask(row.id)[0]
+    assert emulator.end()[0] == 0
+    return bytes(out)
+
+
+def test_two_runs_of_one_seed_give_the_same_bytes():
+    first = run_bytes()
+    assert len(first) > 2000
+    assert first == run_bytes()
+
+
+def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
+    log = tmp_path / "truth.csv"
+    emulator = Emulator(
+        "--truth-log", str(log), "--set", "parameters.update_rate=10", "--set", "links.serial.dialect=a"
+    )
+    assert emulator.read("device_status")["mode"] == "standby"
+    assert emulator.command("set_mode", mode="lost_in_space") == 0
+    while emulator.read("device_status")["frames_captured"] < 5:
+        select.select([], [], [], 0.05)
+    code, errors = emulator.end(signal.SIGINT)
+    assert (code, errors) == (0, "")
+    lines = log.read_text().splitlines()
+    assert len(lines) >= 6
+    names, row = lines[0].split(","), lines[-1].split(",")
+    values = dict(zip(names, row, strict=True))
+    assert math.isfinite(float(values["cross_boresight_arcsec"]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["no_such_profile"], "no_such_profile"),
+        (["--set", "catalog.path=/no/such/file"], "/no/such/file"),
+        (["--set", "sensor.apperture_m=0.01"], "apperture_m"),
+        (["--serial", "/dev/no_such_tty"], "/dev/no_such_tty"),
+        (["--state-dir", "/proc/none"], "/proc/none"),
+        (["--set", "truth.kind=file", "--set", "truth.path=gone.csv"], "gone.csv"),
+    ],
+)
+def test_bad_input_ends_in_one_line_and_status_2(arguments, said):
+    command = [
+        sys.executable,
+        "-c",
+        "from emulator.cli.app import main; main()",
+        "run",
+        "--can",
+        "off",
+        *arguments,
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=READY_WITHIN_S, check=False)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("starhil: ")
+    assert said in line
