@@ -15,7 +15,7 @@ from emulator.frames import FrameRequest
 from emulator.imager import Imager
 from emulator.images import ImageStore
 from emulator.modes import Mode, Modes, Transition
-from emulator.parameters import Parameters
+from emulator.parameters import Parameters, ParameterValue
 from emulator.profile import LINK_PARAMETERS, Profile
 from emulator.refusal import Refused
 from emulator.scheduler import Event, Scheduler
@@ -211,12 +211,21 @@ class Device:
 
     def save_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
         """Store all parameters; `done` is called when they are on the disk, or with what went wrong."""
+        self._store_parameters(dict(self.parameters), done)
+
+    def forget_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
+        """Store none: present values stay, and the defaults hold from the next restart on."""
+        self._store_parameters({}, done)
+
+    def _store_parameters(
+        self, content: dict[str, ParameterValue], done: Callable[[EmulatorError | None], None]
+    ) -> None:
         before = self._stored_parameters
-        self._stored_parameters = dict(self.parameters)
+        self._stored_parameters = dict(content)
 
         def finish(error: EmulatorError | None) -> None:
             if error is None:
-                self.parameters.mark_stored()
+                self.parameters.mark_stored(content)
             else:
                 self._stored_parameters = before
             done(error)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from emulator.clock import Clock, SteppedClock, make_clock
 from emulator.control import ControlServer
@@ -32,6 +32,9 @@ from emulator.truth_log import TruthLog
 from emulator.worker_process import WorkerProcess
 from protocol.icd import InterfaceDefinition, load_icd
 from protocol.values import Value
+
+if TYPE_CHECKING:
+    from emulator.links.canopen import CanopenLink
 
 log = logging.getLogger("starhil.run")
 
@@ -88,6 +91,7 @@ class Emulation:
         self._device: Device | None = None
         self.serial: SerialLink | None = None
         self.can: CanLink | None = None
+        self.canopen: CanopenLink | None = None
         self.feed: LiveFeed | None = None
         self.warm: Warm | None = None
         self.ready_words: dict[str, str] = {}
@@ -156,12 +160,15 @@ class Emulation:
             self.ready_words["control"] = await self.control.start(self.options.control)
         self._warming = asyncio.create_task(self._warm_up())
 
+    @property
+    def _state_dir(self) -> Path | None:
+        """Folder of what survives a restart; None where nothing does."""
+        state_dir = self.profile.run.state_dir
+        return self.profile.folder / Path(state_dir).expanduser() if state_dir else None
+
     def _open_store(self) -> StateStore:
-        store: StateStore
-        if self.profile.run.state_dir:
-            store = FileStore(self.profile.folder / Path(self.profile.run.state_dir).expanduser())
-        else:
-            store = MemoryStore()
+        folder = self._state_dir
+        store: StateStore = MemoryStore() if folder is None else FileStore(folder)
         self._closers.append(store.close)
         return store
 
@@ -218,6 +225,21 @@ class Emulation:
 
             self.can = CanLink(device, open_can(links.can.channel), links.can.frame_gap_s, seed)
             self.ready_words["can"] = await self.can.start()
+        if links.canopen.node:
+            await self._open_canopen(device)
+
+    async def _open_canopen(self, device: Device) -> None:
+        """Let the CANopen node join the bus of the CAN link, or the one that it would have."""
+        from emulator.links.canopen import open_canopen
+        from protocol.transports.can import open_can
+
+        channel = self.profile.links.can.channel
+        bus = self.ready_words.get("can") or ("auto" if channel == "off" else channel)
+        transport = open_can(bus)
+        self.canopen = open_canopen(device, transport, self._state_dir, self.profile.run.seed)
+        taken = await self.canopen.start()
+        self.ready_words.setdefault("can", taken)
+        self.ready_words["canopen"] = str(device.parameters["canopen_node"])
 
     async def _warm_up(self) -> None:
         """Wait for the pipeline, then wait for boot to end; start the pipeline anew when it ends by itself."""
@@ -281,7 +303,7 @@ class Emulation:
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError, EmulatorError):
                     await task
-        for link in (self.serial, self.can):
+        for link in (self.serial, self.can, self.canopen):
             if link is not None:
                 await link.close()
         if self.control is not None:

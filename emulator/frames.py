@@ -168,16 +168,17 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class ImageRequest:
-    """Ask for the last frame as a square image of `edge` pixels, 8 bit."""
+    """Ask for the last frame as a square image of `edge` pixels, or as it is with `edge` 0; 8 bit."""
 
     edge: int
 
 
 @dataclass(frozen=True)
 class ImageResult:
-    """A square image, row by row; `frame` is the number of the frame that it shows, or -1 if there was none."""
+    """An image, row by row; `frame` is the number of the frame that it shows, or -1 if there was none."""
 
-    edge: int
+    width: int
+    height: int
     frame: int
     pixels: bytes
 

@@ -112,11 +112,37 @@ class ImageStore:
 
     def save(self, edge: int) -> None:
         """Capture the next frame and store it; in standby one frame is exposed for it."""
-        self.busy = True
         self.percent = 0
         self.status = "waiting_sensor"
+
+        def fetch() -> None:
+            self.percent, self.status = 50, "waiting_frame"
+            self._ask(edge, store)
+
+        def store(answer: ImageResult | None) -> None:
+            self.busy = False
+            if answer is None:
+                self.percent, self.status = 0, "storage_error"
+                return
+            self.stored = self._stored_image(answer)
+            self.percent, self.status = 100, "ok"
+
+        self._capture(fetch)
+
+    def take_full(self, done: Callable[[ImageResult | None], None]) -> None:
+        """Capture the next frame in its own size, beside what is stored; `done` gets it, or None if it failed."""
+
+        def finish(answer: ImageResult | None) -> None:
+            self.busy = False
+            done(answer)
+
+        self._capture(lambda: self._ask(0, finish))
+
+    def _capture(self, then: Callable[[], None]) -> None:
+        """Call `then` when the next frame has gone to the pipeline; in standby one is exposed for it."""
+        self.busy = True
         if self._cycle.running:
-            self._cycle.after_exposure = lambda: self._fetch(edge)
+            self._cycle.after_exposure = then
             return
         start_ns, exposure_ns = self._now_ns(), round(self._exposure_s() * NANOSECONDS)
         generation = self._generation
@@ -124,22 +150,13 @@ class ImageStore:
         def expose(_due_ns: int) -> None:
             if generation == self._generation:
                 self._imager.submit(self._single_frame(start_ns + exposure_ns // 2), lambda _answer: None)
-                self._fetch(edge)
+                then()
 
         self._scheduler.at(start_ns + exposure_ns, expose)
 
-    def _fetch(self, edge: int) -> None:
-        """Ask for the frame just exposed; it is stored when it has come and the storing time is over."""
-        self.percent, self.status = 50, "waiting_frame"
-        self._ask(edge, self._store)
-
-    def _store(self, image: StoredImage | None) -> None:
-        self.busy = False
-        if image is None:
-            self.percent, self.status = 0, "storage_error"
-            return
-        self.stored = image
-        self.percent, self.status = 100, "ok"
+    def _stored_image(self, answer: ImageResult) -> StoredImage:
+        self._count = (self._count + 1) % 256
+        return StoredImage(answer.width, answer.pixels, answer.frame, self._count)
 
     def open_stored(self, edge: int) -> bool:
         """Open the stored image for download in a size not above its own; False if there is none such."""
@@ -154,14 +171,17 @@ class ImageStore:
         self.busy = True
         self.download = None
 
-        def take(image: StoredImage | None) -> None:
+        def take(answer: ImageResult | None) -> None:
             self.busy = False
-            self.download, self.frame = image, 0
-            done(image is not None)
+            self.frame = 0
+            self.download = (
+                None if answer is None else StoredImage(answer.width, answer.pixels, answer.frame, 0)
+            )
+            done(answer is not None)
 
         self._ask(edge, take)
 
-    def _ask(self, edge: int, take: Callable[[StoredImage | None], None]) -> None:
+    def _ask(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
         """Fetch an image from the pipeline; it is taken in after the storing time, however fast it came."""
         generation = self._generation
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
@@ -170,11 +190,7 @@ class ImageStore:
 
         def finish() -> None:
             answer = answers[0]
-            if not isinstance(answer, ImageResult) or answer.frame < 0:
-                take(None)
-                return
-            self._count = (self._count + 1) % 256
-            take(StoredImage(answer.edge, answer.pixels, answer.frame, self._count))
+            take(answer if isinstance(answer, ImageResult) and answer.frame >= 0 else None)
 
         def arrived(answer: Answer) -> None:
             answers.append(answer)

@@ -106,10 +106,9 @@ class Parameters(Mapping[str, ParameterValue]):
         self._take(taken)
         return refused
 
-    def mark_stored(self) -> dict[str, ParameterValue]:
-        """Return all values as they are to be stored, and remember them as the stored ones."""
-        self._stored = dict(self._values)
-        return dict(self._values)
+    def mark_stored(self, stored: Mapping[str, ParameterValue]) -> None:
+        """Remember what a restart would bring."""
+        self._stored = dict(stored)
 
     @property
     def differ_from_store(self) -> bool:

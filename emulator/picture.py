@@ -227,9 +227,12 @@ class Picture:
 
     def _image(self, request: ImageRequest) -> ImageResult:
         if self._last is None:
-            return ImageResult(request.edge, -1, b"")
-        pixels = square_image(self._last.image, self._sensor.bits, request.edge)
-        return ImageResult(request.edge, self._last.frame_index, pixels)
+            return ImageResult(0, 0, -1, b"")
+        image, bits, frame = self._last.image, self._sensor.bits, self._last.frame_index
+        if request.edge == 0:
+            height, width = image.shape
+            return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
+        return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
 
 
 def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
@@ -259,6 +262,11 @@ def measured_magnitude(electrons: float, sensor: SensorModel) -> float:
     return -2.5 * math.log10(max(electrons, 1.0) / (sensor.zero_magnitude_e_s * sensor.exposure_s))
 
 
+def eight_bits(image: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+    """Return an image of `bits` bits with its eight highest."""
+    return (image >> max(0, bits - BYTE_LEVELS)).astype(np.uint8)
+
+
 def square_image(image: NDArray[Any], bits: int, edge: int) -> bytes:
     """Return an image as a square of `edge` pixels of 8 bit, row by row.
 
@@ -269,7 +277,7 @@ def square_image(image: NDArray[Any], bits: int, edge: int) -> bytes:
     full = 1 << (max(height, width) - 1).bit_length()
     full = max(full, edge)
     square = np.zeros((full, full), dtype=np.uint32)
-    square[:height, :width] = image >> max(0, bits - BYTE_LEVELS)
+    square[:height, :width] = eight_bits(image, bits)
     step = full // edge
     if step > 1:
         summed = square.reshape(edge, step, edge, step).sum(axis=(1, 3), dtype=np.uint64)

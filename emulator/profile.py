@@ -145,6 +145,8 @@ class Profile(Strict):
     device: DeviceConfig = DeviceConfig()
     timing: TimingConfig = TimingConfig()
     links: LinksConfig = LinksConfig()
+    calibration: dict[str, Any] = Field(default_factory=dict)
+    """What `starhil calibrate` notes about a camera: for people, not used."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Parameters of the device by the names of the interface definition: its defaults in this profile."""
 
@@ -155,6 +157,12 @@ class Profile(Strict):
         """Folder of the profile's file, from which its relative paths count."""
         return self._folder
 
+
+ALTERNATIVES: Final = (
+    (frozenset({"fov_deg"}), frozenset({"focal_px", "centre_px"})),
+    (frozenset({"ra_deg", "dec_deg", "roll_deg"}), frozenset({"quaternion_xyzw"})),
+)
+"""Sets of keys that say the same in two ways; a table has one of them."""
 
 LINK_PARAMETERS: Final[dict[str, str]] = {
     "serial_dialect": "links.serial.dialect",
@@ -239,14 +247,24 @@ def _read(path: Path, depth: int) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Lay `over` over `base`, table by table; a `[truth]` of another kind replaces the whole table."""
-    merged = dict(base)
+    """Lay `over` over `base`, table by table.
+
+    A table of another `kind` replaces the whole table below it, and of two ways to say the same (a field of view or focal
+    lengths, angles or a quaternion) the one in `over` takes the other one's place.
+    """
+    if "kind" in over and over["kind"] != base.get("kind"):
+        return dict(over)
+    dropped = {
+        key
+        for one, other in ALTERNATIVES
+        for keys, by in ((one, other), (other, one))
+        if by & over.keys()
+        for key in keys
+    }
+    merged = {key: value for key, value in base.items() if key not in dropped}
     for key, value in over.items():
         below = merged.get(key)
-        other_kind = (
-            isinstance(value, Mapping) and isinstance(below, dict) and value.get("kind") != below.get("kind")
-        )
-        if isinstance(below, dict) and isinstance(value, Mapping) and not ("kind" in value and other_kind):
+        if isinstance(below, dict) and isinstance(value, Mapping):
             merged[key] = merge(below, value)
         else:
             merged[key] = value

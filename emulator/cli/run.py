@@ -18,6 +18,9 @@ def command(
     can: Annotated[
         str | None, typer.Option(help="auto (vcan0, else the TCP hub), a channel, or off.")
     ] = None,
+    canopen: Annotated[
+        int | None, typer.Option(min=0, max=127, help="Node of the CANopen slave beside it; 0 is off.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all noise.")] = None,
     clock: Annotated[str | None, typer.Option(help="real, scaled:FACTOR or stepped.")] = None,
     state_dir: Annotated[
@@ -61,6 +64,8 @@ def command(
         "links.serial.symlink": None if symlink is None else str(symlink.absolute()),
     }
     overrides += [f"{key}={_quoted(value)}" for key, value in given.items() if value is not None]
+    if canopen is not None:
+        overrides.append(f"links.canopen.node={canopen}")
     if seed is not None:
         overrides.append(f"run.seed={seed}")
     loaded = load_profile(profile, overrides)

@@ -41,8 +41,9 @@ class FakePicture:
         """Answer a request as the pipeline does."""
         self.requests.append(request)
         if isinstance(request, ImageRequest):
-            pixels = bytes(n % 251 for n in range(request.edge)) * request.edge
-            return ImageResult(request.edge, self.last_index, pixels if self.last_index >= 0 else b"")
+            edge = request.edge or 10
+            pixels = bytes(n % 251 for n in range(edge)) * edge
+            return ImageResult(edge, edge, self.last_index, pixels if self.last_index >= 0 else b"")
         self.last_index = request.index
         if not request.solve:
             return FrameResult(request.index, solved=False)
@@ -136,13 +137,13 @@ class Bench:
         return self.device.modes.mode.value
 
 
-@pytest.fixture()
+@pytest.fixture
 def bench() -> Bench:
     """A device in standby."""
     return Bench().start()
 
 
-@pytest.fixture()
+@pytest.fixture
 def make_bench() -> Callable[..., Bench]:
     """Make devices of one's own."""
     return Bench

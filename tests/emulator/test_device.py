@@ -209,6 +209,21 @@ def test_saved_parameters_survive_a_restart_and_others_do_not(make_bench, tmp_pa
     again.store.close()
 
 
+def test_forgotten_parameters_are_defaults_after_the_next_restart(make_bench, tmp_path):
+    bench = make_bench(store=FileStore(tmp_path)).start()
+    bench.command("set_parameter", parameter=1, value=55.0)
+    bench.command("save_parameters")
+    told = []
+    bench.device.forget_parameters(told.append)
+    assert told == [None]
+    assert bench.device.parameters["exposure"] == 55
+    assert bench.read("device_status")["parameters_changed"]
+    bench.command("reset")
+    bench.step(1.0)
+    assert bench.device.parameters["exposure"] == 100
+    bench.store.close()
+
+
 def test_a_corrupt_store_gives_defaults_and_a_flag(make_bench, tmp_path):
     bench = make_bench(store=FileStore(tmp_path)).start()
     bench.command("set_parameter", parameter=1, value=55.0)

@@ -115,6 +115,19 @@ def test_a_smaller_size_is_the_mean_over_squares():
     assert np.abs(got - expected).max() <= 0.5
 
 
+def test_a_whole_frame_is_taken_beside_what_is_stored(bench):
+    save(bench, "size_64")
+    taken = []
+    bench.device.images.take_full(taken.append)
+    assert bench.command("save_image", image_size="size_64") is ErrorCode.BUSY
+    bench.step(1.0)
+    (frame,) = taken
+    assert (frame.width, frame.height, len(frame.pixels)) == (10, 10, 100)
+    assert frame.frame == bench.picture.frames[-1].index
+    assert bench.device.images.stored.edge == 64
+    assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
+
+
 def test_a_reset_forgets_images(bench):
     save(bench)
     bench.command("reset")

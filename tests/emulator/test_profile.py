@@ -48,6 +48,22 @@ def test_another_kind_of_truth_replaces_the_whole_table(tmp_path):
     assert load_profile(path).truth.kind == "rate"
 
 
+def test_a_calibrated_camera_takes_the_place_of_the_field_of_view(tmp_path):
+    write(
+        tmp_path,
+        "[camera]\nfocal_px = [1201.0, 1202.0]\ncentre_px = [460.0, 470.0]\n[calibration]\nstars = 400\n",
+        "camera.toml",
+    )
+    camera = load_profile(write(tmp_path, 'extends = "camera.toml"\n')).camera
+    assert camera.values()["focal_px"] == [1201.0, 1202.0]
+    both = write(
+        tmp_path, 'extends = "cubestar"\n[camera]\nfocal_px = [1201.0, 1202.0]\ncentre_px = [460.0, 470.0]\n'
+    )
+    assert "fov_deg" not in load_profile(both).camera.values()
+    back = write(tmp_path, f'extends = "{both}"\n[camera]\nfov_deg = 30.0\n', "back.toml")
+    assert "focal_px" not in load_profile(back).camera.values()
+
+
 def test_a_profile_extends_a_path_beside_it(tmp_path):
     write(tmp_path, "[run]\nseed = 77\n", "base.toml")
     assert load_profile(write(tmp_path, 'extends = "base.toml"\n')).run.seed == 77
