@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import Callable, Coroutine, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -21,6 +19,7 @@ from hil_tests.links import (
     HostLink,
     SerialLink,
 )
+from hil_tests.loop_thread import LoopThread
 from hil_tests.wire_log import WireLog
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition, load_icd
@@ -341,13 +340,11 @@ class ObcClient:
         timeout_s: float = DEFAULT_TIMEOUT_S,
         retries: int = 0,
     ) -> None:
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="obc-client", daemon=True)
-        self._thread.start()
+        self._loop = LoopThread("obc-client")
         try:
             self.core = self.run(self._open(make_link, icd, timeout_s, retries))
         except BaseException:
-            self._stop_loop()
+            self._loop.close()
             raise
 
     @staticmethod
@@ -386,23 +383,13 @@ class ObcClient:
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the client's loop and return what it returns."""
-        future: Future[T] = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-        try:
-            return future.result()
-        except KeyboardInterrupt:
-            future.cancel()
-            raise
+        return self._loop.run(coroutine)
 
     def close(self) -> None:
         """Close the link and end the thread; a second call does nothing."""
-        if self._thread.is_alive():
+        if self._loop.alive:
             self.run(self.core.close())
-            self._stop_loop()
-
-    def _stop_loop(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+            self._loop.close()
 
     def __enter__(self) -> Self:
         return self

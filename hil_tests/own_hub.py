@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
 from types import TracebackType
 from typing import Self
 
+from hil_tests.loop_thread import LoopThread
 from protocol.hub import DEFAULT_BUS, CanHub
 from protocol.transports.can import kernel_can_is_up
 
@@ -15,17 +14,14 @@ class OwnHub:
     """A TCP hub at a free port in a thread; a context manager. `channel` is what clients open."""
 
     def __init__(self) -> None:
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="can-hub", daemon=True)
+        self._loop = LoopThread("can-hub")
         self._hub: CanHub | None = None
         self.channel = ""
 
     def start(self, port: int = 0) -> Self:
         """Start listening; port 0 takes a free one."""
-        if not self._thread.is_alive():
-            self._thread.start()
         hub = CanHub(port=port)
-        asyncio.run_coroutine_threadsafe(hub.start(), self._loop).result()
+        self._loop.run(hub.start())
         self._hub = hub
         self.channel = f"socketcand:127.0.0.1:{hub.port}/{DEFAULT_BUS}"
         return self
@@ -38,14 +34,12 @@ class OwnHub:
     def stop(self) -> None:
         """End the hub; `start` may follow."""
         if self._hub is not None:
-            asyncio.run_coroutine_threadsafe(self._hub.close(), self._loop).result()
+            self._loop.run(self._hub.close())
             self._hub = None
 
     def close(self) -> None:
         """End the hub and its thread."""
         self.stop()
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
         self._loop.close()
 
     def __enter__(self) -> Self:

@@ -48,10 +48,10 @@ def test_a_session_passes(name, links, tmp_path):
         assert sum(1 for _ in read_candump(tmp_path / "can.log")) > result["steps"]
 
 
-def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(tmp_path):
+def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(emulator, tmp_path):
     script = tmp_path / "wrong.toml"
     script.write_text("[[step]]\nread = 'identification'\nexpect = { interface_version = 99 }\n")
-    done = starhil("session", script, "--start", "--log", tmp_path)
+    done = starhil("session", script, "--serial", emulator.ready["serial"], "--log", tmp_path)
     assert done.returncode == 1
     assert "interface_version is 1, expected 99" in done.stdout
     assert done.stderr == ""

@@ -1,0 +1,200 @@
+"""A CAN bus under full load, measured from the OBC's side: nothing lost, replies right, how late.
+
+It talks to a device over its links only, so it measures a real unit as well as the emulator. The other traffic comes from
+a process of its own, which also counts what arrives of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing as mp
+import random
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Final
+
+from hil_tests.errors import BenchError
+from hil_tests.load_figures import CanLoad, Spread
+from protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
+from protocol.errors import ProtocolError
+from protocol.icd import InterfaceDefinition, load_icd
+from protocol.messages import LinkFault, Reply, ReplyKind, Request
+from protocol.transports import open_can
+
+HOST: Final = 1
+DEVICE: Final = 4
+TALKER: Final = 0x20
+"""CAN address of the other traffic's sender; it speaks to LISTENER, an address nobody has."""
+LISTENER: Final = 0x21
+
+ASKED: Final = (
+    "identification",
+    "quaternion",
+    "precise_attitude",
+    "star_tracker",
+    "unix_time",
+    "device_status",
+)
+"""Telemetry that is asked for in turn."""
+PAUSE_S: Final = 0.004
+"""Mean pause between two requests; the moments are random, so that they meet every phase of a frame's processing."""
+REPLY_WITHIN_S: Final = 1.0
+TICK_S: Final = 0.001
+"""Time between two bunches of the other traffic."""
+SETTLE_S: Final = 0.5
+"""How long the last frames may take to arrive."""
+
+
+# --- the other traffic ---
+
+
+def _talk(spec: str, rate: float, pipe: Connection) -> None:
+    """Send numbered frames at a rate until told to stop, count them at another port of the bus, and report."""
+    asyncio.run(_talk_until_told(spec, rate, pipe))
+
+
+async def _talk_until_told(spec: str, rate: float, pipe: Connection) -> None:
+    identifier = CanIdentifier(MessageType.TELEMETRY, 133, TALKER, LISTENER).pack()
+    seen: list[int] = []
+
+    def count(frame: CanFrame) -> None:
+        if frame.id == identifier:
+            seen.append(int.from_bytes(frame.data, "little"))
+
+    talker, listener = open_can(spec), open_can(spec)
+    await listener.start(count)
+    await talker.start(lambda _frame: None)
+    pipe.send("ready")
+    await asyncio.to_thread(pipe.recv)
+    stop = asyncio.create_task(asyncio.to_thread(pipe.recv))
+    begin = time.monotonic()
+    sent = refused = 0
+    while not stop.done():
+        due = int((time.monotonic() - begin) * rate)
+        for number in range(sent, due):
+            refused += not talker.send(CanFrame(identifier, number.to_bytes(8, "little")))
+        sent = max(sent, due)
+        await asyncio.sleep(TICK_S)
+    seconds = time.monotonic() - begin
+    await talker.drain()
+    await asyncio.sleep(SETTLE_S)
+    disordered = sum(later <= earlier for earlier, later in zip(seen, seen[1:], strict=False))
+    pipe.send((seconds, sent, sent - len(set(seen)), disordered, refused))
+    await talker.close()
+    await listener.close()
+
+
+class OtherTraffic:
+    """The process that keeps the bus busy."""
+
+    def __init__(self, spec: str, rate: float) -> None:
+        self._pipe, far = mp.Pipe()
+        self._process = mp.get_context("spawn").Process(target=_talk, args=(spec, rate, far), daemon=True)
+        self._process.start()
+        far.close()
+        self._hear()
+        self._pipe.send("go")
+
+    def stop(self) -> tuple[float, int, int, int, int]:
+        """End the traffic; return seconds, frames sent, lost, out of order, and refused by the port."""
+        self._pipe.send("stop")
+        figures: tuple[float, int, int, int, int] = self._hear()
+        self._process.join()
+        return figures
+
+    def _hear(self) -> tuple[float, int, int, int, int]:
+        try:
+            return self._pipe.recv()  # type: ignore[no-any-return]
+        except EOFError:
+            raise BenchError(
+                "bus load: the process of the other traffic ended; its reason stands above"
+            ) from None
+
+
+# --- CAN ---
+
+
+class _CanAsker:
+    """Asks for telemetry over CAN, one request at a time, and judges the replies."""
+
+    def __init__(self, icd: InterfaceDefinition, device: int) -> None:
+        self._icd = icd
+        self._device = device
+        self._receiver = CanHostReceiver(HOST, device)
+        self._answer: asyncio.Future[Reply] | None = None
+        self.latencies: list[float] = []
+        self.unanswered = 0
+        self.wrong = 0
+
+    def take(self, frame: CanFrame) -> None:
+        for event in self._receiver.feed(frame, time.monotonic()):
+            if isinstance(event, LinkFault):
+                self.wrong += 1
+            elif self._answer is not None and not self._answer.done():
+                self._answer.set_result(event)
+
+    async def ask(self, name: str, send: Callable[[CanFrame], bool]) -> None:
+        row = self._icd.telemetry[name]
+        self._answer = asyncio.get_running_loop().create_future()
+        begin = time.perf_counter()
+        for frame in encode_request_frames(Request.of(row.id), HOST, self._device):
+            send(frame)
+        try:
+            reply = await asyncio.wait_for(self._answer, REPLY_WITHIN_S)
+        except TimeoutError:
+            self.unanswered += 1
+            return
+        self.latencies.append(time.perf_counter() - begin)
+        self.wrong += not _is_right(self._icd, reply, row.id)
+
+
+def _is_right(icd: InterfaceDefinition, reply: Reply, identifier: int) -> bool:
+    """Whether a reply is the telemetry that was asked for, with every value within its limits."""
+    if reply.kind is not ReplyKind.TELEMETRY or reply.id != identifier:
+        return False
+    try:
+        icd.telemetry_by_id[identifier].decode(reply.data, check=True)
+    except ProtocolError:
+        return False
+    return True
+
+
+async def load_can(spec: str, seconds: float, rate: float, *, device: int = DEVICE) -> CanLoad:
+    """Ask a device for telemetry while other nodes fill the bus.
+
+    Parameters
+    ----------
+    spec
+        The bus, as `open_can` takes it.
+    seconds
+        Duration.
+    rate
+        Frames a second of the other traffic.
+    device
+        CAN address of the device.
+    """
+    asker = _CanAsker(load_icd(), device)
+    transport = open_can(spec)
+    await transport.start(asker.take)
+    traffic = await asyncio.to_thread(OtherTraffic, spec, rate)
+    rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
+    end = time.monotonic() + seconds
+    number = 0
+    while time.monotonic() < end:
+        await asker.ask(ASKED[number % len(ASKED)], transport.send)
+        number += 1
+        await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
+    duration, sent, lost, disordered, refused = await asyncio.to_thread(traffic.stop)
+    await transport.close()
+    return CanLoad(
+        seconds=round(duration, 1),
+        offered_per_s=round(sent / duration, 1),
+        sent=sent,
+        lost=lost + refused,
+        disordered=disordered,
+        requests=number,
+        unanswered=asker.unanswered,
+        wrong=asker.wrong,
+        latency=Spread.of(asker.latencies),
+    )

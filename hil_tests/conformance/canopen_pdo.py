@@ -1,0 +1,114 @@
+"""CANopen conformance: how the cases about PDOs configure them (CiA 301 7.5.2.34 to 7.5.2.38)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from canopen.objectdictionary import ODVariable
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_ACCESS,
+    ABORT_DEVICE_STATE,
+    ABORT_VALUE,
+    ABORT_VALUE_HIGH,
+    ABORT_VALUE_LOW,
+    NO_RTR,
+    PDO_OFF,
+    CanopenProbe,
+    is_integer,
+    size_of,
+)
+from hil_tests.conformance.case import CaseSkipped
+
+REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
+FIXED: Final = (ABORT_ACCESS, ABORT_DEVICE_STATE, ABORT_VALUE)
+"""Aborts by which stacks refuse a change of the mapping of a PDO in use; CiA 301 names none."""
+FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
+SYNCHRONOUS: Final = 1
+EVENT: Final = 254
+
+
+def entry(item: ODVariable) -> int:
+    """Return the mapping entry of a variable."""
+    return item.index << 16 | item.subindex << 8 | 8 * (size_of(item) or 0)
+
+
+def constant(probe: CanopenProbe) -> ODVariable:
+    """Return an object to transmit whose value holds still: mapped by default if it can be."""
+    for item in probe.variables():
+        if (
+            item.pdo_mappable
+            and item.access_type == "rw"
+            and item.index >= 0x2000
+            and size_of(item) in {1, 2, 4}
+        ):
+            return item
+    return probe.find(
+        "object for a TPDO", lambda item: item.pdo_mappable and item.readable and bool(size_of(item))
+    )
+
+
+def writable(probe: CanopenProbe) -> ODVariable:
+    """Return an object to receive that can be read back and has limits or none."""
+    return probe.find(
+        "object for an RPDO",
+        lambda item: (
+            item.pdo_mappable
+            and item.access_type == "rw"
+            and is_integer(item)
+            and size_of(item) in {1, 2}
+            and item.index >= 0x2000
+            and item.max is not None
+        ),
+    )
+
+
+def set_up(
+    probe: CanopenProbe,
+    index: int,
+    objects: Sequence[int],
+    kind: int,
+    *,
+    identifier: int | None = None,
+    inhibit: int = 0,
+    event_ms: int = 0,
+    start: int | None = None,
+) -> int:
+    """Configure a PDO by the procedure of CiA 301 and return its identifier; other PDOs and the heartbeat are off."""
+    probe.quiet()
+    transmit = index >= 0x1800
+    number = index & 0x1FF
+    identifier = (
+        (0x180 if transmit else 0x200) + 0x100 * number + probe.node if identifier is None else identifier
+    )
+    flags = NO_RTR if transmit else 0
+    probe.set(index, 1, PDO_OFF | flags | identifier)
+    probe.set(index + 0x200, 0, 0, 1)
+    for position, value in enumerate(objects, 1):
+        probe.set(index + 0x200, position, value)
+    probe.set(index + 0x200, 0, len(objects), 1)
+    probe.set(index, 2, kind, 1)
+    record = probe.od.indices[index]
+    settings: tuple[tuple[int, int | None, int], ...] = ((3, inhibit, 2), (5, event_ms, 2), (6, start, 1))
+    for subindex, value, size in settings:
+        if value and not (isinstance(record, ODVariable) or subindex in record.subindices):
+            raise CaseSkipped(f"{index:04X}h has no sub-index {subindex}")
+        if value is not None and not isinstance(record, ODVariable) and subindex in record.subindices:
+            probe.set(index, subindex, value, size)
+    probe.set(index, 1, flags | identifier)
+    probe.drain()
+    return identifier
+
+
+def first(probe: CanopenProbe, kind: int) -> int:
+    """Return the index of the first RPDO (1400h) or TPDO (1800h); skip the case if there is none."""
+    indices = probe.pdo_indices(kind)
+    if not indices:
+        raise CaseSkipped(f"no PDO from {kind:04X}h on")
+    return indices[0]
+
+
+def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
+    """Send a SYNC, with a counter if one is given."""
+    probe.send(0x080, b"" if counter is None else bytes([counter]))

@@ -1,0 +1,181 @@
+"""CANopen conformance: receive PDOs (CiA 301 7.2.2, 7.5.2.35, 7.5.2.36)."""
+
+from __future__ import annotations
+
+from hil_tests.conformance.canopen_pdo import (
+    FIXED,
+    FORBIDDEN,
+    REFUSED,
+    SYNCHRONOUS,
+    entry,
+    first,
+    send_sync,
+    set_up,
+    writable,
+)
+from hil_tests.conformance.canopen_probe import (
+    ABORT_NOT_MAPPABLE,
+    PDO_OFF,
+    PRE_OPERATIONAL,
+    START,
+    STOP,
+    CanopenProbe,
+    size_of,
+)
+from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+
+
+@case(_CASES, "canopen.rpdo.event", "event-driven RPDO acts at once", "CiA 301 7.2.2.2", intrusive=True)
+def rpdo_event(probe: CanopenProbe) -> None:
+    """The object has the value that was sent."""
+    item = writable(probe)
+    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
+    probe.command(START)
+    for limit in (item.min, item.max):
+        data = int(limit or 0).to_bytes(size, "little")
+        probe.send(identifier, data)
+        check_equal(probe.read(item.index, item.subindex), data, "value")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(_CASES, "canopen.rpdo.gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5", intrusive=True)
+def rpdo_gate(probe: CanopenProbe) -> None:
+    """In PRE-OPERATIONAL and in STOPPED the object keeps its value."""
+    item = writable(probe)
+    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    data = next(
+        value
+        for value in (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
+        if value != before
+    )
+    identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
+    for command in (PRE_OPERATIONAL, STOP):
+        probe.command(command)
+        probe.send(identifier, data)
+        probe.command(PRE_OPERATIONAL)
+        check_equal(probe.read(item.index, item.subindex), before, "value as before")
+
+
+@case(
+    _CASES,
+    "canopen.rpdo.synchronous",
+    "synchronous RPDO acts at the next SYNC",
+    "CiA 301 7.2.2.2",
+    intrusive=True,
+)
+def rpdo_synchronous(probe: CanopenProbe) -> None:
+    """The old value before it, the latest received after it."""
+    item = writable(probe)
+    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
+    identifier = set_up(probe, first(probe, 0x1400), [entry(item)], SYNCHRONOUS)
+    probe.command(START)
+    probe.send(identifier, low)
+    probe.send(identifier, high)
+    check_equal(probe.read(item.index, item.subindex), before, "value before the SYNC")
+    send_sync(probe)
+    check_equal(probe.read(item.index, item.subindex), high, "value after the SYNC")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(
+    _CASES,
+    "canopen.rpdo.short",
+    "too short an RPDO is reported and not processed",
+    "CiA 301 7.2.2.3, 7.2.7.1",
+    intrusive=True,
+)
+def rpdo_short(probe: CanopenProbe) -> None:
+    """EMCY 8210h; the object keeps its value."""
+    item = writable(probe)
+    before = probe.read(item.index, item.subindex)
+    identifier = set_up(probe, first(probe, 0x1400), [entry(item), entry(item)], 255)
+    emergency = probe.number(0x1014) & 0x7FF
+    probe.command(START)
+    probe.drain()
+    probe.send(identifier, int(item.max or 0).to_bytes(size_of(item) or 1, "little"))
+    check_equal(probe.expect(emergency, "EMCY 8210h")[:2], b"\x10\x82", "error code")
+    check_equal(probe.read(item.index, item.subindex), before, "value as before")
+
+
+@case(_CASES, "canopen.rpdo.long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1", intrusive=True)
+def rpdo_long(probe: CanopenProbe) -> None:
+    """EMCY 8220h, and EMCY 0000h after one of the right length."""
+    item = writable(probe)
+    before = probe.read(item.index, item.subindex)
+    identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
+    emergency = probe.number(0x1014) & 0x7FF
+    probe.command(START)
+    probe.drain()
+    probe.send(identifier, before + b"\0")
+    check_equal(probe.expect(emergency, "EMCY 8220h")[:2], b"\x20\x82", "error code")
+    probe.send(identifier, before)
+    check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
+
+
+@case(
+    _CASES,
+    "canopen.rpdo.place-holder",
+    "place holders skip bytes of an RPDO",
+    "CiA 301 7.4.7",
+    intrusive=True,
+)
+def place_holder(probe: CanopenProbe) -> None:
+    """UNSIGNED16 mapped by its type before the object."""
+    if 0x0006 not in probe.od:
+        raise CaseSkipped("the data sheet allows no place holder of 16 bits")
+    item = writable(probe)
+    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    identifier = set_up(probe, first(probe, 0x1400), [0x0006_0010, entry(item)], 255)
+    probe.command(START)
+    data = int(item.max or 0).to_bytes(size, "little")
+    probe.send(identifier, b"\x55\xaa" + data)
+    check_equal(probe.read(item.index, item.subindex), data, "value")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(_CASES, "canopen.rpdo.deadline", "deadline of an RPDO", "CiA 301 7.5.2.35", intrusive=True)
+def deadline(probe: CanopenProbe) -> None:
+    """With an event timer of 100 ms EMCY 8250h comes 100 ms after the last message, not before the first."""
+    item = writable(probe)
+    before = probe.read(item.index, item.subindex)
+    identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255, event_ms=100)
+    emergency = probe.number(0x1014) & 0x7FF
+    probe.command(START)
+    probe.drain()
+    probe.expect_silence(emergency, "EMCY before the first message", 0.3)
+    probe.send(identifier, before)
+    start = probe.bus.now()
+    check_equal(probe.expect(emergency, "EMCY 8250h")[:2], b"\x50\x82", "error code")
+    check(
+        0.08 <= probe.bus.now() - start <= 0.16, "0.1 s after the message", f"{probe.bus.now() - start:.3f} s"
+    )
+    probe.send(identifier, before)
+    check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
+
+
+@case(
+    _CASES, "canopen.rpdo.refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35", intrusive=True
+)
+def rpdo_refused(probe: CanopenProbe) -> None:
+    """Restricted identifiers, another identifier in use, types 241 to 253, read-only objects."""
+    index, item = first(probe, 0x1400), writable(probe)
+    set_up(probe, index, [entry(item)], 255)
+    probe.expect_refusal(index, 1, 0x3F3, 4, *FIXED)
+    for value in (241, 252, 253):
+        probe.expect_refusal(index, 2, value, 1, *REFUSED)
+    probe.expect_refusal(index + 0x200, 0, 0, 1, *FIXED)
+    probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
+    for identifier in FORBIDDEN:
+        probe.expect_refusal(index, 1, identifier, 4, *REFUSED)
+    probe.set(index + 0x200, 0, 0, 1)
+    constant_ = probe.find(
+        "mappable read-only object", lambda item: item.pdo_mappable and item.access_type == "ro"
+    )
+    probe.expect_refusal(index + 0x200, 1, entry(constant_), 4, ABORT_NOT_MAPPABLE)
+
+
+CASES = tuple(_CASES)

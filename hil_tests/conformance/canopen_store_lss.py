@@ -1,0 +1,362 @@
+"""CANopen conformance: store and restore (CiA 301 7.5.2.11, 7.5.2.12) and LSS (CiA 305)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_NOT_STORED,
+    LSS_FROM_SLAVE,
+    LSS_TO_SLAVE,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    START,
+    STOP,
+    CanopenProbe,
+)
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+SIGNATURE_REFUSED: Final = (ABORT_NOT_STORED, 0x08000021, 0x08000022)
+
+
+def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
+    probe.drain()
+    probe.command(command)
+    probe.expect_boot_up()
+
+
+@case(_CASES, "canopen.store.ability", "1010h and 1011h tell what they can do", "CiA 301 7.5.2.11")
+def ability(probe: CanopenProbe) -> None:
+    """Bit 0: on command, bit 1: by itself; the others are zero."""
+    for index in (0x1010, 0x1011):
+        if index in probe.od:
+            check(probe.number(index, 1) & ~0x03 == 0, f"{index:04X}h:01h 0 to 3", probe.number(index, 1))
+
+
+@case(_CASES, "canopen.store.signature", "wrong signatures are refused", "CiA 301 7.5.2.11", intrusive=True)
+def signature(probe: CanopenProbe) -> None:
+    """Abort 0800 002xh for anything but `save` and `load`, and for the two exchanged."""
+    probe.require(0x1010)
+    for index, other in ((0x1010, b"load"), (0x1011, b"save")):
+        if index in probe.od:
+            for value in (other, other.upper(), b"evas", bytes(4), b"\x01\0\0\0"):
+                probe.expect_refusal(index, 1, value, 4, *SIGNATURE_REFUSED)
+
+
+@case(
+    _CASES,
+    "canopen.store.save",
+    "stored parameters are back after a reset",
+    "CiA 301 7.5.2.11",
+    intrusive=True,
+)
+def save(probe: CanopenProbe) -> None:
+    """After reset node and reset communication; what was changed afterwards is not."""
+    probe.require(0x1010)
+    probe.set(0x1017, 0, 777, 2)
+    probe.set(0x1010, 1, b"save")
+    for command in (RESET_NODE, RESET_COMMUNICATION):
+        probe.set(0x1017, 0, 555, 2)
+        _reset(probe, command)
+        check_equal(probe.number(0x1017), 777, "1017h")
+    _restore(probe)
+
+
+def _restore(probe: CanopenProbe) -> None:
+    probe.set(0x1011, 1, b"load")
+    _reset(probe)
+
+
+@case(
+    _CASES,
+    "canopen.store.restore",
+    "defaults hold from the next reset on",
+    "CiA 301 7.5.2.12",
+    intrusive=True,
+)
+def restore(probe: CanopenProbe) -> None:
+    """`load` changes nothing until then."""
+    probe.require(0x1010)
+    probe.require(0x1011)
+    default = probe.od.get_variable(0x1017)
+    probe.set(0x1017, 0, 777, 2)
+    probe.set(0x1010, 1, b"save")
+    probe.set(0x1011, 1, b"load")
+    check_equal(probe.number(0x1017), 777, "1017h before the reset")
+    _reset(probe)
+    check_equal(probe.number(0x1017), 0 if default is None else default.default, "1017h after the reset")
+
+
+@case(
+    _CASES,
+    "canopen.store.groups",
+    "communication and application are stored apart",
+    "CiA 301 7.5.2.11",
+    intrusive=True,
+)
+def groups(probe: CanopenProbe) -> None:
+    """Storing the application's leaves the communication profile as it was stored."""
+    probe.require(0x1010)
+    if probe.od.get_variable(0x1010, 3) is None:
+        raise CaseSkipped("1010h has no sub-index 3")
+    before = probe.number(0x1017)
+    probe.set(0x1017, 0, before ^ 0x11, 2)
+    probe.set(0x1010, 3, b"save")
+    _reset(probe)
+    check_equal(probe.number(0x1017), before, "1017h")
+    _restore(probe)
+
+
+@case(
+    _CASES,
+    "canopen.store.pdo",
+    "a stored PDO configuration is back after a reset",
+    "CiA 301 7.5.2.11",
+    intrusive=True,
+)
+def pdo(probe: CanopenProbe) -> None:
+    """Transmission type of the first TPDO."""
+    probe.require(0x1010)
+    probe.require(0x1800)
+    probe.set(0x1800, 2, 17, 1)
+    probe.set(0x1010, 2, b"save")
+    _reset(probe)
+    check_equal(probe.number(0x1800, 2), 17, "1800h:02h")
+    _restore(probe)
+
+
+# LSS
+
+
+def _lss(probe: CanopenProbe, data: bytes | str, timeout_s: float = 0.2) -> bytes | None:
+    payload = bytes.fromhex(data) if isinstance(data, str) else data
+    probe.send(LSS_TO_SLAVE, payload.ljust(8, b"\0"))
+    return probe.wait_for(LSS_FROM_SLAVE, timeout_s)
+
+
+def _identity(probe: CanopenProbe) -> list[int]:
+    return [probe.number(0x1018, subindex) for subindex in range(1, 5)]
+
+
+def _select(probe: CanopenProbe) -> list[int]:
+    """Select the node by its identity; skip the case if it has no LSS."""
+    if not probe.od.device_information.LSS_supported:
+        raise CaseSkipped("the data sheet has no LSS")
+    identity = _identity(probe)
+    answer = None
+    for step, number in enumerate(identity):
+        answer = _lss(probe, bytes([0x40 + step]) + number.to_bytes(4, "little"), 0.2 if step == 3 else 0.05)
+    check_equal(answer, b"\x44" + bytes(7), "answer to switch state selective")
+    return identity
+
+
+def _wait(probe: CanopenProbe) -> None:
+    probe.send(LSS_TO_SLAVE, b"\x04" + bytes(7))
+
+
+@case(
+    _CASES,
+    "canopen.lss.selective",
+    "switch state selective",
+    "CiA 305 switch state selective",
+    intrusive=True,
+)
+def selective(probe: CanopenProbe) -> None:
+    """The identity selects the node; any other does not, nor the four parts out of order."""
+    identity = _select(probe)
+    check(_lss(probe, "5e") is not None, "configuration state", "waiting")
+    _wait(probe)
+    for wrong in range(4):
+        parts = [number ^ (1 << 20 if place == wrong else 0) for place, number in enumerate(identity)]
+        for step, number in enumerate(parts):
+            answer = _lss(probe, bytes([0x40 + step]) + number.to_bytes(4, "little"), 0.05)
+            check(answer is None, "no answer to another identity", answer)
+    for step in (0, 2, 1, 3):
+        answer = _lss(probe, bytes([0x40 + step]) + identity[step].to_bytes(4, "little"), 0.05)
+        check(answer is None, "no answer to parts out of order", answer)
+    check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
+
+
+@case(_CASES, "canopen.lss.global", "switch state global", "CiA 305 switch state global", intrusive=True)
+def global_(probe: CanopenProbe) -> None:
+    """Into configuration and back, unanswered."""
+    _select(probe)
+    check(_lss(probe, "04 00", 0.1) is None, "no answer to switch state global", "one")
+    check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
+    check(_lss(probe, "04 01", 0.1) is None, "no answer to switch state global", "one")
+    check(_lss(probe, "5e") is not None, "configuration state", "waiting")
+    _wait(probe)
+
+
+@case(_CASES, "canopen.lss.inquire", "inquire identity and node-ID", "CiA 305 inquire", intrusive=True)
+def inquire(probe: CanopenProbe) -> None:
+    """The four numbers of 1018h, and the node-ID in use."""
+    identity = _select(probe)
+    for command, number in enumerate(identity, 0x5A):
+        answer = _lss(probe, bytes([command]))
+        check_equal(answer, bytes([command]) + number.to_bytes(4, "little") + bytes(3), "answer")
+    check_equal(_lss(probe, "5e"), bytes([0x5E, probe.node]) + bytes(6), "answer")
+    _wait(probe)
+
+
+@case(
+    _CASES, "canopen.lss.waiting", "a waiting node obeys no configuration", "CiA 305 states", intrusive=True
+)
+def waiting(probe: CanopenProbe) -> None:
+    """Node-ID, bit timing, store and inquiries are not answered."""
+    _select(probe)
+    _wait(probe)
+    for data in ("11 05", "13 00 02", "17", "5a", "5e"):
+        answer = _lss(probe, data, 0.05)
+        check(answer is None, f"no answer to {data}", answer)
+
+
+@case(_CASES, "canopen.lss.node-id", "configure node-ID", "CiA 305 configure node-ID", intrusive=True)
+def node_id(probe: CanopenProbe) -> None:
+    """Numbers that are none are refused; a new one holds from the reset of the communication on, and back."""
+    _select(probe)
+    for value in (0, 128, 254):
+        check_equal(_lss(probe, bytes([0x11, value])), b"\x11\x01" + bytes(6), f"answer to node-ID {value}")
+    old = probe.node
+    new = old % 127 + 1
+    check_equal(_lss(probe, bytes([0x11, new])), b"\x11\0" + bytes(6), f"answer to node-ID {new}")
+    _wait(probe)
+    check_equal(probe.number(0x1000) >= 0, 1, "SDO under the old node-ID before the reset")
+    probe.command(RESET_COMMUNICATION)
+    try:
+        probe.node = new
+        probe.expect_boot_up()
+        check_equal(probe.number(0x1200, 1) if 0x1200 in probe.od else 0x600 + new, 0x600 + new, "1200h:01h")
+    finally:
+        _select(probe)
+        _lss(probe, bytes([0x11, old]))
+        _wait(probe)
+        probe.command(RESET_COMMUNICATION)
+        probe.node = old
+    probe.expect_boot_up()
+
+
+@case(
+    _CASES, "canopen.lss.bit-timing", "configure bit timing", "CiA 305 configure bit timing", intrusive=True
+)
+def bit_timing(probe: CanopenProbe) -> None:
+    """Rates of the data sheet are taken, index 5, 9 and other tables refused; nothing is activated."""
+    _select(probe)
+    table = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
+    rates = probe.od.device_information.allowed_baudrates
+    for index, rate in table.items():
+        status = 0 if rate in rates else 1
+        check_equal(
+            _lss(probe, bytes([0x13, 0, index])), bytes([0x13, status]) + bytes(6), f"answer to {rate} bit/s"
+        )
+    for data in ("13 00 05", "13 00 ff", "13 01 00"):
+        answer = _lss(probe, data)
+        check(answer is not None and answer[:1] == b"\x13" and answer[1], f"refusal of {data}", answer)
+    _wait(probe)
+
+
+@case(
+    _CASES, "canopen.lss.identify", "identify remote slave", "CiA 305 identify remote slave", intrusive=True
+)
+def identify(probe: CanopenProbe) -> None:
+    """Answered by 4Fh if the node is within the ranges, not otherwise."""
+    _select(probe)
+    _wait(probe)
+    vendor, product, revision, serial = _identity(probe)
+    everything = (vendor, product, 0, 0xFFFFFFFF, 0, 0xFFFFFFFF)
+    exact = (vendor, product, revision, revision, serial, serial)
+    for ranges in (everything, exact):
+        for step, number in enumerate(ranges):
+            answer = _lss(
+                probe, bytes([0x46 + step]) + number.to_bytes(4, "little"), 0.2 if step == 5 else 0.02
+            )
+        check_equal(answer, b"\x4f" + bytes(7), "answer")
+    others = [
+        (vendor, product ^ 1, *everything[2:]),
+        (vendor, product, revision + 1, 0xFFFFFFFF, 0, 0xFFFFFFFF),
+    ]
+    if serial:
+        others.append((vendor, product, 0, 0xFFFFFFFF, 0, serial - 1))
+    for ranges in others:
+        for step, number in enumerate(ranges):
+            answer = _lss(probe, bytes([0x46 + step]) + number.to_bytes(4, "little"), 0.05)
+            check(answer is None, "no answer", answer)
+
+
+@case(
+    _CASES,
+    "canopen.lss.configured",
+    "a configured node takes no part in fastscan",
+    "CiA 305 fastscan",
+    intrusive=True,
+)
+def configured(probe: CanopenProbe) -> None:
+    """Neither fastscan nor identify non-configured is answered."""
+    _select(probe)
+    _wait(probe)
+    for data in ("51 00 00 00 00 80 00 00", "4c"):
+        answer = _lss(probe, data, 0.1)
+        check(answer is None, f"no answer to {data}", answer)
+
+
+@case(
+    _CASES,
+    "canopen.lss.fastscan",
+    "fastscan finds a node without a node-ID",
+    "CiA 305 fastscan",
+    intrusive=True,
+)
+def fastscan(probe: CanopenProbe) -> None:
+    """The node-ID is taken away, the identity found bit by bit, the node-ID given back; only without other such nodes."""
+    identity = _select(probe)
+    old = probe.node
+    check_equal(_lss(probe, "11 ff"), b"\x11\0" + bytes(6), "answer to node-ID 255")
+    _wait(probe)
+    probe.command(RESET_COMMUNICATION)
+    try:
+        probe.drain()
+        check(probe.wait_for(0x700 + old, 0.2) is None, "no boot-up message without a node-ID", "one")
+        check_equal(_lss(probe, "4c"), b"\x50" + bytes(7), "answer to identify non-configured")
+        found = _scan(probe)
+        check_equal(found, identity, "identity")
+        check_equal(_lss(probe, "5e"), b"\x5e\xff" + bytes(6), "answer to inquire node-ID")
+    finally:
+        probe.send(LSS_TO_SLAVE, b"\x04\x01" + bytes(6))
+        _lss(probe, bytes([0x11, old]))
+        _wait(probe)
+    probe.expect_boot_up()
+
+
+def _scan(probe: CanopenProbe) -> list[int]:
+    def ask(number: int, bit: int, part: int, following: int) -> bool:
+        data = b"\x51" + number.to_bytes(4, "little") + bytes([bit, part, following])
+        return _lss(probe, data, 0.03) is not None
+
+    if not ask(0, 0x80, 0, 0):
+        raise CaseFailed("an answer to the begin of fastscan", "nothing")
+    identity = []
+    for part in range(4):
+        number = 0
+        for bit in reversed(range(32)):
+            if not ask(number, bit, part, part):
+                number |= 1 << bit
+        if not ask(number, 0, part, (part + 1) % 4):
+            raise CaseFailed(f"part {part + 1} of the identity confirmed", f"nothing for 0x{number:08X}")
+        identity.append(number)
+    return identity
+
+
+@case(_CASES, "canopen.lss.states", "LSS works in every NMT state", "CiA 305 states", intrusive=True)
+def states(probe: CanopenProbe) -> None:
+    """The node is selected in OPERATIONAL and asked in STOPPED."""
+    _select(probe)
+    _wait(probe)
+    for command in (START, STOP):
+        probe.command(command)
+        probe.send(LSS_TO_SLAVE, b"\x04\x01" + bytes(6))
+        check_equal(_lss(probe, "5e"), bytes([0x5E, probe.node]) + bytes(6), "answer")
+        _wait(probe)
+
+
+CASES = tuple(_CASES)

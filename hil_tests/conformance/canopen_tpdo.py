@@ -1,0 +1,351 @@
+"""CANopen conformance: transmit PDOs (CiA 301 7.2.2, 7.5.2.37, 7.5.2.38)."""
+
+from __future__ import annotations
+
+from canopen.objectdictionary import ODVariable
+
+from hil_tests.conformance.canopen_pdo import (
+    EVENT,
+    FIXED,
+    FORBIDDEN,
+    REFUSED,
+    SYNCHRONOUS,
+    constant,
+    entry,
+    first,
+    send_sync,
+    set_up,
+    writable,
+)
+from hil_tests.conformance.canopen_probe import (
+    ABORT_NO_OBJECT,
+    ABORT_NO_SUBINDEX,
+    ABORT_NOT_MAPPABLE,
+    ABORT_PDO_LENGTH,
+    NO_RTR,
+    PDO_OFF,
+    PRE_OPERATIONAL,
+    START,
+    STOP,
+    CanopenProbe,
+    is_integer,
+    size_of,
+)
+from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+
+
+@case(_CASES, "canopen.tpdo.cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2", intrusive=True)
+def cyclic(probe: CanopenProbe) -> None:
+    """Types 1 and 3: the mapped value, at the SYNCs it has to come at, and at no other."""
+    index, item = first(probe, 0x1800), constant(probe)
+    value = probe.read(item.index, item.subindex)
+    for kind in (1, 3):
+        identifier = set_up(probe, index, [entry(item)], kind)
+        probe.command(START)
+        probe.drain()
+        for number in range(1, 2 * kind + 1):
+            send_sync(probe)
+            if number % kind == 0:
+                check_equal(probe.expect(identifier, f"TPDO of type {kind}"), value, "data")
+            else:
+                probe.expect_silence(identifier, f"TPDO of type {kind} at SYNC {number}", 0.05)
+        probe.command(PRE_OPERATIONAL)
+
+
+@case(
+    _CASES,
+    "canopen.tpdo.not-without-sync",
+    "synchronous TPDO waits for SYNC",
+    "CiA 301 7.2.2.2",
+    intrusive=True,
+)
+def not_withoutsend_sync(probe: CanopenProbe) -> None:
+    """Nothing in half a second without a SYNC."""
+    identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
+    probe.command(START)
+    probe.expect_silence(identifier, "TPDO without SYNC", 0.5)
+
+
+@case(
+    _CASES,
+    "canopen.tpdo.acyclic",
+    "acyclic TPDO at the SYNC after an event only",
+    "CiA 301 7.5.2.37",
+    intrusive=True,
+)
+def acyclic(probe: CanopenProbe) -> None:
+    """Type 0: a write to the mapped object is the event; the next SYNC sends, the one after does not."""
+    item = writable(probe)
+    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
+    probe.command(START)
+    send_sync(probe)
+    probe.wait_for(identifier, 0.1)
+    probe.drain()
+    send_sync(probe)
+    probe.expect_silence(identifier, "TPDO without an event")
+    size = size_of(item) or 1
+    changed = int(item.max or 1).to_bytes(size, "little")
+    before = probe.read(item.index, item.subindex)
+    probe.set(item.index, item.subindex, changed)
+    probe.expect_silence(identifier, "TPDO before the SYNC", 0.05)
+    send_sync(probe)
+    check_equal(probe.expect(identifier, "TPDO after the event"), changed, "data")
+    send_sync(probe)
+    probe.expect_silence(identifier, "TPDO without a second event")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(_CASES, "canopen.tpdo.sync-start", "SYNC start value", "CiA 301 7.5.2.37", intrusive=True)
+def sync_start(probe: CanopenProbe) -> None:
+    """Type 2 with start value 3 is sent at counters 3, 5 and 7."""
+    probe.require(0x1019)
+    probe.set(0x1019, 0, 8, 1)
+    identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], 2, start=3)
+    probe.command(START)
+    probe.drain()
+    sent = []
+    for counter in range(1, 9):
+        send_sync(probe, counter)
+        if probe.wait_for(identifier, 0.05) is not None:
+            sent.append(counter)
+    check_equal(sent, [3, 5, 7], "counters")
+
+
+@case(_CASES, "canopen.tpdo.event", "event-driven TPDO after a change", "CiA 301 7.2.2.2", intrusive=True)
+def event(probe: CanopenProbe) -> None:
+    """A write to the mapped object sends it; SYNC does not."""
+    item = writable(probe)
+    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
+    before = probe.read(item.index, item.subindex)
+    probe.command(START)
+    probe.wait_for(identifier, 0.1)
+    send_sync(probe)
+    probe.expect_silence(identifier, "event-driven TPDO at SYNC")
+    changed = int(item.max or 1).to_bytes(size_of(item) or 1, "little")
+    probe.set(item.index, item.subindex, changed)
+    check_equal(probe.expect(identifier, "TPDO after the write"), changed, "data")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(_CASES, "canopen.tpdo.event-timer", "event timer", "CiA 301 7.5.2.37", intrusive=True)
+def event_timer(probe: CanopenProbe) -> None:
+    """With 50 ms the TPDO comes every 50 ms, within a fifth."""
+    identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
+    probe.command(START)
+    probe.wait_for(identifier, 0.1)
+    found = probe.count(identifier, 0.33)
+    check(5 <= len(found) <= 8, "a TPDO every 50 ms", f"{len(found)} in 0.33 s")
+    mean = (found[-1][0] - found[0][0]) / (len(found) - 1)
+    check(0.04 <= mean <= 0.06, "period 0.05 s", f"{mean:.4f} s")
+
+
+@case(_CASES, "canopen.tpdo.inhibit", "inhibit time", "CiA 301 7.5.2.37", intrusive=True)
+def inhibit(probe: CanopenProbe) -> None:
+    """Two events at once with 100 ms: the second is sent 100 ms after the first, with the newest value."""
+    item = writable(probe)
+    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
+    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
+    probe.command(START)
+    probe.wait_for(identifier, 0.3)
+    probe.wait_for(0x7FF, 0.15)
+    probe.set(item.index, item.subindex, low)
+    check_equal(probe.expect(identifier, "first TPDO"), low, "data")
+    start = probe.bus.now()
+    probe.set(item.index, item.subindex, low)
+    probe.set(item.index, item.subindex, high)
+    check_equal(probe.expect(identifier, "second TPDO"), high, "data")
+    check(0.08 <= probe.bus.now() - start <= 0.16, "0.1 s between them", f"{probe.bus.now() - start:.3f} s")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(_CASES, "canopen.tpdo.gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5", intrusive=True)
+def gate(probe: CanopenProbe) -> None:
+    """By SYNC and by timer, neither in PRE-OPERATIONAL nor in STOPPED, again in OPERATIONAL."""
+    index, item = first(probe, 0x1800), constant(probe)
+    for kind, event_ms in ((SYNCHRONOUS, 0), (EVENT, 20)):
+        identifier = set_up(probe, index, [entry(item)], kind, event_ms=event_ms)
+        for command in (PRE_OPERATIONAL, STOP):
+            probe.command(START)
+            send_sync(probe)
+            probe.expect(identifier, "TPDO in OPERATIONAL")
+            probe.command(command)
+            probe.drain()
+            send_sync(probe)
+            probe.expect_silence(identifier, f"TPDO after command {command}")
+        probe.command(PRE_OPERATIONAL)
+
+
+@case(_CASES, "canopen.tpdo.mapping", "remapping at run time", "CiA 301 7.5.2.38", intrusive=True)
+def mapping(probe: CanopenProbe) -> None:
+    """Two objects in one order and in the other."""
+    index = first(probe, 0x1800)
+    fitting = [
+        item
+        for item in probe.variables()
+        if item.pdo_mappable and item.access_type == "rw" and is_integer(item) and size_of(item) in {1, 2}
+    ]
+    if len(fitting) < 2:
+        raise CaseSkipped("fewer than two objects to map")
+    one, two = fitting[:2]
+    values = {item.qualname: probe.read(item.index, item.subindex) for item in (one, two)}
+    for pair in ((one, two), (two, one)):
+        identifier = set_up(probe, index, [entry(item) for item in pair], SYNCHRONOUS)
+        probe.command(START)
+        send_sync(probe)
+        data = b"".join(values[item.qualname] for item in pair)
+        check_equal(probe.expect(identifier, "TPDO"), data, "data")
+        probe.command(PRE_OPERATIONAL)
+
+
+@case(
+    _CASES, "canopen.tpdo.identifier", "a TPDO under another identifier", "CiA 301 7.5.2.37", intrusive=True
+)
+def identifier_moves(probe: CanopenProbe) -> None:
+    """It is sent under the new identifier and not under the old one."""
+    index, item = first(probe, 0x1800), constant(probe)
+    old = set_up(probe, index, [entry(item)], SYNCHRONOUS)
+    new = set_up(probe, index, [entry(item)], SYNCHRONOUS, identifier=0x3F1)
+    probe.command(START)
+    send_sync(probe)
+    probe.expect(new, "TPDO")
+    send_sync(probe)
+    probe.expect_silence(old, "TPDO under its old identifier")
+
+
+@case(
+    _CASES, "canopen.tpdo.forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5", intrusive=True
+)
+def forbidden(probe: CanopenProbe) -> None:
+    """Restricted ones and the extended format, abort 0609 0030h."""
+    index = first(probe, 0x1800)
+    set_up(probe, index, [entry(constant(probe))], SYNCHRONOUS)
+    probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
+    for identifier in (*FORBIDDEN, 0x2000_0181):
+        probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *REFUSED)
+
+
+@case(
+    _CASES,
+    "canopen.tpdo.fixed",
+    "what a TPDO in use does not let be changed",
+    "CiA 301 7.5.2.37",
+    intrusive=True,
+)
+def fixed(probe: CanopenProbe) -> None:
+    """Identifier, inhibit time, SYNC start value, mapping."""
+    index, item = first(probe, 0x1800), constant(probe)
+    set_up(probe, index, [entry(item)], SYNCHRONOUS)
+    record = probe.od.indices[index]
+    probe.expect_refusal(index, 1, NO_RTR | 0x3F2, 4, *FIXED)
+    if not isinstance(record, ODVariable):
+        for subindex, size in ((3, 2), (6, 1)):
+            if subindex in record.subindices:
+                probe.expect_refusal(index, subindex, 5, size, *FIXED)
+    probe.expect_refusal(index + 0x200, 0, 0, 1, *FIXED)
+    probe.expect_refusal(index + 0x200, 1, entry(item), 4, *FIXED)
+    probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
+    probe.expect_refusal(index + 0x200, 1, entry(item), 4, *FIXED)
+    probe.set(index + 0x200, 0, 0, 1)
+    probe.set(index + 0x200, 1, entry(item))
+
+
+@case(
+    _CASES,
+    "canopen.tpdo.types",
+    "transmission types that there are none of",
+    "CiA 301 7.5.2.37",
+    intrusive=True,
+)
+def types(probe: CanopenProbe) -> None:
+    """241 to 251 are reserved, abort 0609 0030h."""
+    index = first(probe, 0x1800)
+    for value in (241, 251):
+        probe.expect_refusal(index, 2, value, 1, *REFUSED)
+    for value in (0, 1, 240, 254, 255):
+        probe.set(index, 2, value, 1)
+
+
+@case(_CASES, "canopen.tpdo.reserved", "sub-index 4 of a TPDO is not served", "CiA 301 7.5.2.37")
+def reserved(probe: CanopenProbe) -> None:
+    """Abort 0609 0011h unless the data sheet has it."""
+    index = first(probe, 0x1800)
+    if probe.od.get_variable(index, 4) is not None:
+        raise CaseSkipped("the data sheet has it")
+    probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), ABORT_NO_SUBINDEX)
+
+
+@case(
+    _CASES,
+    "canopen.tpdo.mapping-refused",
+    "mapping of what cannot be mapped",
+    "CiA 301 7.5.2.38",
+    intrusive=True,
+)
+def mapping_refused(probe: CanopenProbe) -> None:
+    """No such object, not mappable, wrong length, more than 64 bits, too many objects."""
+    index, item = first(probe, 0x1800), constant(probe)
+    probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
+    probe.set(index + 0x200, 0, 0, 1)
+    probe.expect_refusal(index + 0x200, 1, 0x1FFF_0008, 4, ABORT_NO_OBJECT, ABORT_NOT_MAPPABLE)
+    probe.expect_refusal(
+        index + 0x200, 1, item.index << 16 | 0xFE08, 4, ABORT_NO_OBJECT, ABORT_NO_SUBINDEX, ABORT_NOT_MAPPABLE
+    )
+    probe.expect_refusal(index + 0x200, 1, 0x1000_0020, 4, ABORT_NOT_MAPPABLE)
+    probe.expect_refusal(index + 0x200, 1, entry(item) + 8, 4, ABORT_NOT_MAPPABLE, ABORT_PDO_LENGTH)
+    hidden = next(
+        (other for other in probe.variables() if other.access_type == "wo" and other.pdo_mappable), None
+    )
+    if hidden is not None:
+        probe.expect_refusal(index + 0x200, 1, entry(hidden), 4, ABORT_NOT_MAPPABLE)
+
+
+@case(
+    _CASES, "canopen.tpdo.mapping-length", "mapping of more than 64 bits", "CiA 301 7.5.2.38", intrusive=True
+)
+def mapping_length(probe: CanopenProbe) -> None:
+    """Abort 0604 0042h for the sum and for the number of objects."""
+    index = first(probe, 0x1800)
+    wide = probe.find(
+        "mappable object of 4 bytes", lambda item: item.pdo_mappable and item.readable and size_of(item) == 4
+    )
+    probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
+    probe.set(index + 0x200, 0, 0, 1)
+    for position in (1, 2, 3):
+        probe.set(index + 0x200, position, entry(wide))
+    probe.expect_refusal(index + 0x200, 0, 3, 1, ABORT_PDO_LENGTH)
+    probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *REFUSED)
+    probe.set(index + 0x200, 0, 2, 1)
+
+
+@case(
+    _CASES,
+    "canopen.tpdo.attitude",
+    "TPDOs with a sequence number are of one sample",
+    "design: attitude TPDOs",
+    intrusive=True,
+)
+def attitude(probe: CanopenProbe) -> None:
+    """All TPDOs that map an object named `sequence` carry the same one after one SYNC."""
+    marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
+    chosen: list[int] = []
+    probe.quiet()
+    for index in probe.pdo_indices(0x1800):
+        if probe.number(index + 0x200, 0) and probe.number(index + 0x200, 1) == entry(marker):
+            probe.set(index, 2, SYNCHRONOUS, 1)
+            identifier = 0x3E0 + len(chosen)
+            probe.set(index, 1, PDO_OFF | NO_RTR | identifier)
+            probe.set(index, 1, NO_RTR | identifier)
+            chosen.append(identifier)
+    check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
+    probe.command(START)
+    for _ in range(5):
+        probe.drain()
+        send_sync(probe)
+        heads = {probe.expect(identifier, "TPDO")[:2] for identifier in chosen}
+        check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
+
+
+CASES = tuple(_CASES)

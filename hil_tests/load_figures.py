@@ -1,0 +1,81 @@
+"""Figures of a link under load, and whether they are good."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, 99th percentile and greatest of some durations, milliseconds."""
+
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> Spread:
+        """Sum up durations given in seconds; NaN where there are none."""
+        if not seconds:
+            return cls(float("nan"), float("nan"), float("nan"))
+        ordered = sorted(1e3 * value for value in seconds)
+        places = (min(int(share * len(ordered)), len(ordered) - 1) for share in (0.5, 0.99))
+        p50, p99 = (ordered[place] for place in places)
+        return cls(round(p50, 3), round(p99, 3), round(ordered[-1], 3))
+
+
+@dataclass(frozen=True)
+class CanLoad:
+    """A CAN bus under load."""
+
+    seconds: float
+    offered_per_s: float
+    """Frames a second of the other traffic, as sent."""
+    sent: int
+    lost: int
+    """Frames of the other traffic that did not arrive."""
+    disordered: int
+    requests: int
+    unanswered: int
+    wrong: int
+    """Replies that were refusals, had a wrong length or a value outside its limits, and faults of the framing."""
+    latency: Spread
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing was lost and every reply right."""
+        return not (self.lost or self.disordered or self.unanswered or self.wrong) and self.requests > 0
+
+
+@dataclass(frozen=True)
+class SerialLoad:
+    """A serial line busy in both directions."""
+
+    seconds: float
+    baud: int
+    sent_bytes: int
+    received_bytes: int
+    sent_share: float
+    """Part of the line's capacity that was used, 0 to 1."""
+    received_share: float
+    exchanges: int
+    wrong: int
+    """Replies out of turn, refusals, wrong bytes, faults of the framing, and error flags that the device reports."""
+
+    @property
+    def good(self) -> bool:
+        """Whether every exchange was right."""
+        return self.wrong == 0 and self.exchanges > 0
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """How regularly a periodic message comes."""
+
+    what: str
+    period_ms: float
+    """Mean interval."""
+    messages: int
+    deviation: Spread
+    """Distance of each interval from the mean."""

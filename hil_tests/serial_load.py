@@ -1,0 +1,151 @@
+"""A serial line busy in both directions at once, measured from the OBC's side: every reply right, and how busy it was.
+
+It talks to a device over its line only, so it measures a real unit as well as the emulator.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from typing import Final
+
+from hil_tests.load_figures import SerialLoad
+from protocol.icd import InterfaceDefinition, load_icd
+from protocol.image_transfer import MAP_PART_SIZE
+from protocol.messages import LinkFault, Reply, ReplyKind, Request
+from protocol.serial_framing import Dialect, HostReceiver, encode_request
+from protocol.transports import SerialTransport, open_serial
+
+REPLY_WITHIN_S: Final = 1.0
+PIPELINE: Final = 12
+"""Exchanges under way at once, so that both directions of the line stay busy."""
+
+
+class _SerialPipeline:
+    """Keeps several exchanges under way: long telecommands out, long telemetry back."""
+
+    def __init__(self, icd: InterfaceDefinition, dialect: Dialect) -> None:
+        frame = icd.telemetry["image_frame"]
+        hole_map = icd.telecommands["set_hole_map_1"]
+        self._receiver = HostReceiver(dialect)
+        self._cycle = [(Request.of(frame.id), frame.size)]
+        self._cycle += [
+            (Request.of(hole_map.id, bytes((value,)) * MAP_PART_SIZE), 0) for value in range(1, 6)
+        ]
+        self._next = 0
+        self._under_way: deque[tuple[Request, int]] = deque()
+        self.answered = asyncio.Event()
+        self.exchanges = 0
+        self.wrong = 0
+        self.received = 0
+        self.last = b""
+        """Data of the last reply."""
+
+    @property
+    def under_way(self) -> int:
+        """Requests whose replies are still to come."""
+        return len(self._under_way)
+
+    def next_request(self) -> bytes:
+        """Return the next request of the cycle as bytes."""
+        request, size = self._cycle[self._next % len(self._cycle)]
+        self._next += 1
+        return self.request(request, size)
+
+    def request(self, request: Request, size: int) -> bytes:
+        """Note a request as under way and return it as bytes."""
+        self._under_way.append((request, size))
+        if len(self._under_way) == 1:
+            self._receiver.expect(request, size)
+        return encode_request(request)
+
+    def take(self, data: bytes) -> None:
+        """Take bytes up to the end of each message, since dialect b needs to know what the next one answers."""
+        self.received += len(data)
+        start = 0
+        while start < len(data):
+            end = data.find(b"\xff", start)
+            end = len(data) if end < 0 else end + 1
+            for event in self._receiver.feed(data[start:end], time.monotonic()):
+                self._judge(event)
+            start = end
+        self.answered.set()
+
+    def _judge(self, event: Reply | LinkFault) -> None:
+        if isinstance(event, LinkFault) or not self._under_way:
+            self.wrong += 1
+            return
+        request, size = self._under_way.popleft()
+        wanted = ReplyKind.TELEMETRY if size else ReplyKind.ACK
+        self.wrong += (event.kind, event.id, len(event.data)) != (wanted, request.id, size)
+        self.exchanges += 1
+        self.last = event.data
+        if self._under_way:
+            self._receiver.expect(*self._under_way[0])
+
+
+async def load_serial(spec: str, seconds: float, baud: int, dialect: Dialect) -> SerialLoad:
+    """Keep a serial line busy in both directions and check every reply.
+
+    Parameters
+    ----------
+    spec
+        The port, as `open_serial` takes it.
+    seconds
+        Duration.
+    baud, dialect
+        As the device has them.
+    """
+    icd = load_icd()
+    pipeline = _SerialPipeline(icd, dialect)
+    transport = open_serial(spec, baud)
+    await transport.start(pipeline.take)
+    begin = time.monotonic()
+    lost = False
+    while time.monotonic() - begin < seconds and not lost:
+        while pipeline.under_way < PIPELINE:
+            transport.send(pipeline.next_request())
+        pipeline.answered.clear()
+        try:
+            await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
+        except TimeoutError:
+            lost = True
+    duration = time.monotonic() - begin
+    while pipeline.under_way and not lost:
+        pipeline.answered.clear()
+        try:
+            await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
+        except TimeoutError:
+            lost = True
+    sent, received = transport.statistics.sent, pipeline.received
+    flags = 0 if lost else await _error_flags(icd, transport, pipeline)
+    await transport.close()
+    capacity = duration * baud / 10.0
+    return SerialLoad(
+        seconds=round(duration, 1),
+        baud=baud,
+        sent_bytes=sent,
+        received_bytes=received,
+        sent_share=round(sent / capacity, 3),
+        received_share=round(received / capacity, 3),
+        exchanges=pipeline.exchanges,
+        wrong=pipeline.wrong + pipeline.under_way + flags,
+    )
+
+
+async def _error_flags(
+    icd: InterfaceDefinition, transport: SerialTransport, pipeline: _SerialPipeline
+) -> int:
+    """Count the error flags that the device reports of its serial link."""
+    row = icd.telemetry["communication_status"]
+    pipeline.answered.clear()
+    transport.send(pipeline.request(Request.of(row.id), row.size))
+    try:
+        await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
+    except TimeoutError:
+        return 1
+    values = row.decode(pipeline.last)
+    return sum(
+        bool(values[name]) for name in ("uart_protocol_error", "uart_incomplete", "telecommand_overrun")
+    )
