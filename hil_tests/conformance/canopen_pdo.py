@@ -91,11 +91,12 @@ def set_up(
     probe.set(index, 2, kind, 1)
     record = probe.od.indices[index]
     settings: tuple[tuple[int, int | None, int], ...] = ((3, inhibit, 2), (5, event_ms, 2), (6, start, 1))
-    for subindex, value, size in settings:
-        if value and not (isinstance(record, ODVariable) or subindex in record.subindices):
+    for subindex, setting, size in settings:
+        served = not isinstance(record, ODVariable) and subindex in record.subindices
+        if setting and not served:
             raise CaseSkipped(f"{index:04X}h has no sub-index {subindex}")
-        if value is not None and not isinstance(record, ODVariable) and subindex in record.subindices:
-            probe.set(index, subindex, value, size)
+        if setting is not None and served:
+            probe.set(index, subindex, setting, size)
     probe.set(index, 1, flags | identifier)
     probe.drain()
     return identifier
