@@ -171,6 +171,14 @@ class Renderer:
         )
         return Frame(image, stars, attitude, (rate[0], rate[1], rate[2]), exposure, self.seed, index)
 
+    def trails(self, frame: Frame) -> npt.NDArray[np.float64]:
+        """Trails (n, 2) of a frame's stars during its exposure: from start to end along x and y, pixels."""
+        icrs = self.catalog.vectors[frame.stars.catalog_index]
+        half = 0.5 * frame.exposure_s * np.array(frame.rate_rad_s)
+        start, _ = self.camera.project(frame.attitude.rotated(-half).to_sensor(icrs))
+        end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
+        return end - start
+
     def _mean_without_stars(self, exposure_s: float) -> npt.NDArray[np.float32]:
         """Mean electrons (h, w) of sky and dark current, in the buffer that a frame is built in."""
         if exposure_s != self._still_exposure_s:

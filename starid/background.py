@@ -16,7 +16,7 @@ BLOCK_PX: Final = 32
 LEAST_NOISE_DN: Final = 12.0**-0.5
 """Rounding to whole counts alone has this standard deviation."""
 
-_STRIDE: Final = 2
+_ROW_STEP: Final = 4
 _FIRST_SAMPLES: Final = 32
 _CLIP_SIGMA: Final = 3.5
 _QUARTILE_SIGMA: Final = 1.349
@@ -71,10 +71,11 @@ def _block_statistics(
             bottom = min(top + block, height)
             right = min(left + block, width)
             count = 0
-            for y in range(top, bottom, _STRIDE):
-                for x in range(left + (y // _STRIDE) % _STRIDE, right, _STRIDE):
-                    values[count] = np.float32(image[y, x])
-                    count += 1
+            for y in range(top + column % _ROW_STEP, bottom, _ROW_STEP):
+                line = image[y, left:right]
+                for x in range(line.size):
+                    values[count + x] = np.float32(line[x])
+                count += line.size
             step = max(count // _FIRST_SAMPLES, 1)
             chosen = min(count // step, _FIRST_SAMPLES)
             for k in range(chosen):

@@ -13,8 +13,16 @@ import numpy.typing as npt
 from starid.background import Background, estimate_background
 from starid.centroid import CHI2, FIT_COLUMNS, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
 from starid.errors import StaridError
-from starid.matched_filter import find_peaks, find_peaks_in_smooth, noise_factor, spot_taps
-from starid.measurement import AT_EDGE, SATURATED, find_neighbours, measure
+from starid.matched_filter import (
+    INTEGER_TAPS_SUM,
+    find_peaks,
+    find_peaks_in_bytes,
+    find_peaks_in_smooth,
+    integer_taps,
+    noise_factor,
+    spot_taps,
+)
+from starid.measurement import AT_EDGE, SATURATED, TWICE, find_neighbours, measure
 from starid.spot_shape import SpotShape, moments_of, shape_from_moments
 from starid.trail_filter import smooth_along_trails, trail_noise_factor
 from starid.windows import WINDOW_COLUMNS, cut_windows, lay_windows
@@ -23,13 +31,14 @@ Grid: TypeAlias = npt.NDArray[np.float32]
 
 LEAST_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
-_MOST_PEAKS: Final = 16384
+_MOST_PEAKS: Final = 8192
 _HIGHER: Final = 1.5
 _STARS_FOR_SHAPE: Final = 40
 _SHAPE_WINDOW_PX: Final = 40
 _TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
 _FIT_PARAMETERS: Final = 3
+_MISFIT_SIGMA: Final = 3.0
 _RELAX: Final = 0.8
 _MOST_NEIGHBOURS: Final = 64
 
@@ -56,6 +65,10 @@ class DetectionSettings:
         Side of the blocks in which the background is estimated.
     follow_trails : bool
         Whether trails of a turning sensor are looked for.
+    pixel_sigma : float
+        Excess over the sky, in sigmas of the noise, from which a pixel counts as lit by a star.
+    min_star_pixels, max_star_pixels : int
+        Fewest and most lit pixels of a star; candidates with others are refused.
     """
 
     threshold_sigma: float = 5.5
@@ -66,6 +79,9 @@ class DetectionSettings:
     max_stars: int = 500
     block_px: int = 32
     follow_trails: bool = True
+    pixel_sigma: float = 3.0
+    min_star_pixels: int = 1
+    max_star_pixels: int = 10000
 
     def __post_init__(self) -> None:
         ranges = {
@@ -76,6 +92,9 @@ class DetectionSettings:
             "model_error": (0.0, 1.0),
             "max_stars": (1, 5000),
             "block_px": (8, 1024),
+            "pixel_sigma": (0.0, 1000.0),
+            "min_star_pixels": (0, 1000000),
+            "max_star_pixels": (1, 1000000),
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
@@ -103,6 +122,8 @@ class Detections:
         Width of the spot that was used.
     trail_px : float
         Median length of the stars' trails; 0 where they are round.
+    refused : int
+        Candidates that stood out of the noise and are no stars: hot pixels, bodies, edges.
     reason : str
         Why there is no star; empty where there is one.
     """
@@ -117,6 +138,7 @@ class Detections:
     noise: float
     psf_sigma_px: float
     trail_px: float
+    refused: int
     reason: str
 
     @property
@@ -187,13 +209,13 @@ def _checked(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDAr
     return np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
 
 
-def _nothing(background: Background, reason: str) -> Detections:
+def _nothing(background: Background, reason: str, refused: int = 0) -> Detections:
     """Detections without a star."""
     none = np.zeros(0)
     pairs = np.zeros((0, 2))
     no = np.zeros(0, dtype=bool)
     level, noise = background.median_level, background.median_noise
-    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, reason)
+    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, refused, reason)
 
 
 def _peaks(
@@ -203,6 +225,15 @@ def _peaks(
     threshold_sigma: float,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
+    bytes_taps = integer_taps(sigma_px)
+    if counts.dtype == np.uint8 and bytes_taps is not None:
+        taps8, image8 = bytes_taps, counts.view(np.uint8)
+
+        def search_bytes(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+            return find_peaks_in_bytes(image8, threshold, background.block_px, taps8, peaks, heights)
+
+        factor = noise_factor(taps8 / INTEGER_TAPS_SUM)
+        return _search(search_bytes, background, threshold_sigma * factor)
     taps = spot_taps(sigma_px)
 
     def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
@@ -238,9 +269,12 @@ def _search(
         if count < _MOST_PEAKS:
             break
         factor *= _HIGHER
-    heights = heights[:count] + np.float32(factor * background.median_noise)
+    peaks, heights = peaks[:count], heights[:count]
+    rows, columns = background.level.shape
+    blocks = peaks // background.block_px
+    heights -= background.level[np.minimum(blocks[:, 1], rows - 1), np.minimum(blocks[:, 0], columns - 1)]
     order = np.argsort(-heights, kind="stable")
-    return peaks[:count][order], heights[order]
+    return peaks[order], heights[order]
 
 
 def _shape(
@@ -300,14 +334,18 @@ def _measured(
     ratio = _RELAX * settings.threshold_sigma
     core_dn = saturation - background.median_level
     sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, core_dn)
-    measure(windows, pixels, first, neighbours, sensor, (counts.shape[1], counts.shape[0]), stars, flags)
+    lit = (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels))
+    size = (counts.shape[1], counts.shape[0])
+    measure(windows, pixels, first, neighbours, sensor, lit, size, stars, flags)
     good = np.flatnonzero(stars[:, STATE] == GOOD)
     if good.size == 0:
-        return _nothing(background, "nothing on the image has the shape of a star")
+        return _nothing(background, "nothing on the image has the shape of a star", count)
+    refused = count - good.size - int(np.count_nonzero(stars[:, STATE] == TWICE))
     good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
     fits, marks = stars[good], flags[good]
     freedom = np.maximum(fits[:, PIXELS] - _FIT_PARAMETERS, 1.0)
-    inflation = np.sqrt(np.maximum(fits[:, CHI2] / freedom, 1.0))
+    misfit = fits[:, CHI2] / freedom
+    inflation = np.sqrt(np.where(misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom), misfit, 1.0))
     unit = 1.0 if gain is None else gain
     return Detections(
         fits[:, [X, Y]],
@@ -320,5 +358,6 @@ def _measured(
         typical,
         shape.sigma_px,
         shape.trail_px,
+        refused,
         "",
     )

@@ -14,6 +14,16 @@ import numpy.typing as npt
 
 from starid.jit_loops import compiled_loops
 
+INTEGER_TAPS_SUM: Final = 16
+"""Sum of the integer filter's taps along one axis; a byte smoothed along both axes fills 16 bits then."""
+
+_SHARP_BELOW_PX: Final = 0.65
+_INTEGER_UP_TO_PX: Final = 1.3
+_SHARP_TAPS: Final = np.array([8, 4, 0], dtype=np.uint16)
+_SOFT_TAPS: Final = np.array([6, 4, 1], dtype=np.uint16)
+_LINE_STEP: Final = 4
+_BYTES: Final = 8
+_WORDS: Final = 4
 _HALF_WIDTH_SIGMA: Final = 2.2
 _SQRT_HALF: Final = math.sqrt(0.5)
 
@@ -27,9 +37,19 @@ def spot_taps(sigma_px: float) -> npt.NDArray[np.float32]:
     return taps
 
 
-def noise_factor(taps: npt.NDArray[np.float32]) -> float:
+def noise_factor(taps: npt.NDArray[np.floating]) -> float:
     """Noise of the smoothed image over that of a pixel."""
     return float(taps[0] ** 2 + 2.0 * np.sum(taps[1:] ** 2, dtype=np.float64))
+
+
+def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
+    """Right half (3,) of an integer filter close to `spot_taps`, centre first; None where there is none.
+
+    Its signal-to-noise ratio is within 4 % of the best for spots of 0.6 to 1.3 pixels.
+    """
+    if sigma_px > _INTEGER_UP_TO_PX:
+        return None
+    return _SHARP_TAPS if sigma_px < _SHARP_BELOW_PX else _SOFT_TAPS
 
 
 @compiled_loops
@@ -116,34 +136,36 @@ def _smooth_all(
 def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
     """Values of row i of a grid of blocks at every image column."""
     columns = grid.shape[1]
-    for x in range(out.size):
-        u = min(max((x + 0.5) / block - 0.5, 0.0), columns - 1.0)
-        j = min(int(u), max(columns - 2, 0))
-        out[x] = grid[i, j] + np.float32(u - j) * (grid[i, min(j + 1, columns - 1)] - grid[i, j])
+    width = out.size
+    start = 0
+    for j in range(columns):
+        # from the centre of block j − 1 to that of block j
+        end = min(math.ceil((j + 0.5) * block - 0.5), width)
+        low = grid[i, max(j - 1, 0)]
+        slope = (grid[i, j] - low) / np.float32(block)
+        origin = np.float32((j - 0.5) * block - 0.5)
+        for x in range(start, end):
+            out[x] = low + slope * (np.float32(x) - origin)
+        start = max(end, start)
+    for x in range(start, width):
+        out[x] = grid[i, columns - 1]
 
 
 @compiled_loops
 def _mark(
-    row: npt.NDArray[np.float32],
-    upper: npt.NDArray[np.float32],
-    lower: npt.NDArray[np.float32],
-    q: np.float32,
-    above: npt.NDArray[np.uint8],
-) -> int:
-    """Mark what lies above the threshold between two lines of it; return how many pixels do."""
-    found = 0
+    row: npt.NDArray[np.float32], lines: npt.NDArray[np.float32], q: np.float32, above: npt.NDArray[np.uint8]
+) -> None:
+    """Mark what lies above the threshold between two lines of it."""
+    upper, lower = lines[0], lines[1]
     for x in range(row.size):
-        high = row[x] > upper[x] + q * (lower[x] - upper[x])
-        above[x] = high
-        found += high
-    return found
+        above[x] = row[x] > upper[x] + q * (lower[x] - upper[x])
 
 
 @compiled_loops
 def _is_top(
-    row: npt.NDArray[np.float32],
-    before: npt.NDArray[np.float32],
-    after: npt.NDArray[np.float32],
+    row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
+    before: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
+    after: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
     x: int,
     has_before: bool,
     has_after: bool,
@@ -162,31 +184,30 @@ def _is_top(
 def _peaks_of_row(
     y: int,
     height: int,
-    row: npt.NDArray[np.float32],
-    before: npt.NDArray[np.float32],
-    after: npt.NDArray[np.float32],
-    lines: npt.NDArray[np.float32],
-    q: np.float32,
+    row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
+    before: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
+    after: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
     above: npt.NDArray[np.uint8],
+    words: npt.NDArray[np.uint64],
     count: int,
     peaks: npt.NDArray[np.int32],
     heights: npt.NDArray[np.float32],
 ) -> int:
-    """Add the peaks of row y to the list; return how many there are now."""
-    if _mark(row, lines[0], lines[1], q, above) == 0:
-        return count
-    words = above.view(np.uint64)
-    for word in range(words.size):
-        if words[word] == 0:
+    """Add the peaks of row y, among the pixels that are marked, to the list; return how many there are now.
+
+    `words` is `above`, eight marks at a time, so that the empty stretches are passed over quickly.
+    """
+    for word in range(0, words.size, _WORDS):
+        if words[word] | words[word + 1] | words[word + 2] | words[word + 3] == 0:
             continue
-        for x in range(8 * word, min(8 * word + 8, row.size)):
+        for x in range(_BYTES * word, min(_BYTES * (word + _WORDS), row.size)):
             if above[x] == 0 or not _is_top(row, before, after, x, y > 0, y < height - 1):
                 continue
             if count == peaks.shape[0]:
                 return count
             peaks[count, 0] = x
             peaks[count, 1] = y
-            heights[count] = row[x] - (lines[0, x] + q * (lines[1, x] - lines[0, x]))
+            heights[count] = np.float32(row[x])
             count += 1
     return count
 
@@ -228,7 +249,7 @@ def find_peaks(
     peaks : ndarray (m, 2), int32
         Filled with column and row of each peak.
     heights : ndarray (m,), float32
-        Filled with the smoothed value less the threshold.
+        Filled with the smoothed value.
 
     Returns
     -------
@@ -240,7 +261,8 @@ def find_peaks(
     padded = np.empty(width + 2 * reach, np.float32)
     smooth = np.empty((3, width), np.float32)
     lines = np.empty((2, width), np.float32)
-    above = np.zeros((width + 7) // 8 * 8, np.uint8)
+    above = np.zeros(-(-width // (_BYTES * _WORDS)) * _BYTES * _WORDS, np.uint8)
+    words = above.view(np.uint64)
     count = 0
     line = -1
     for y in range(height + 1):
@@ -251,7 +273,8 @@ def find_peaks(
             # row y − 1 has both neighbours now
             line, q = _set_lines(threshold, block, y - 1, line, lines)
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
-            count = _peaks_of_row(y - 1, height, row, before, after, lines, q, above, count, peaks, heights)
+            _mark(row, lines, q, above)
+            count = _peaks_of_row(y - 1, height, row, before, after, above, words, count, peaks, heights)
     return count
 
 
@@ -266,11 +289,85 @@ def find_peaks_in_smooth(
     """As `find_peaks`, in an image (h, w) that has been smoothed already."""
     height, width = smooth.shape
     lines = np.empty((2, width), np.float32)
-    above = np.zeros((width + 7) // 8 * 8, np.uint8)
+    above = np.zeros(-(-width // (_BYTES * _WORDS)) * _BYTES * _WORDS, np.uint8)
+    words = above.view(np.uint64)
     count = 0
     line = -1
     for y in range(height):
         line, q = _set_lines(threshold, block, y, line, lines)
         before, after = smooth[max(y - 1, 0)], smooth[min(y + 1, height - 1)]
-        count = _peaks_of_row(y, height, smooth[y], before, after, lines, q, above, count, peaks, heights)
+        _mark(smooth[y], lines, q, above)
+        count = _peaks_of_row(y, height, smooth[y], before, after, above, words, count, peaks, heights)
+    return count
+
+
+@compiled_loops
+def _smooth_down_integer(
+    image: npt.NDArray[np.uint8], y: int, taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
+) -> None:
+    """As `_smooth_down`, in 16-bit integers."""
+    bottom = image.shape[0] - 1
+    centre = image[y]
+    up, down = image[max(y - 1, 0)], image[min(y + 1, bottom)]
+    up2, down2 = image[max(y - 2, 0)], image[min(y + 2, bottom)]
+    t0, t1, t2 = taps[0], taps[1], taps[2]
+    for x in range(out.size):
+        near = np.uint16(np.uint16(up[x]) + np.uint16(down[x]))
+        far = np.uint16(np.uint16(up2[x]) + np.uint16(down2[x]))
+        out[x] = np.uint16(np.uint16(np.uint16(centre[x]) * t0) + np.uint16(near * t1) + np.uint16(far * t2))
+
+
+@compiled_loops
+def _smooth_along_integer(
+    padded: npt.NDArray[np.uint16], taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
+) -> None:
+    """As `_smooth_along`, in 16-bit integers; `padded` has two more at either end."""
+    width = out.size
+    padded[0] = padded[1] = padded[2]
+    padded[width + 2] = padded[width + 3] = padded[width + 1]
+    t0, t1, t2 = taps[0], taps[1], taps[2]
+    for x in range(width):
+        near = np.uint16(padded[x + 1] + padded[x + 3])
+        far = np.uint16(padded[x] + padded[x + 4])
+        out[x] = np.uint16(np.uint16(padded[x + 2] * t0) + np.uint16(near * t1) + np.uint16(far * t2))
+
+
+@compiled_loops
+def find_peaks_in_bytes(
+    image: npt.NDArray[np.uint8],
+    threshold: npt.NDArray[np.float32],
+    block: float,
+    taps: npt.NDArray[np.uint16],
+    peaks: npt.NDArray[np.int32],
+    heights: npt.NDArray[np.float32],
+) -> int:
+    """As `find_peaks`, several times faster, with the taps of `integer_taps`."""
+    height, width = image.shape
+    padded = np.empty(width + 4, np.uint16)
+    smooth = np.empty((3, width), np.uint16)
+    lines = np.empty((2, width), np.float32)
+    limit = np.empty(width, np.uint16)
+    above = np.zeros(-(-width // (_BYTES * _WORDS)) * _BYTES * _WORDS, np.uint8)
+    words = above.view(np.uint64)
+    scale = np.float32(INTEGER_TAPS_SUM**2)
+    highest = np.float32(65535.0)
+    count = 0
+    line = -1
+    for y in range(height + 1):
+        if y < height:
+            _smooth_down_integer(image, y, taps, padded[2 : 2 + width])
+            _smooth_along_integer(padded, taps, smooth[y % 3])
+        if y > 0:
+            if (y - 1) % _LINE_STEP == 0:
+                line, q = _set_lines(threshold, block, y - 1 + _LINE_STEP // 2, line, lines)
+                upper, lower = lines[0], lines[1]
+                for x in range(width):
+                    value = scale * (upper[x] + q * (lower[x] - upper[x]))
+                    limit[x] = np.int32(min(max(value, np.float32(0.0)), highest))
+            row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
+            for x in range(width):
+                above[x] = row[x] > limit[x]
+            count = _peaks_of_row(y - 1, height, row, before, after, above, words, count, peaks, heights)
+    for k in range(count):
+        heights[k] /= scale
     return count

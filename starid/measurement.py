@@ -44,7 +44,7 @@ from starid.windows import (
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
 
-FAINT, NOT_A_STAR, TWICE, OUTSIDE = 4, 5, 6, 7
+FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
 """Further reasons, beside those of `starid.centroid`, for which a candidate is no star."""
 
 _ROUNDS: Final = 3
@@ -154,6 +154,7 @@ def _judge(
     sigma: float,
     least_ratio: float,
     saturation_dn: float,
+    lit: tuple[float, float, float],
     size: tuple[int, int],
 ) -> float:
     """Decide whether a fit is a star: GOOD, or why it is not."""
@@ -169,6 +170,11 @@ def _judge(
         squares += model[0, k] * model[0, k]
     if patch == 0.0 and star[FLUX] * math.sqrt(squares) < least_ratio * noise:
         return float(FAINT)
+    bright = 0
+    for k in range(pixels.size):
+        bright += pixels[k] > lit[0] * noise
+    if not lit[1] <= bright <= lit[2]:
+        return float(WRONG_SIZE)
     allowed = _WANDER_PX * max(sigma, 1.0) + patch + 0.5 * length
     if math.hypot(star[X] - window[START_X], star[Y] - window[START_Y]) > allowed:
         return float(WANDERED)
@@ -221,6 +227,7 @@ def measure(
     first: npt.NDArray[np.int32],
     neighbours: npt.NDArray[np.int32],
     sensor: tuple[float, float, float, float, float],
+    lit: tuple[float, float, float],
     size: tuple[int, int],
     stars: npt.NDArray[np.float64],
     flags: npt.NDArray[np.uint8],
@@ -239,6 +246,8 @@ def measure(
     sensor : (float, float, float, float, float)
         Standard deviation of the spot, pixels; variance in counts² that a count of star light brings; model error;
         least signal-to-noise ratio of a star; counts above the sky that saturate.
+    lit : (float, float, float)
+        Sigmas from which a pixel is lit; fewest and most lit pixels of a star.
     size : (int, int)
         Columns and rows of the image.
     stars : ndarray (n, FIT_COLUMNS)
@@ -291,7 +300,9 @@ def measure(
             ):
                 fit_star(target, place, (star[X], star[Y]), shape, noise, model, work, star)
             if star[STATE] == GOOD:
-                star[STATE] = _judge(target, model, star, window, sigma, least_ratio, saturation_dn, size)
+                star[STATE] = _judge(
+                    target, model, star, window, sigma, least_ratio, saturation_dn, lit, size
+                )
             if star[STATE] == GOOD:
                 flags[k] = _flags(star, window, own, sigma, size)
         _drop_doubles(stars, first, neighbours, sigma)

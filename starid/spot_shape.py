@@ -1,18 +1,11 @@
 """Shape of the stars of a frame: width of the spot, and the trails that a turning sensor draws.
 
 Second moments of bright stars under a Gaussian weight that is adapted to the star itself (Bernstein & Jarvis 2002)
-give each star's covariance: across a trail that of the spot, along it more. The trails of a frame belong to one
-rotation of the sensor; through a lens that keeps straight lines straight they follow, with (u, v) measured from the
-image's centre,
-
-    dx = t_x + a·u² + b·u·v − r·v,    dy = t_y + a·u·v + b·v² + r·u,
-
-and nearly so through any other. The five numbers are fitted to the stars' trails, whose senses are not seen.
+give each star's covariance: across a trail that of the spot, along it more.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,24 +16,19 @@ import numpy.typing as npt
 
 from starid.background import interpolate_at
 from starid.jit_loops import compiled_loops
+from starid.trail_flow import FLOW_TERMS, fit_flow, typical_trail
 
 Array = npt.NDArray[np.float64]
 
-FLOW_TERMS: Final = 5
 MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _ITERATIONS: Final = 30
 _SETTLED: Final = 1e-2
 _WEIGHT_END: Final = 12.0
 _LEAST_FOR_SPOT: Final = 3
-_LEAST_FOR_ROLL: Final = 5
-_LEAST_FOR_FLOW: Final = 12
 _ROUND_BELOW_PX: Final = 0.7
 _LEAST_SIGMA_PX: Final = 0.3
-_MOST_PAIRS: Final = 20
-_CLIP: Final = 3.0
 _UNEXPLAINED: Final = 0.5
-_ROUNDS: Final = 4
 
 
 @dataclass(frozen=True)
@@ -52,8 +40,7 @@ class SpotShape:
     sigma_px : float
         Standard deviation of the spot, pixels.
     flow : ndarray (5,)
-        t_x, t_y, r, a, b of the trails, pixels, for (u, v) in halves of the image's longer side; all zero where
-        stars are round.
+        Flow of the trails (`starid.trail_flow`); all zero where stars are round.
     trail_px : float
         Median length of the trails, pixels.
     stars : int
@@ -177,16 +164,6 @@ def moments_of(
     return count
 
 
-@compiled_loops
-def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
-    """Trail (dx, dy) in pixels at an image position, up to its sense."""
-    half = 0.5 * max(width, height)
-    u = (x - 0.5 * (width - 1)) / half
-    v = (y - 0.5 * (height - 1)) / half
-    inward = flow[3] * u + flow[4] * v
-    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
-
-
 def shape_from_moments(
     table: Array, width: int, height: int, known_sigma_px: float | None, assumed_sigma_px: float
 ) -> SpotShape:
@@ -216,11 +193,10 @@ def shape_from_moments(
         trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         half = 0.5 * max(width, height)
         places = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / half
-        flow = fit_flow(places, trails)
-        drawn = _flow_terms(places) @ flow
-        typical = float(np.median(np.hypot(drawn[:, 0], drawn[:, 1])))
-        left_over = np.median(_mismatch(trails, drawn)) / max(float(np.median(length)), 1e-9)
-        if typical > _ROUND_BELOW_PX and left_over < _UNEXPLAINED:
+        flow = np.zeros(FLOW_TERMS)
+        fit_flow(places, trails, flow)
+        typical, off = typical_trail(flow, places, trails)
+        if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * float(np.median(length)):
             return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
     return SpotShape(_sigma(float(np.median(mean)), known_sigma_px), still, 0.0, len(table))
 
@@ -250,67 +226,3 @@ def trail_length(along: Array, across: float) -> Array:
     z, share = _box_share()
     cut = np.interp((ratio - 1.0) / (2.0 * ratio), share, z, left=0.0)
     return np.asarray(2.0 * cut * np.sqrt(ratio + 1.0) * math.sqrt(across), dtype=np.float64)
-
-
-def _flow_terms(places: Array) -> Array:
-    """Matrix (n, 2, 5) that turns a flow into trails at places (n, 2)."""
-    u, v = places[:, 0], places[:, 1]
-    one, none = np.ones_like(u), np.zeros_like(u)
-    dx = np.column_stack([one, none, -v, u * u, u * v])
-    dy = np.column_stack([none, one, u, u * v, v * v])
-    return np.stack([dx, dy], axis=1)
-
-
-def _mismatch(trails: Array, drawn: Array) -> Array:
-    """Distances (n,) between seen and drawn trails, in the sense that fits better."""
-    forth = np.linalg.norm(trails - drawn, axis=-1)
-    back = np.linalg.norm(trails + drawn, axis=-1)
-    return np.asarray(np.minimum(forth, back), dtype=np.float64)
-
-
-def fit_flow(places: Array, trails: Array) -> Array:
-    """Flow (5,) through trails (n, 2), up to their senses, at places (n, 2).
-
-    Starts are translation and roll through two of the brightest stars in either relative sense, and pure
-    translations; the one that leaves least is refined by least squares without outliers. Few stars get fewer terms.
-    """
-    terms = _flow_terms(places)
-    count = len(trails)
-    best = np.zeros(FLOW_TERMS)
-    least = math.inf
-    for start in _starts(terms, trails):
-        left = float(
-            np.mean(np.minimum(_mismatch(trails, terms @ start), 0.5 * np.linalg.norm(trails, axis=1)))
-        )
-        if left < least:
-            best, least = start, left
-    used = 2 if count < _LEAST_FOR_ROLL else 3 if count < _LEAST_FOR_FLOW else FLOW_TERMS
-    for _ in range(_ROUNDS):
-        drawn = terms @ best
-        sense = np.where(np.sum(trails * drawn, axis=1) < 0.0, -1.0, 1.0)
-        off = _mismatch(trails, drawn)
-        keep = off <= max(_CLIP * float(np.median(off)), 0.1)
-        if np.count_nonzero(keep) < used:
-            break
-        system = terms[keep][:, :, :used].reshape(-1, used)
-        best = np.zeros(FLOW_TERMS)
-        best[:used] = np.linalg.lstsq(system, (sense[:, None] * trails)[keep].ravel(), rcond=None)[0]
-    return best
-
-
-def _starts(terms: Array, trails: Array) -> list[Array]:
-    """First guesses of a flow: translations along single stars' trails, translation and roll through pairs."""
-    starts = []
-    few = min(len(trails), 8)
-    for k in range(few):
-        start = np.zeros(FLOW_TERMS)
-        start[:2] = trails[k]
-        starts.append(start)
-    for i, j in list(itertools.combinations(range(few), 2))[:_MOST_PAIRS]:
-        for sense in (1.0, -1.0):
-            system = terms[[i, j]][:, :, :3].reshape(4, 3)
-            wanted = np.concatenate([trails[i], sense * trails[j]])
-            start = np.zeros(FLOW_TERMS)
-            start[:3] = np.linalg.lstsq(system, wanted, rcond=None)[0]
-            starts.append(start)
-    return starts

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from starid.jit_loops import compiled_loops
 from starid.matched_filter import smooth_image, spot_taps
-from starid.spot_shape import trail_at
+from starid.trail_flow import trail_at
 
 _TILE_PX: Final = 64
 _MOST_STEPS: Final = 96
@@ -47,7 +47,7 @@ def _smooth_along(
 def smooth_along_trails(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], sigma_px: float, flow: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float32]:
-    """Smooth an image (h, w) with the spot, and then along the trails of a flow (`SpotShape`)."""
+    """Smooth an image (h, w) with the spot, and then along the trails of a flow (`starid.trail_flow`)."""
     out = np.empty(image.shape, dtype=np.float32)
     _smooth_along(smooth_image(image, spot_taps(sigma_px)), flow, out)
     return out

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from starid.background import LEAST_NOISE_DN, interpolate_at
 from starid.jit_loops import compiled_loops
-from starid.spot_shape import trail_at
+from starid.trail_flow import trail_at
 
 WINDOW_COLUMNS: Final = 14
 (
@@ -203,7 +203,7 @@ def lay_windows(
     spot : (float, float, float)
         Standard deviation of the spot, pixels; saturation and the typical noise of a pixel, counts.
     flow : ndarray (5,)
-        Flow of the trails (`SpotShape`).
+        Flow of the trails (`starid.trail_flow`).
     windows : ndarray (n, WINDOW_COLUMNS)
         Filled; COLUMNS tells where there is none, and why.
 
@@ -219,7 +219,10 @@ def lay_windows(
     for k in range(_RING_PIXELS):
         circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
         circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
-    visited = np.zeros((height, width), np.uint8)
+    bright = False
+    for k in range(peaks.shape[0]):
+        bright = bright or image[peaks[k, 1], peaks[k, 0]] >= saturation
+    visited = np.zeros((height, width) if bright else (1, 1), np.uint8)
     stack = np.empty((2 * MOST_SATURATED, 2), np.int32)
     patch = np.zeros(3)
     total = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -58,3 +59,120 @@ def latency(
         console.print(
             f"{process.worker}: ready {process.ready_s:.2f} s after its start, {process.memory_mb:.0f} MB resident"
         )
+
+
+@group.command("centroid")
+def centroid(
+    rates: Annotated[
+        list[float] | None, typer.Option("--rate", help="Body rate, degrees/s. May be repeated.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of random attitude a rate.")] = 30,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
+    bits: Annotated[int, typer.Option(help="8, 12 or 16.")] = 8,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Plot to write: .png, .svg or .pdf.")
+    ] = None,
+    json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Measure the error of centroids over magnitude and smear, beside the Cramér–Rao bound."""
+    import dataclasses
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from emulator.bench.centroid import DEFAULT_RATES_DEG_S, measure_centroids, plot_centroids
+    from emulator.sensor_model import SensorModel
+
+    progress = Console(stderr=True)
+    sensor = SensorModel(bits=bits)
+    rows = measure_centroids(rates or DEFAULT_RATES_DEG_S, frames, seed, sensor, progress=progress.print)
+    if output is not None:
+        plot_centroids(rows, output)
+    if json_out:
+        print(json.dumps({"seed": seed, "frames": frames, "rows": [dataclasses.asdict(row) for row in rows]}))
+        return
+    table = Table("rate °/s", "V", "stars", "found %", "error px", "bound px", "ratio", "stated px", "NSE")
+    for row in rows:
+        table.add_row(
+            f"{row.rate_deg_s:g}",
+            f"{row.v_low:g}…{row.v_high:g}",
+            str(row.stars),
+            f"{row.detected_pct:.1f}",
+            f"{row.rms_px:.4f}",
+            f"{row.bound_px:.4f}",
+            f"{row.ratio:.3f}",
+            f"{row.predicted_px:.4f}",
+            f"{row.normalised_squared_error:.2f}",
+        )
+    Console().print(table)
+
+
+@group.command("frame")
+def frame(
+    frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
+    rate: Annotated[float, typer.Option(help="Body rate during the exposures, degrees/s.")] = 0.0,
+    json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Time a frame stage by stage on one core: rendered, detected, identified (processor time of one thread)."""
+    import dataclasses
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from emulator.bench.frame import measure_frames
+
+    progress = Console(stderr=True)
+    rows = measure_frames(frames, seed, rate, progress=progress.print)
+    if json_out:
+        print(json.dumps({"seed": seed, "rows": [dataclasses.asdict(row) for row in rows]}))
+        return
+    table = Table("stage", "frames", "median ms", "p99 ms", "least ms")
+    for row in rows:
+        figures = (f"{value:.2f}" for value in (row.median_ms, row.p99_ms, row.least_ms))
+        table.add_row(row.stage, str(row.frames), *figures)
+    Console().print(table)
+
+
+@group.command("bus")
+def bus(
+    seconds: Annotated[float, typer.Option(min=1.0, help="Time for each link.")] = 60.0,
+    rate: Annotated[float, typer.Option(min=0.0, help="Frames a second of other nodes on CAN.")] = 7000.0,
+    baud: Annotated[int, typer.Option(min=1200, help="Serial bit rate.")] = 921_600,
+    p99_limit_ms: Annotated[float, typer.Option(help="Exit status 1 if CAN replies are later.")] = 5.0,
+    can: Annotated[str | None, typer.Option(help="CAN of a running device, e.g. vcan0.")] = None,
+    serial: Annotated[str | None, typer.Option(help="Serial port of a running device.")] = None,
+    canopen: Annotated[int | None, typer.Option(help="CANopen node of a running device.")] = None,
+    device_address: Annotated[int, typer.Option(help="CAN address of the device.")] = 4,
+    dialect: Annotated[str, typer.Option(help="Serial dialect of the device.")] = "b",
+    json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Load the links of a device to the full and measure what is lost, wrong, late or irregular.
+
+    Without --can and --serial it starts an emulator that solves frames at 10 Hz, and a CAN hub. The exit status is 0 only if
+    nothing was lost or wrong and the latency of CAN replies keeps the limit.
+    """
+    import json
+    from contextlib import nullcontext
+
+    from rich.console import Console
+
+    from emulator.cli.bench_bus import Target, measure, own_device, print_figures
+    from emulator.errors import EmulatorError
+    from protocol.serial_framing import Dialect
+
+    if dialect not in set(Dialect):
+        raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
+    progress = Console(stderr=True)
+    given = Target(can, serial, canopen, device_address, baud, Dialect(dialect))
+    own = can is None and serial is None
+    with own_device(baud, progress.print) if own else nullcontext(given) as target:
+        figures = measure(target, seconds, rate, progress.print)
+    good = figures.good(p99_limit_ms)
+    if json_out:
+        print(json.dumps({**figures.as_dict(), "good": good}))
+    else:
+        print_figures(figures, good)
+    raise typer.Exit(0 if good else 1)
