@@ -1,4 +1,4 @@
-"""Kernels that end an identification: search or track, then covariance, quaternion and lists of pairs."""
+"""The end of an identification in the kernels: test, refine, judge; covariance, quaternion and pairs."""
 
 from __future__ import annotations
 
@@ -8,11 +8,29 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.jit import compiled
+from starid.jit_kernels import inner
+from starid.observation import SIGMA, SOURCE, Table, rescale
 from starid.pattern_index import IndexArrays
-from starid.refinement import solve_symmetric
-from starid.search import SCALE_TOLERANCE, SIGMAS_KNOWN, Outcome, search
-from starid.tracking import track_near
+from starid.refinement import (
+    NUMBERS,
+    RMS,
+    SCALE,
+    VARIANCE,
+    ZERO_POINT,
+    refine,
+    solve_symmetric,
+)
+from starid.settings import (
+    LARGEST_SIGMA,
+    MAGNITUDE_GATE,
+    NOTHING,
+    SCALE_TOLERANCE,
+    SIGMAS_KNOWN,
+)
+from starid.verification import log_false_probability, worth_refining
+
+LEAST_MATCHED: Final = 4
+"""Matches that an answer needs."""
 
 PRIOR_FREEDOM: Final = 10.0
 """Weight of the errors that the caller gives, in degrees of freedom, against what the residuals say."""
@@ -24,12 +42,12 @@ class Answer(NamedTuple):
     Attributes
     ----------
     status : int
-        As in `starid.search.Outcome`.
+        As in `starid.settings`.
     quaternion : ndarray (4,)
         Scalar-last, ICRS→sensor, scalar ≥ 0.
     covariance : ndarray (3, 3)
         rad², sensor frame.
-    detections, stars : ndarray (m,) int64
+    pairs : ndarray (2, m) int64
         Matched rows of the detections, and of the index's stars.
     numbers : ndarray (6,)
         rms (px), noise (px), logarithm of the bound on a false answer, scale, triangles, candidates.
@@ -38,15 +56,90 @@ class Answer(NamedTuple):
     status: int
     quaternion: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    detections: NDArray[np.int64]
-    stars: NDArray[np.int64]
+    pairs: NDArray[np.int64]
     numbers: NDArray[np.float64]
 
 
-@compiled
-def quaternion_of(m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scalar-last quaternion, scalar ≥ 0, of a rotation matrix, from its largest component (Shepperd 1978)."""
-    q = np.empty(4)
+class Candidate(NamedTuple):
+    """Workspace of a candidate attitude; see `starid.refinement.refine`.
+
+    Attributes
+    ----------
+    frames : ndarray (3, 3, 3)
+        Frames of the pattern in the sensor and in the sky, and the rotation between them.
+    stars : ndarray (n,) int64
+    normal : ndarray (4, 4)
+    numbers : ndarray (`NUMBERS`,)
+    """
+
+    frames: NDArray[np.float64]
+    stars: NDArray[np.int64]
+    normal: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+
+
+@inner
+def new_candidate(count: int) -> Candidate:
+    """Workspace for so many detections."""
+    stars = np.empty(count, dtype=np.int64)
+    return Candidate(np.empty((3, 3, 3)), stars, np.empty((4, 4)), np.empty(NUMBERS))
+
+
+@inner
+def judged(
+    index: IndexArrays,
+    given: Table,
+    settings: NDArray[np.float64],
+    candidate: Candidate,
+    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    used: tuple[int, int, int],
+    prior_volume: float,
+) -> tuple[int, float]:
+    """Test, refine and judge the attitude in ``candidate.frames[2]``.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Rotation, scale and zero point are set.
+    tests : (odds, order)
+        From `starid.verification.hit_odds` and `test_order`.
+    used : (int, int, int)
+        Detections that the attitude was made from.
+    prior_volume : float
+        As in `log_false_probability`.
+
+    Returns
+    -------
+    matched : int
+        Stars matched; 0 for a candidate that fell through.
+    bound : float
+        Logarithm of the bound on the probability of a false answer.
+    """
+    rotation, numbers = candidate.frames[2], candidate.numbers
+    faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
+    odds, order = tests
+    if not worth_refining(index, given, rotation, numbers[SCALE], faintest, settings, odds, order, used):
+        return 0, 0.0
+    matched = refine(
+        index, given, settings, LEAST_MATCHED, rotation, candidate.stars, candidate.normal, numbers
+    )
+    if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
+        return 0, 0.0
+    seen = given
+    if settings[SCALE_TOLERANCE] > 0.0:
+        if abs(math.log(numbers[SCALE])) > 1.5 * settings[SCALE_TOLERANCE]:
+            return 0, 0.0
+        seen = np.empty_like(given)
+        rescale(given, numbers[SCALE], seen)
+    bound = log_false_probability(
+        index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior_volume
+    )
+    return matched, bound
+
+
+@inner
+def quaternion_of(m: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+    """Fill in the scalar-last quaternion, scalar ≥ 0, of a rotation matrix (Shepperd 1978)."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     if trace > 0.0:
         q[3] = 1.0 + trace
@@ -65,80 +158,58 @@ def quaternion_of(m: NDArray[np.float64]) -> NDArray[np.float64]:
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[3] < 0.0:
         norm = -norm
-    return q / norm
+    for k in range(4):
+        q[k] /= norm
 
 
-@compiled
-def finish(outcome: Outcome, sigmas: NDArray[np.float64], sigmas_known: bool, unknowns: int) -> Answer:
-    """Turn an outcome into an answer.
+@inner
+def finish(
+    status: int,
+    given: Table,
+    candidate: Candidate,
+    settings: NDArray[np.float64],
+    bound: float,
+    triangles: int,
+    candidates: int,
+) -> Answer:
+    """Turn a candidate that stands (or, with a status other than `ACCEPTED`, nothing) into an answer.
 
     The covariance is the inverse normal matrix times the variance of unit weight. That is estimated from the
     residuals with ν degrees of freedom and multiplied by ν/(ν − 2), which makes it the covariance of the
     (Student) posterior; errors given by the caller count as further degrees of freedom.
     """
-    refined = outcome.refined
-    m = refined.matched
-    detections = np.empty(m, dtype=np.int64)
-    stars = np.empty(m, dtype=np.int64)
-    covariance = np.full((3, 3), math.nan)
-    numbers = np.array(
-        [
-            refined.rms_px, math.nan, outcome.log_chance, refined.scale, float(outcome.triangles),
-            float(outcome.candidates),
-        ]
-    )  # fmt: skip
-    if m == 0:
-        return Answer(outcome.status, np.full(4, math.nan), covariance, detections, stars, numbers)
-    filled = 0
+    numbers = candidate.numbers
+    quaternion, covariance = np.full(4, math.nan), np.full((3, 3), math.nan)
+    facts = np.full(6, math.nan)
+    facts[2], facts[4], facts[5] = bound, triangles, candidates
+    if status <= NOTHING or bound == 0.0:
+        return Answer(status, quaternion, covariance, np.empty((2, 0), dtype=np.int64), facts)
+    m = 0
+    for i in range(candidate.stars.shape[0]):
+        m += 1 if candidate.stars[i] >= 0 else 0
+    pairs = np.empty((2, m), dtype=np.int64)
     mean_sigma2 = 0.0
-    for i in range(refined.stars.shape[0]):
-        if refined.stars[i] >= 0:
-            row = outcome.source[i]
-            detections[filled] = row
-            stars[filled] = refined.stars[i]
-            mean_sigma2 += sigmas[row] * sigmas[row] / m
+    filled = 0
+    for i in range(candidate.stars.shape[0]):
+        if candidate.stars[i] >= 0:
+            pairs[0, filled] = np.int64(given[i, SOURCE])
+            pairs[1, filled] = candidate.stars[i]
+            mean_sigma2 += given[i, SIGMA] * given[i, SIGMA] / m
             filled += 1
-    freedom = float(max(2 * m - unknowns, 1))
-    variance = refined.variance
-    if sigmas_known:
+    freedom = float(max(2 * m - (4 if settings[SCALE_TOLERANCE] > 0.0 else 3), 1))
+    variance = numbers[VARIANCE]
+    if settings[SIGMAS_KNOWN] > 0.0:
         variance = (PRIOR_FREEDOM + variance * freedom) / (PRIOR_FREEDOM + freedom)
         freedom += PRIOR_FREEDOM
-    numbers[1] = math.sqrt(variance * mean_sigma2)
+    facts[0], facts[1], facts[3] = numbers[RMS], math.sqrt(variance * mean_sigma2), numbers[SCALE]
     if freedom > 2.0:
         variance *= freedom / (freedom - 2.0)
+    unit, column = np.empty(4), np.empty(4)
     for axis in range(3):
-        unit = np.zeros(3)
-        unit[axis] = variance
-        column, _ = solve_symmetric(refined.normal, unit, 3)
-        covariance[:, axis] = column
-    return Answer(outcome.status, quaternion_of(refined.rotation), covariance, detections, stars, numbers)
-
-
-@compiled
-def identify_kernel(
-    index: IndexArrays,
-    params: NDArray[np.float64],
-    xy: NDArray[np.float64],
-    flux: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    settings: NDArray[np.float64],
-) -> Answer:
-    """Lost in space, whole: see `starid.search.search` and `finish`."""
-    outcome = search(index, params, xy, flux, sigmas, settings)
-    return finish(outcome, sigmas, settings[SIGMAS_KNOWN] > 0.0, 4 if settings[SCALE_TOLERANCE] > 0.0 else 3)
-
-
-@compiled
-def track_kernel(
-    index: IndexArrays,
-    params: NDArray[np.float64],
-    xy: NDArray[np.float64],
-    flux: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    settings: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    window_rad: float,
-) -> Answer:
-    """Tracking, whole: see `starid.tracking.track_near` and `finish`."""
-    outcome = track_near(index, params, xy, flux, sigmas, settings, predicted, window_rad)
-    return finish(outcome, sigmas, settings[SIGMAS_KNOWN] > 0.0, 3)
+        for k in range(3):
+            unit[k] = variance if k == axis else 0.0
+        solve_symmetric(candidate.normal, unit, 3, column)
+        for k in range(3):
+            covariance[k, axis] = column[k]
+    quaternion_of(candidate.frames[2], quaternion)
+    return Answer(status, quaternion, covariance, pairs, facts)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starid import index_file
-from starid.answer import Answer, identify_kernel, track_kernel
+from starid.answer import Answer
 from starid.attitude import Attitude
 from starid.cache import cache_dir
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -32,7 +32,8 @@ from starid.pattern_index import (
     field_solid_angle,
     seen_stars,
 )
-from starid.search import (
+from starid.search import identify_kernel
+from starid.settings import (
     ACCEPTED,
     FIELD_PX,
     LARGEST_SIGMA,
@@ -51,6 +52,7 @@ from starid.search import (
     WINDOW,
 )
 from starid.solution import Mode, Reason, Solution
+from starid.tracking import track_kernel
 
 STARS_PER_FIELD: Final = 200
 """Catalogue stars a field, on the average, that the default limiting magnitude aims at."""
@@ -58,7 +60,7 @@ STARS_PER_FIELD: Final = 200
 BRIGHTEST_LIMIT: Final = 6.0
 FAINTEST_LIMIT: Final = 9.0
 BLEND_PX: Final = 2.0
-TOLERANCE_PX: Final = 5.0
+TOLERANCE_PX: Final = 4.0
 WINDOW_PX: Final = 12.0
 TEST_WINDOW_PX: Final = 10.0
 TRACKING_WINDOW_PX: Final = 20.0
@@ -111,7 +113,7 @@ class Effort:
     window_px: float = WINDOW_PX
     test_window_px: float = TEST_WINDOW_PX
     magnitude_gate: float = 1.5
-    max_triangles: int = 1500
+    max_triangles: int = 3000
     max_false_probability: float = 1e-5
     max_false_probability_tracking: float = 1e-5
 
@@ -290,9 +292,9 @@ class Identifier:
             valid=True,
             reason=Reason.OK,
             quaternion_xyzw=answer.quaternion,
-            detection_index=answer.detections,
-            catalog_index=self._rows[answer.stars],
-            hip=self._hip[answer.stars],
+            detection_index=answer.pairs[0],
+            catalog_index=self._rows[answer.pairs[1]],
+            hip=self._hip[answer.pairs[1]],
             covariance=answer.covariance,
             rms_px=rms,
             sigma_px=sigma,
@@ -319,7 +321,7 @@ def index_settings(
         shortest_side_rad=0.12 * width,
         quota=10,
         cells_per_edge=max(int(0.5 * math.pi / cell), 1),
-        side_bins=128,
+        side_bins=72,
     )
 
 

@@ -1,14 +1,14 @@
-"""Detections as the identification kernels see them: directions, pixel gradients and magnitudes."""
+"""Detections as the identification kernels see them: one table of directions, gradients and magnitudes."""
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.jit import compiled
+from starid.jit_kernels import inner
 from starid.projection import (
     FX,
     FY,
@@ -19,90 +19,103 @@ from starid.projection import (
     to_plane,
 )
 
+Table = NDArray[np.float64]
+
+X: Final = 0
+Y: Final = 1
+Z: Final = 2
+"""Direction: unit vector in the sensor frame."""
+U_X: Final = 3
+U_Y: Final = 4
+U_Z: Final = 5
+"""Derivative of the column by the direction, pixels per unit."""
+V_X: Final = 6
+V_Y: Final = 7
+V_Z: Final = 8
+"""Derivative of the row by the direction, pixels per unit."""
+MAGNITUDE: Final = 9
+"""−2.5·log10(flux)."""
+SIGMA: Final = 10
+"""One-sigma error of the position per axis, pixels, or in units of an unknown common one."""
+SOURCE: Final = 11
+"""Row of the detection as given."""
+COLUMNS: Final = 12
+
 FAINTEST: Final = 99.0
 """Instrumental magnitude of a detection without positive flux."""
 
 
-class Observations(NamedTuple):
-    """Detections sorted by falling flux.
-
-    Attributes
-    ----------
-    source : ndarray (n,) int64
-        Row of the detection as given.
-    directions : ndarray (n, 3)
-        Unit vectors, sensor frame.
-    gradients : ndarray (n, 2, 3)
-        Derivative of the pixel position by the direction there, pixels per unit.
-    magnitudes : ndarray (n,)
-        −2.5·log10(flux).
-    sigmas : ndarray (n,)
-        One-sigma error of a position per axis, pixels, or in units of an unknown common one.
-    """
-
-    source: NDArray[np.int64]
-    directions: NDArray[np.float64]
-    gradients: NDArray[np.float64]
-    magnitudes: NDArray[np.float64]
-    sigmas: NDArray[np.float64]
+@inner
+def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Rows by falling flux (Shell sort, gaps of Ciura); equal ones keep no particular order."""
+    n = flux.shape[0]
+    order = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        order[i] = i
+    for gap in (1750, 701, 301, 132, 57, 23, 10, 4, 1):
+        for i in range(gap, n):
+            row = order[i]
+            j = i
+            while j >= gap and flux[order[j - gap]] < flux[row]:
+                order[j] = order[j - gap]
+                j -= gap
+            order[j] = row
+    return order
 
 
-@compiled
+@inner
 def observe(
     params: NDArray[np.float64],
     xy: NDArray[np.float64],
     flux: NDArray[np.float64],
     sigmas: NDArray[np.float64],
-) -> Observations:
+) -> Table:
     """Sort detections by falling flux and look along them; those that see no direction are left out."""
-    total = xy.shape[0]
-    order = np.argsort(-flux, kind="mergesort")
-    source = np.empty(total, dtype=np.int64)
-    directions = np.empty((total, 3))
-    gradients = np.empty((total, 2, 3))
-    magnitudes = np.empty(total)
-    ordered_sigmas = np.empty(total)
+    order = by_falling_flux(flux)
+    table = np.empty((flux.shape[0], COLUMNS))
     n = 0
-    fx, fy = params[FX], params[FY]
+    fx, fy, model = params[FX], params[FY], params[MODEL]
     for row in order:
         x, y, z, seen = back_project_one(params, xy[row, 0], xy[row, 1])
-        if not seen:
+        a, b, mapped = to_plane(model, x, y, z)
+        if not (seen and mapped):
             continue
-        a, b, mapped = to_plane(params[MODEL], x, y, z)
-        if not mapped:
-            continue
-        source[n] = row
-        directions[n, 0], directions[n, 1], directions[n, 2] = x, y, z
         j11, j12, j22 = distort_slopes(params, a, b)
-        ax, ay, az, bx, by, bz = plane_slopes(params[MODEL], x, y, z)
-        gradients[n, 0, 0] = fx * (j11 * ax + j12 * bx)
-        gradients[n, 0, 1] = fx * (j11 * ay + j12 * by)
-        gradients[n, 0, 2] = fx * (j11 * az + j12 * bz)
-        gradients[n, 1, 0] = fy * (j12 * ax + j22 * bx)
-        gradients[n, 1, 1] = fy * (j12 * ay + j22 * by)
-        gradients[n, 1, 2] = fy * (j12 * az + j22 * bz)
-        magnitudes[n] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
-        ordered_sigmas[n] = sigmas[row]
+        ax, ay, az, bx, by, bz = plane_slopes(model, x, y, z)
+        table[n, X], table[n, Y], table[n, Z] = x, y, z
+        table[n, U_X] = fx * (j11 * ax + j12 * bx)
+        table[n, U_Y] = fx * (j11 * ay + j12 * by)
+        table[n, U_Z] = fx * (j11 * az + j12 * bz)
+        table[n, V_X] = fy * (j12 * ax + j22 * bx)
+        table[n, V_Y] = fy * (j12 * ay + j22 * by)
+        table[n, V_Z] = fy * (j12 * az + j22 * bz)
+        table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
+        table[n, SIGMA] = sigmas[row]
+        table[n, SOURCE] = row
         n += 1
-    return Observations(source[:n], directions[:n], gradients[:n], magnitudes[:n], ordered_sigmas[:n])
+    return table[:n]
 
 
-@compiled
-def rescaled(observations: Observations, scale: float) -> Observations:
-    """See the same detections with the focal length divided by `scale` (pinhole, narrow fields)."""
-    n = observations.directions.shape[0]
-    directions = np.empty((n, 3))
-    gradients = np.empty((n, 2, 3))
-    for i in range(n):
-        x = observations.directions[i, 0] * scale
-        y = observations.directions[i, 1] * scale
-        z = observations.directions[i, 2]
+@inner
+def rescale(given: Table, scale: float, seen: Table) -> None:
+    """Fill `seen` with the same detections under a focal length divided by `scale` (pinhole, narrow fields)."""
+    for i in range(given.shape[0]):
+        x, y, z = given[i, X] * scale, given[i, Y] * scale, given[i, Z]
         norm = math.sqrt(x * x + y * y + z * z)
-        directions[i, 0], directions[i, 1], directions[i, 2] = x / norm, y / norm, z / norm
-        for axis in range(2):
-            gradients[i, axis, 0] = observations.gradients[i, axis, 0] * norm / scale
-            gradients[i, axis, 1] = observations.gradients[i, axis, 1] * norm / scale
-            gradients[i, axis, 2] = observations.gradients[i, axis, 2] * norm
-    return Observations(
-        observations.source, directions, gradients, observations.magnitudes, observations.sigmas
-    )
+        lateral = norm / scale
+        seen[i, X], seen[i, Y], seen[i, Z] = x / norm, y / norm, z / norm
+        seen[i, U_X], seen[i, U_Y], seen[i, U_Z] = (
+            given[i, U_X] * lateral,
+            given[i, U_Y] * lateral,
+            given[i, U_Z] * norm,
+        )
+        seen[i, V_X], seen[i, V_Y], seen[i, V_Z] = (
+            given[i, V_X] * lateral,
+            given[i, V_Y] * lateral,
+            given[i, V_Z] * norm,
+        )
+        seen[i, MAGNITUDE], seen[i, SIGMA], seen[i, SOURCE] = (
+            given[i, MAGNITUDE],
+            given[i, SIGMA],
+            given[i, SOURCE],
+        )

@@ -6,7 +6,7 @@ of half the field's area: so every part of the sky, rich or poor, offers about a
 field still holds some.
 
 Sides are chords of the unit sphere (2·sin(angle/2)), sorted longest first; corner k lies opposite side k.
-Triangles are binned by handedness, longest and middle side, so that a query reads a few short runs.
+Triangles are binned by handedness and all three sides, so that a query reads a few short runs.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from starid.camera import Camera
 from starid.catalog import StarCatalog, blend
 from starid.errors import StaridError
-from starid.jit import compiled
+from starid.jit_kernels import entry, inner
 from starid.sky_grid import FACES, build_sky_grid, cell_of
 
-INDEX_VERSION: Final = 1
+INDEX_VERSION: Final = 3
 """Raised whenever the same catalogue and settings would give another index."""
 
 SIDE_STEPS: Final = 65535
@@ -44,39 +44,37 @@ class IndexArrays(NamedTuple):
 
     Attributes
     ----------
-    vectors : ndarray (m, 3) float64
-        Unit vectors ICRS of the (blended) stars, brightest first.
-    magnitudes : ndarray (m,) float64
-        V magnitudes, ascending.
+    stars : ndarray (m, 4) float64
+        Unit vector ICRS and V magnitude of the (blended) stars, brightest first.
     grid_start, grid_stars : ndarray int32
         Sky grid, see `starid.sky_grid`.
     counts : ndarray (cells + 1, bins) int32
         Stars down to a magnitude bin in a cap with the area of the field around each coarse cell; the last
         row counts the whole sky.
     bin_start : ndarray int32
-        Triangles of bin ``(hand · b + longest) · b + middle`` stand in ``[start[bin], start[bin + 1])``.
-    sides : ndarray (p, 3) uint16
-        Longest, middle and shortest chord in steps.
-    corners : ndarray (p, 3) uint16
-        Pattern star opposite each side.
+        Triangles of bin ``((hand · b + longest) · b + middle) · b + shortest`` stand in
+        ``[start[bin], start[bin + 1])``.
+    patterns : ndarray (p, 6) uint16
+        Longest, middle and shortest chord in steps, and the pattern star opposite each.
     pattern_stars : ndarray int32
-        Row of `vectors` for each pattern star.
+        Row of `stars` for each pattern star.
     numbers : ndarray (6,) float64
         cells per edge of the grid, its margin (rad), bins per side, chord of one step, shortest indexed side
         (chord), stars a field on the average.
     """
 
-    vectors: NDArray[np.float64]
-    magnitudes: NDArray[np.float64]
+    stars: NDArray[np.float64]
     grid_start: NDArray[np.int32]
     grid_stars: NDArray[np.int32]
     counts: NDArray[np.int32]
     bin_start: NDArray[np.int32]
-    sides: NDArray[np.uint16]
-    corners: NDArray[np.uint16]
+    patterns: NDArray[np.uint16]
     pattern_stars: NDArray[np.int32]
     numbers: NDArray[np.float64]
 
+
+STAR_MAGNITUDE: Final = 3
+"""Column of `IndexArrays.stars`."""
 
 GRID_CELLS: Final = 0
 GRID_MARGIN: Final = 1
@@ -107,7 +105,7 @@ class IndexSettings:
     cells_per_edge : int
         Fineness of the sky grid.
     side_bins : int
-        Bins for the longest and for the middle side.
+        Bins for each side.
     """
 
     limiting_magnitude: float
@@ -136,7 +134,7 @@ def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float
     return blend(deep, blend_rad).brighter_than(limiting_magnitude)
 
 
-@compiled
+@entry
 def _pick(
     vectors: NDArray[np.float64],
     neighbour_start: NDArray[np.int64],
@@ -177,7 +175,7 @@ def pick_pattern_stars(vectors: NDArray[np.float64], cap_area_sr: float, quota: 
     return np.flatnonzero(_pick(vectors, start, neighbours, quota))
 
 
-@compiled
+@inner
 def sorted_triangle(
     c0: float, c1: float, c2: float, i: int, j: int, k: int
 ) -> tuple[float, float, float, int, int, int]:
@@ -191,28 +189,27 @@ def sorted_triangle(
     return c0, c1, c2, i, j, k
 
 
-@compiled
+@inner
 def chord(vectors: NDArray[np.float64], i: int, j: int) -> float:
-    """Chord between two unit vectors, rows i and j."""
+    """Chord between two unit vectors, the first three columns of rows i and j."""
     x = vectors[i, 0] - vectors[j, 0]
     y = vectors[i, 1] - vectors[j, 1]
     z = vectors[i, 2] - vectors[j, 2]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
+@inner
 def handedness(vectors: NDArray[np.float64], i: int, j: int, k: int) -> int:
     """1 where the triple product of rows i, j, k is positive, else 0."""
-    a, b, c = vectors[i], vectors[j], vectors[k]
     product = (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
+        vectors[i, 0] * (vectors[j, 1] * vectors[k, 2] - vectors[k, 1] * vectors[j, 2])
+        + vectors[i, 1] * (vectors[j, 2] * vectors[k, 0] - vectors[k, 2] * vectors[j, 0])
+        + vectors[i, 2] * (vectors[j, 0] * vectors[k, 1] - vectors[k, 0] * vectors[j, 1])
     )
     return 1 if product > 0.0 else 0
 
 
-@compiled
+@entry
 def _triangles(
     vectors: NDArray[np.float64],
     start: NDArray[np.int64],
@@ -220,17 +217,15 @@ def _triangles(
     shortest: float,
     longest: float,
     bins: int,
-) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64]]:
-    """All triangles i < j < k with sides between the limits: sides, corners, bin (see `IndexArrays`)."""
+) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+    """All triangles i < j < k with sides between the limits: patterns and bins (see `IndexArrays`)."""
     step = longest / SIDE_STEPS
     count = 0
-    sides = np.empty((0, 3), dtype=np.uint16)
-    corners = np.empty((0, 3), dtype=np.uint16)
+    patterns = np.empty((0, 6), dtype=np.uint16)
     binned = np.empty(0, dtype=np.int64)
     for fill in range(2):
         if fill == 1:
-            sides = np.empty((count, 3), dtype=np.uint16)
-            corners = np.empty((count, 3), dtype=np.uint16)
+            patterns = np.empty((count, 6), dtype=np.uint16)
             binned = np.empty(count, dtype=np.int64)
             count = 0
         for i in range(vectors.shape[0]):
@@ -248,17 +243,20 @@ def _triangles(
                         continue
                     if fill == 1:
                         s0, s1, s2, a, b, c = sorted_triangle(c0, c1, c2, i, j, k)
-                        sides[count] = round(s0 / step), round(s1 / step), round(s2 / step)
-                        corners[count] = a, b, c
+                        patterns[count, 0] = round(s0 / step)
+                        patterns[count, 1] = round(s1 / step)
+                        patterns[count, 2] = round(s2 / step)
+                        patterns[count, 3], patterns[count, 4], patterns[count, 5] = a, b, c
                         hand = handedness(vectors, a, b, c)
                         bin0 = min(int(s0 / longest * bins), bins - 1)
                         bin1 = min(int(s1 / longest * bins), bins - 1)
-                        binned[count] = (hand * bins + bin0) * bins + bin1
+                        bin2 = min(int(s2 / longest * bins), bins - 1)
+                        binned[count] = ((hand * bins + bin0) * bins + bin1) * bins + bin2
                     count += 1
-    return sides, corners, binned
+    return patterns, binned
 
 
-@compiled
+@entry
 def _count_field_stars(
     vectors: NDArray[np.float64], magnitudes: NDArray[np.float64], cap_cosine: float, bins: int
 ) -> NDArray[np.int32]:
@@ -286,7 +284,7 @@ def _count_field_stars(
     return counts
 
 
-@compiled
+@inner
 def magnitude_bin(magnitude: float, bins: int) -> int:
     """Bin of a magnitude in `IndexArrays.counts`."""
     return min(max(int((magnitude - BRIGHTEST_BIN) * BINS_PER_MAGNITUDE), 0), bins - 1)
@@ -312,15 +310,15 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
     longest = 2.0 * math.sin(0.5 * settings.longest_side_rad)
     shortest = 2.0 * math.sin(0.5 * settings.shortest_side_rad)
     bins = settings.side_bins
-    sides, corners, binned = _triangles(chosen, start, neighbours, shortest, longest, bins)
+    patterns, binned = _triangles(chosen, start, neighbours, shortest, longest, bins)
     if binned.size == 0:
         raise StaridError(
             f"index: no triangle of stars to V {settings.limiting_magnitude:g} fits the field; "
             "raise the limiting magnitude"
         )
     order = np.argsort(binned, kind="stable")
-    bin_start = np.zeros(2 * bins * bins + 1, dtype=np.int32)
-    np.cumsum(np.bincount(binned, minlength=2 * bins * bins), out=bin_start[1:])
+    bin_start = np.zeros(2 * bins**3 + 1, dtype=np.int32)
+    np.cumsum(np.bincount(binned, minlength=2 * bins**3), out=bin_start[1:])
     magnitude_bins = max(int((settings.limiting_magnitude - BRIGHTEST_BIN) * BINS_PER_MAGNITUDE) + 1, 1)
     cap_cosine = 1.0 - settings.field_area_sr / (2.0 * math.pi)
     counts = _count_field_stars(vectors, magnitudes, cap_cosine, magnitude_bins)
@@ -335,14 +333,12 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
         ]
     )
     return IndexArrays(
-        vectors=vectors,
-        magnitudes=magnitudes,
+        stars=np.column_stack([vectors, magnitudes]),
         grid_start=grid_start,
         grid_stars=grid_stars,
         counts=counts,
         bin_start=bin_start,
-        sides=np.ascontiguousarray(sides[order]),
-        corners=np.ascontiguousarray(corners[order]),
+        patterns=np.ascontiguousarray(patterns[order]),
         pattern_stars=pattern_stars.astype(np.int32),
         numbers=numbers,
     )

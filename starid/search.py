@@ -8,51 +8,45 @@ exhausted, triangles drawn from a wider choice follow.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.jit import compiled
-from starid.observation import Observations, observe, rescaled
+from starid.answer import (
+    LEAST_MATCHED,
+    Answer,
+    Candidate,
+    finish,
+    judged,
+    new_candidate,
+)
+from starid.jit_kernels import entry, inner
+from starid.observation import MAGNITUDE, Table, X, Y, Z, observe
 from starid.pattern_index import (
     SHORTEST_SIDE,
     SIDE_BINS,
     SIDE_STEP,
     SIDE_STEPS,
+    STAR_MAGNITUDE,
     IndexArrays,
     chord,
     handedness,
     sorted_triangle,
 )
-from starid.refinement import Refined, nothing_refined, refine
-from starid.verification import ROTATIONS, hit_odds, log_false_probability, test_order, worth_refining
-
-SEARCH_TOLERANCE: Final = 0
-"""Largest error of a side, radians."""
-MAGNITUDE_GATE: Final = 1
-"""Largest deviation of a star's magnitude from what its flux says, magnitudes."""
-MAX_TRIANGLES: Final = 2
-"""Triangles of detections looked up before giving up."""
-SCALE_TOLERANCE: Final = 3
-"""Relative error of the focal length (0 where it is known)."""
-WINDOW: Final = 4
-"""First matching window, pixels."""
-LARGEST_SIGMA: Final = 5
-"""Largest centroid noise believed, pixels per axis."""
-LOG_CHANCE: Final = 6
-"""Logarithm of the largest probability of a false answer."""
-PX_PER_RAD: Final = 7
-"""Least pixels per radian in the field."""
-SIGMAS_KNOWN: Final = 8
-"""Not 0 where the errors of the positions are given."""
-FIELD_PX: Final = 9
-"""Pixels in the field."""
-LOG_CHANCE_TRACKING: Final = 10
-"""The same as `LOG_CHANCE` for an answer near a predicted attitude."""
-TEST_WINDOW: Final = 11
-"""Window of the sequential test, radians."""
-SETTING_COUNT: Final = 12
+from starid.refinement import SCALE, ZERO_POINT
+from starid.settings import (
+    ACCEPTED,
+    LOG_CHANCE,
+    MAGNITUDE_GATE,
+    MAX_TRIANGLES,
+    NOTHING,
+    SCALE_TOLERANCE,
+    SEARCH_TOLERANCE,
+    TEST_WINDOW,
+    TOO_FEW,
+)
+from starid.verification import ROTATIONS, hit_odds, test_order
 
 SYSTEMATIC: Final = 14
 """Brightest detections of which every triangle is tried first."""
@@ -60,239 +54,260 @@ SYSTEMATIC: Final = 14
 DRAWN_FROM: Final = 60
 """Brightest detections from which further triangles are drawn."""
 
-LEAST_MATCHED: Final = 4
-"""Matches that an answer needs."""
+DRAWN_TOLERANCE: Final = 0.5
+"""Tolerance of their sides as a share of that of the first: they are many, and each must be cheap."""
 
-NOTHING: Final = 0
-ACCEPTED: Final = 1
-TOO_FEW: Final = 2
-NOISY: Final = 3
+MOST_FOUND: Final = 4096
+"""Triangles of the index tried for one of detections."""
+
+_SEED: Final = 88172645463325252
 
 
-class Outcome(NamedTuple):
-    """Answer of a search.
+@inner
+def copy_corner(table: NDArray[np.float64], source: int, scale: float, frame: Table, row: int) -> None:
+    """Copy a unit vector to a row of a frame, its first two components times `scale` (and unit length again)."""
+    x, y, z = table[source, X] * scale, table[source, Y] * scale, table[source, Z]
+    norm = 1.0 / math.sqrt(x * x + y * y + z * z) if scale != 1.0 else 1.0
+    frame[row, 0], frame[row, 1], frame[row, 2] = x * norm, y * norm, z * norm
 
-    Attributes
+
+@inner
+def make_frame(frame: Table) -> None:
+    """Turn three unit vectors (rows) into an orthonormal frame: sum, first − second made normal to it, third."""
+    along, square_sum, square_side = 0.0, 0.0, 0.0
+    for axis in range(3):
+        total = frame[0, axis] + frame[1, axis] + frame[2, axis]
+        frame[1, axis] = frame[0, axis] - frame[1, axis]
+        frame[0, axis] = total
+        square_sum += total * total
+        along += total * frame[1, axis]
+    for axis in range(3):
+        frame[1, axis] -= along / square_sum * frame[0, axis]
+        square_side += frame[1, axis] * frame[1, axis]
+    long, side = 1.0 / math.sqrt(square_sum), 1.0 / math.sqrt(square_side)
+    for axis in range(3):
+        frame[0, axis] *= long
+        frame[1, axis] *= side
+    frame[2, 0] = frame[0, 1] * frame[1, 2] - frame[0, 2] * frame[1, 1]
+    frame[2, 1] = frame[0, 2] * frame[1, 0] - frame[0, 0] * frame[1, 2]
+    frame[2, 2] = frame[0, 0] * frame[1, 1] - frame[0, 1] * frame[1, 0]
+
+
+@inner
+def set_rotation(
+    given: Table,
+    detections: tuple[int, int, int],
+    scale: float,
+    star_table: NDArray[np.float64],
+    stars: tuple[int, int, int],
+    frames: NDArray[np.float64],
+) -> None:
+    """Fill ``frames[2]`` with the ICRS→sensor matrix that carries three stars into three detections.
+
+    Parameters
     ----------
-    status : int
-        `ACCEPTED`, `NOTHING`, `TOO_FEW` or `NOISY`.
-    refined : Refined
-        The refined attitude (of the last candidate where not accepted).
-    source : ndarray (n,)
-        Row of the detection as given, for each observation.
-    log_chance : float
-        Logarithm of the bound on the probability of a false answer.
-    triangles, candidates : int
-        Work done.
+    scale : float
+        Factor on the tangents of the detections' directions.
+    frames : ndarray (3, 3, 3)
+        The other two are workspace: the frame of the detections, and that of the stars.
     """
-
-    status: int
-    refined: Refined
-    source: NDArray[np.int64]
-    log_chance: float
-    triangles: int
-    candidates: int
-
-
-@compiled
-def frame_of(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Orthonormal frame (rows) of three directions: their sum, the side a − b made normal to it, the third."""
-    frame = np.empty((3, 3))
-    sx, sy, sz = a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2]
-    k = 1.0 / math.sqrt(sx * sx + sy * sy + sz * sz)
-    sx, sy, sz = sx * k, sy * k, sz * k
-    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
-    along = dx * sx + dy * sy + dz * sz
-    dx, dy, dz = dx - along * sx, dy - along * sy, dz - along * sz
-    k = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz = dx * k, dy * k, dz * k
-    frame[0, 0], frame[0, 1], frame[0, 2] = sx, sy, sz
-    frame[1, 0], frame[1, 1], frame[1, 2] = dx, dy, dz
-    frame[2, 0], frame[2, 1], frame[2, 2] = sy * dz - sz * dy, sz * dx - sx * dz, sx * dy - sy * dx
-    return frame
-
-
-@compiled
-def rotation_between(sensor: NDArray[np.float64], sky: NDArray[np.float64]) -> NDArray[np.float64]:
-    """ICRS→sensor matrix that carries one frame (rows) into the other: sensorᵀ · sky."""
-    rotation = np.empty((3, 3))
+    sensor, sky = frames[0], frames[1]
+    for row in range(3):
+        copy_corner(given, detections[row], scale, sensor, row)
+        copy_corner(star_table, stars[row], 1.0, sky, row)
+    make_frame(sensor)
+    make_frame(sky)
     for i in range(3):
         for j in range(3):
-            rotation[i, j] = sensor[0, i] * sky[0, j] + sensor[1, i] * sky[1, j] + sensor[2, i] * sky[2, j]
-    return rotation
+            frames[2, i, j] = sensor[0, i] * sky[0, j] + sensor[1, i] * sky[1, j] + sensor[2, i] * sky[2, j]
 
 
-@compiled
-def judged(
+@inner
+def _look_up(
+    patterns: NDArray[np.uint16],
+    bin_start: NDArray[np.int32],
+    numbers: NDArray[np.float64],
+    triangle: tuple[float, float, float],
+    hand: int,
+    tolerance: float,
+    spread: float,
+    found: NDArray[np.int64],
+) -> int:
+    """Fill in the index's triangles with the given sides, longest first; return how many.
+
+    With a `spread` the sides may all be longer or shorter by one factor within 1 ± spread.
+    """
+    s0, s1, s2 = triangle
+    bins, step = int(numbers[SIDE_BINS]), numbers[SIDE_STEP]
+    longest = step * SIDE_STEPS
+    per_side = bins / longest
+    low0, high0 = s0 * (1.0 - spread) - tolerance, min(s0 * (1.0 + spread) + tolerance, longest)
+    first_bin = max(int(low0 * per_side), 0)
+    last_bin = min(int(high0 * per_side), bins - 1)
+    ratio_low, ratio_high, scale = 1.0, 1.0, 1.0
+    count = 0
+    for bin0 in range(first_bin, last_bin + 1):
+        if spread > 0.0:
+            ratio_low = max(bin0 / per_side - tolerance, low0) / s0
+            ratio_high = min((bin0 + 1) / per_side + tolerance, high0) / s0
+        low1 = max(int((s1 * ratio_low - tolerance) * per_side), 0)
+        high1 = min(int((s1 * ratio_high + tolerance) * per_side), bins - 1)
+        low2 = max(int((s2 * ratio_low - tolerance) * per_side), 0)
+        high2 = min(int((s2 * ratio_high + tolerance) * per_side), bins - 1)
+        for bin1 in range(low1, high1 + 1):
+            row = ((hand * bins + bin0) * bins + bin1) * bins
+            for pattern in range(bin_start[row + low2], bin_start[row + high2 + 1]):
+                p0 = patterns[pattern, 0] * step
+                if p0 < low0 or p0 > high0:
+                    continue
+                if spread > 0.0:
+                    scale = p0 / s0
+                if abs(patterns[pattern, 1] * step - s1 * scale) > tolerance:
+                    continue
+                if abs(patterns[pattern, 2] * step - s2 * scale) > tolerance:
+                    continue
+                found[count] = pattern
+                count += 1
+                if count == found.shape[0]:
+                    return count
+    return count
+
+
+@inner
+def _try_patterns(
     index: IndexArrays,
-    observations: Observations,
-    refined: Refined,
-    prior_volume: float,
+    given: Table,
     settings: NDArray[np.float64],
+    candidate: Candidate,
+    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    corners: tuple[int, int, int],
+    longest_side: float,
+    found: NDArray[np.int64],
+    count: int,
 ) -> float:
-    """`log_false_probability` of a refined attitude under the settings."""
-    if refined.matched == 0 or refined.rms_px > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
-        return 0.0
-    seen = rescaled(observations, refined.scale) if refined.scale != 1.0 else observations
-    spread = 2.0 * settings[SCALE_TOLERANCE]
-    return log_false_probability(
-        index, seen, refined, settings[SIGMAS_KNOWN] > 0.0, prior_volume, spread, settings[FIELD_PX]
+    """Try the index's triangles found for one of detections.
+
+    Returns the bound of the first that stands, left in `candidate`, or 0.
+    """
+    stars, patterns, pattern_stars = index.stars, index.patterns, index.pattern_stars
+    frames, numbers = candidate.frames, candidate.numbers
+    i, j, k = corners
+    spread, gate = settings[SCALE_TOLERANCE], settings[MAGNITUDE_GATE]
+    mi, mj, mk = given[i, MAGNITUDE], given[j, MAGNITUDE], given[k, MAGNITUDE]
+    for n in range(count):
+        pattern = found[n]
+        a = int(np.int64(pattern_stars[patterns[pattern, 3]]))
+        b = int(np.int64(pattern_stars[patterns[pattern, 4]]))
+        c = int(np.int64(pattern_stars[patterns[pattern, 5]]))
+        da, db, dc = (
+            stars[a, STAR_MAGNITUDE] - mi,
+            stars[b, STAR_MAGNITUDE] - mj,
+            stars[c, STAR_MAGNITUDE] - mk,
+        )
+        zero_point = (da + db + dc) / 3.0
+        if abs(da - zero_point) > gate or abs(db - zero_point) > gate or abs(dc - zero_point) > gate:
+            continue
+        numbers[ZERO_POINT], numbers[SCALE] = zero_point, 1.0
+        if spread > 0.0:
+            numbers[SCALE] = patterns[pattern, 0] * index.numbers[SIDE_STEP] / longest_side
+        set_rotation(given, corners, numbers[SCALE], stars, (a, b, c), frames)
+        _, bound = judged(index, given, settings, candidate, tests, corners, ROTATIONS)
+        if bound < settings[LOG_CHANCE]:
+            return bound
+    return 0.0
+
+
+@inner
+def chord_table(given: Table, count: int) -> NDArray[np.float64]:
+    """Chords (count, count) between the first detections."""
+    table = np.zeros((count, count))
+    for i in range(count):
+        for j in range(i):
+            table[i, j] = chord(given, i, j)
+            table[j, i] = table[i, j]
+    return table
+
+
+@inner
+def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
+    """Next of the triangles i < j < k in the order (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4)."""
+    if i + 1 < j:
+        return i + 1, j, k
+    if j + 1 < k:
+        return 0, j + 1, k
+    return 0, 1, k + 1
+
+
+@inner
+def _drawn(state: np.uint64, choice: int) -> tuple[np.uint64, int, int, int]:
+    """Step of a xorshift generator, and three numbers below `choice` from it (16 bits each)."""
+    state ^= state << np.uint64(13)
+    state ^= state >> np.uint64(7)
+    state ^= state << np.uint64(17)
+    mask, bits = np.uint64(0xFFFF), np.uint64(16)
+    return (
+        state,
+        int(np.int64(((state & mask) * np.uint64(choice)) >> bits)),
+        int(np.int64(((state >> bits) & mask) * np.uint64(choice)) >> bits),
+        int(np.int64((((state >> np.uint64(32)) & mask) * np.uint64(choice)) >> bits)),
     )
 
 
-@compiled
-def _try_triangle(
-    index: IndexArrays,
-    observations: Observations,
-    corners: tuple[int, int, int],
-    odds: NDArray[np.float64],
-    order: NDArray[np.int64],
-    settings: NDArray[np.float64],
-    work: NDArray[np.int64],
-) -> tuple[Refined, float, bool]:
-    """Look a triangle of detections up; refine what passes the sequential test.
-
-    `work` counts triangles and candidates. Returns the last refinement, its bound, and whether it stands.
-    """
-    directions = observations.directions
-    none = nothing_refined()
-    i, j, k = corners
-    c0, c1, c2 = chord(directions, j, k), chord(directions, i, k), chord(directions, i, j)
-    s0, s1, s2, i, j, k = sorted_triangle(c0, c1, c2, i, j, k)
-    step = index.numbers[SIDE_STEP]
-    tolerance = settings[SEARCH_TOLERANCE]
-    spread = settings[SCALE_TOLERANCE]
-    longest = step * SIDE_STEPS
-    if s2 * (1.0 + spread) < index.numbers[SHORTEST_SIDE] or s0 * (1.0 - spread) > longest:
-        return none, 0.0, False
-    if s1 + s2 - s0 < tolerance:
-        return none, 0.0, False
-    work[0] += 1
-    bins = int(index.numbers[SIDE_BINS])
-    hand = handedness(directions, i, j, k)
-    low0, high0 = s0 * (1.0 - spread) - tolerance, min(s0 * (1.0 + spread) + tolerance, longest)
-    first_bin = max(int(low0 / longest * bins), 0)
-    last_bin = min(int(high0 / longest * bins), bins - 1)
-    mean_magnitude = (
-        observations.magnitudes[i] + observations.magnitudes[j] + observations.magnitudes[k]
-    ) / 3.0
-    gate = settings[MAGNITUDE_GATE]
-    sensor_frame = frame_of(directions[i], directions[j], directions[k])
-    for bin0 in range(first_bin, last_bin + 1):
-        ratio_low = max(bin0 * longest / bins - tolerance, low0) / s0 if spread > 0.0 else 1.0
-        ratio_high = min((bin0 + 1) * longest / bins + tolerance, high0) / s0 if spread > 0.0 else 1.0
-        low1 = max(int((s1 * ratio_low - tolerance) / longest * bins), 0)
-        high1 = min(int((s1 * ratio_high + tolerance) / longest * bins), bins - 1)
-        row = (hand * bins + bin0) * bins
-        for entry in range(index.bin_start[row + low1], index.bin_start[row + high1 + 1]):
-            p0 = index.sides[entry, 0] * step
-            if p0 < low0 or p0 > high0:
-                continue
-            scale = p0 / s0 if spread > 0.0 else 1.0
-            if abs(index.sides[entry, 1] * step - s1 * scale) > tolerance:
-                continue
-            if abs(index.sides[entry, 2] * step - s2 * scale) > tolerance:
-                continue
-            work[1] += 1
-            a = index.pattern_stars[index.corners[entry, 0]]
-            b = index.pattern_stars[index.corners[entry, 1]]
-            c = index.pattern_stars[index.corners[entry, 2]]
-            zero_point = (
-                index.magnitudes[a] + index.magnitudes[b] + index.magnitudes[c]
-            ) / 3.0 - mean_magnitude
-            if (
-                abs(index.magnitudes[a] - observations.magnitudes[i] - zero_point) > gate
-                or abs(index.magnitudes[b] - observations.magnitudes[j] - zero_point) > gate
-                or abs(index.magnitudes[c] - observations.magnitudes[k] - zero_point) > gate
-            ):
-                continue
-            if spread > 0.0:
-                sensor_frame = _scaled_frame(directions, i, j, k, scale)
-            rotation = rotation_between(
-                sensor_frame, frame_of(index.vectors[a], index.vectors[b], index.vectors[c])
-            )
-            if not worth_refining(
-                index,
-                observations,
-                rotation,
-                scale,
-                zero_point + gate,
-                settings[TEST_WINDOW],
-                odds,
-                order,
-                (i, j, k),
-            ):
-                continue
-            refined = refine(
-                index, observations, rotation, scale, spread > 0.0, settings[WINDOW],
-                zero_point, gate, settings[PX_PER_RAD], LEAST_MATCHED,
-            )  # fmt: skip
-            bound = judged(index, observations, refined, ROTATIONS, settings)
-            if bound < settings[LOG_CHANCE]:
-                return refined, bound, True
-    return none, 0.0, False
-
-
-@compiled
-def _scaled_frame(
-    directions: NDArray[np.float64], i: int, j: int, k: int, scale: float
-) -> NDArray[np.float64]:
-    """`frame_of` three detections seen with the focal length divided by `scale`."""
-    scaled = np.empty((3, 3))
-    for row, source in enumerate((i, j, k)):
-        x, y, z = directions[source, 0] * scale, directions[source, 1] * scale, directions[source, 2]
-        norm = math.sqrt(x * x + y * y + z * z)
-        scaled[row, 0], scaled[row, 1], scaled[row, 2] = x / norm, y / norm, z / norm
-    return frame_of(scaled[0], scaled[1], scaled[2])
-
-
-@compiled
-def search(
+@entry
+def identify_kernel(
     index: IndexArrays,
     params: NDArray[np.float64],
     xy: NDArray[np.float64],
     flux: NDArray[np.float64],
     sigmas: NDArray[np.float64],
     settings: NDArray[np.float64],
-) -> Outcome:
+) -> Answer:
     """Find the attitude of a set of detections without knowing anything of it."""
-    observations = observe(params, xy, flux, sigmas)
-    n = observations.directions.shape[0]
-    refined = nothing_refined()
-    work = np.zeros(2, dtype=np.int64)
-    if n < 4:
-        return Outcome(TOO_FEW, refined, observations.source, 0.0, 0, 0)
-    odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
+    given = observe(params, xy, flux, sigmas)
+    n = given.shape[0]
+    candidate = new_candidate(n)
+    tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
+    found = np.empty(MOST_FOUND, dtype=np.int64)
+    spread, tolerance = settings[SCALE_TOLERANCE], settings[SEARCH_TOLERANCE]
+    shortest = index.numbers[SHORTEST_SIDE] / (1.0 + spread)
+    longest = index.numbers[SIDE_STEP] * SIDE_STEPS / (1.0 - spread)
     limit = int(settings[MAX_TRIANGLES])
-    systematic = min(n, SYSTEMATIC)
-    for k in range(2, systematic):
-        for j in range(1, k):
-            for i in range(j):
-                refined, bound, found = _try_triangle(
-                    index, observations, (i, j, k), odds, order, settings, work
-                )
-                if found:
-                    return Outcome(ACCEPTED, refined, observations.source, bound, work[0], work[1])
-                if work[0] >= limit:
-                    return Outcome(NOTHING, refined, observations.source, 0.0, work[0], work[1])
-    choice = min(n, DRAWN_FROM)
-    if choice <= systematic:
-        return Outcome(NOTHING, refined, observations.source, 0.0, work[0], work[1])
-    state = np.uint64(88172645463325252)
-    for _ in range(8 * limit):
-        drawn = np.empty(3, dtype=np.int64)
-        for corner in range(3):
-            state ^= state << np.uint64(13)
-            state ^= state >> np.uint64(7)
-            state ^= state << np.uint64(17)
-            drawn[corner] = int(state % np.uint64(choice))
-        if drawn[0] == drawn[1] or drawn[0] == drawn[2] or drawn[1] == drawn[2]:
+    systematic, choice = min(n, SYSTEMATIC), min(n, DRAWN_FROM)
+    chords = chord_table(given, systematic)
+    i, j, k = 0, 0, 1
+    drawing = False
+    state = np.uint64(_SEED)
+    triangles, candidates = 0, 0
+    status, bound = NOTHING, 0.0
+    if n < LEAST_MATCHED:
+        status, limit = TOO_FEW, 0
+    for _ in range(4 * limit):
+        if not drawing:
+            i, j, k = _next_triangle(i, j, k)
+            if k == systematic:
+                if choice <= systematic:
+                    break
+                drawing = True
+                tolerance *= DRAWN_TOLERANCE
+                chords = chord_table(given, choice)
+        if drawing:
+            state, i, j, k = _drawn(state, choice)
+            if i in (j, k) or j == k:
+                continue
+        s0, s1, s2, a, b, c = sorted_triangle(chords[j, k], chords[i, k], chords[i, j], i, j, k)
+        if s2 < shortest or s0 > longest or s1 + s2 - s0 < tolerance:
             continue
-        refined, bound, found = _try_triangle(
-            index, observations, (drawn[0], drawn[1], drawn[2]), odds, order, settings, work
+        triangles += 1
+        hand = handedness(given, a, b, c)
+        count = _look_up(
+            index.patterns, index.bin_start, index.numbers, (s0, s1, s2), hand, tolerance, spread, found
         )
-        if found:
-            return Outcome(ACCEPTED, refined, observations.source, bound, work[0], work[1])
-        if work[0] >= limit:
+        if count > 0:
+            candidates += count
+            bound = _try_patterns(index, given, settings, candidate, tests, (a, b, c), s0, found, count)
+            if bound < 0.0:
+                status = ACCEPTED
+                break
+        if triangles >= limit:
             break
-    return Outcome(NOTHING, refined, observations.source, 0.0, work[0], work[1])
+    return finish(status, given, candidate, settings, bound, triangles, candidates)

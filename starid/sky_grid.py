@@ -14,14 +14,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.jit import compiled
+from starid.jit_kernels import entry, inner
 
 FACES: Final = 6
 _SLOPE_MARGIN: Final = 1.25
 """Safety on the linear bound of a cube coordinate's change with angle; holds for margins to 0.2 rad."""
 
 
-@compiled
+@inner
 def cell_of(x: float, y: float, z: float, n: int) -> int:
     """Cell number of a direction of any length, in a grid of n × n cells a face."""
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -37,7 +37,7 @@ def cell_of(x: float, y: float, z: float, n: int) -> int:
     return (face * n + i) * n + j
 
 
-@compiled
+@inner
 def _reach(vector: NDArray[np.float64], face: int, n: int, margin: float) -> tuple[int, int, int, int]:
     """First and last row and column of the cells of a face that lie within the margin of a star.
 
@@ -60,7 +60,7 @@ def _reach(vector: NDArray[np.float64], face: int, n: int, margin: float) -> tup
     return first_i, last_i, first_j, last_j
 
 
-@compiled
+@entry
 def _fill(vectors: NDArray[np.float64], n: int, margin: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Count, then list; see `build_sky_grid`."""
     start = np.zeros(FACES * n * n + 1, dtype=np.int32)

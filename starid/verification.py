@@ -26,10 +26,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.jit import compiled
-from starid.observation import Observations
-from starid.pattern_index import BINS_PER_MAGNITUDE, COUNT_CELLS, GRID_CELLS, IndexArrays, magnitude_bin
-from starid.refinement import Refined, residual
+from starid.jit_kernels import inner
+from starid.matching import residual
+from starid.observation import MAGNITUDE, SIGMA, Table, X, Y, Z
+from starid.pattern_index import (
+    BINS_PER_MAGNITUDE,
+    COUNT_CELLS,
+    GRID_CELLS,
+    STAR_MAGNITUDE,
+    IndexArrays,
+    magnitude_bin,
+)
+from starid.refinement import SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
+from starid.settings import FIELD_PX, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
 from starid.sky_grid import cell_of
 
 TRUE_SHARE: Final = 0.5
@@ -60,22 +69,23 @@ SCATTER_FLOOR: Final = 0.15
 """Least scatter of magnitudes believed in the judgement."""
 
 
-@compiled
+@inner
 def hit_odds(index: IndexArrays, window_rad: float) -> NDArray[np.float64]:
     """Logarithm of the odds that a hit gives, for each magnitude limit of the look-up (bins)."""
-    totals = index.counts[-1]
-    odds = np.empty(totals.shape[0])
-    for b in range(totals.shape[0]):
-        chance = min(0.25 * totals[b] * window_rad * window_rad + 1e-6, 0.9)
+    sky, bins = index.counts.shape[0] - 1, index.counts.shape[1]
+    odds = np.empty(bins)
+    for b in range(bins):
+        chance = min(0.25 * index.counts[sky, b] * window_rad * window_rad + 1e-6, 0.9)
         odds[b] = math.log(TRUE_SHARE / chance + 1.0 - TRUE_SHARE)
     return odds
 
 
-@compiled
+@inner
 def test_order(count: int) -> NDArray[np.int64]:
     """Order in which detections are tested: the brightest, and those of the fainter half, in turn.
 
-    The brightest are the most telling, but they are also where false stars gather.
+    The brightest are the most telling, but they are also where false stars gather. Each pattern begins at
+    another place of it, so that no handful of false stars can stop them all.
     """
     order = np.empty(count, dtype=np.int64)
     half = (count + 1) // 2
@@ -86,14 +96,14 @@ def test_order(count: int) -> NDArray[np.int64]:
     return order
 
 
-@compiled
+@inner
 def worth_refining(
     index: IndexArrays,
-    observations: Observations,
+    given: Table,
     rotation: NDArray[np.float64],
     scale: float,
     faintest_offset: float,
-    window_rad: float,
+    settings: NDArray[np.float64],
     odds: NDArray[np.float64],
     order: NDArray[np.int64],
     used: tuple[int, int, int],
@@ -113,130 +123,138 @@ def worth_refining(
     used : (int, int, int)
         Detections of the pattern.
     """
-    n = int(index.numbers[GRID_CELLS])
-    limit2 = window_rad * window_rad
+    stars, grid_start, grid_stars = index.stars, index.grid_start, index.grid_stars
+    cells = int(index.numbers[GRID_CELLS])
+    limit2 = settings[TEST_WINDOW] * settings[TEST_WINDOW]
     miss = math.log(1.0 - TRUE_SHARE)
     total = 0.0
     hits = 0
-    a, b, c = rotation[0], rotation[1], rotation[2]
-    for step in range(min(order.shape[0], MAX_TESTED)):
-        i = order[step]
+    count = order.shape[0]
+    place = (used[0] + used[1] + used[2]) % count
+    for _ in range(min(count, MAX_TESTED)):
+        i = order[place]
+        place += 1
+        if place == count:
+            place = 0
         if i == used[0] or i == used[1] or i == used[2]:
             continue
-        u, v, w = (
-            observations.directions[i, 0],
-            observations.directions[i, 1],
-            observations.directions[i, 2],
-        )
+        u, v, w = given[i, X] * scale, given[i, Y] * scale, given[i, Z]
+        x = rotation[0, 0] * u + rotation[1, 0] * v + rotation[2, 0] * w
+        y = rotation[0, 1] * u + rotation[1, 1] * v + rotation[2, 1] * w
+        z = rotation[0, 2] * u + rotation[1, 2] * v + rotation[2, 2] * w
         if scale != 1.0:
-            u, v = u * scale, v * scale
-            norm = 1.0 / math.sqrt(u * u + v * v + w * w)
-            u, v, w = u * norm, v * norm, w * norm
-        x = a[0] * u + b[0] * v + c[0] * w
-        y = a[1] * u + b[1] * v + c[1] * w
-        z = a[2] * u + b[2] * v + c[2] * w
-        faintest = observations.magnitudes[i] + faintest_offset
-        cell = cell_of(x, y, z, n)
+            norm = 1.0 / math.sqrt(x * x + y * y + z * z)
+            x, y, z = x * norm, y * norm, z * norm
+        faintest = given[i, MAGNITUDE] + faintest_offset
+        cell = cell_of(x, y, z, cells)
         hit = False
-        for entry in range(index.grid_start[cell], index.grid_start[cell + 1]):
-            star = index.grid_stars[entry]
-            if index.magnitudes[star] > faintest:
+        for entry in range(grid_start[cell], grid_start[cell + 1]):
+            star = grid_stars[entry]
+            if stars[star, STAR_MAGNITUDE] > faintest:
                 break
-            dx = index.vectors[star, 0] - x
-            dy = index.vectors[star, 1] - y
-            dz = index.vectors[star, 2] - z
+            dx, dy, dz = stars[star, 0] - x, stars[star, 1] - y, stars[star, 2] - z
             if dx * dx + dy * dy + dz * dz < limit2:
                 hit = True
                 break
-        if hit:
-            total += odds[magnitude_bin(faintest, odds.shape[0])]
-            hits += 1
-            if total > ACCEPT_ABOVE and hits > 1:
-                return True
-        else:
-            total += miss
-            if total < REJECT_BELOW:
-                return False
+        total += odds[magnitude_bin(faintest, odds.shape[0])] if hit else miss
+        hits += 1 if hit else 0
+        if total < REJECT_BELOW:
+            return False
+        if total > ACCEPT_ABOVE and hits > 1:
+            return True
     return total > 0.0 and hits > 0
 
 
-@compiled
-def _stars_per_magnitude(counts: NDArray[np.int32], magnitude: float) -> float:
+@inner
+def _stars_per_magnitude(counts: NDArray[np.int32], cell: int, magnitude: float) -> float:
     """Catalogue stars a magnitude in a field, smoothed over one magnitude; at least one."""
-    bins = counts.shape[0]
+    bins = counts.shape[1]
     middle = magnitude_bin(magnitude, bins)
     low, high = middle - BINS_PER_MAGNITUDE // 2 - 1, min(middle + BINS_PER_MAGNITUDE // 2, bins - 1)
-    stars = float(counts[high])
+    stars = float(counts[cell, high])
     if low >= 0:
-        stars -= counts[low]
-    return max(stars * BINS_PER_MAGNITUDE / (high - max(low, -1)), 1.0)
+        stars -= counts[cell, low]
+    return float(max(stars * BINS_PER_MAGNITUDE / (high - max(low, -1)), 1.0))
 
 
-@compiled
+@inner
+def _log_detections(
+    index: IndexArrays,
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    numbers: NDArray[np.float64],
+    field_px: float,
+) -> float:
+    """Logarithm of the product over the detections, averaged over `SHARES`; see the module."""
+    star_table, counts = index.stars, index.counts
+    cell = cell_of(rotation[2, 0], rotation[2, 1], rotation[2, 2], COUNT_CELLS)
+    scatter = max(numbers[SCATTER], SCATTER_FLOOR)
+    totals = np.zeros(len(SHARES))
+    for i in range(stars.shape[0]):
+        gain = 0.0
+        star = stars[i]
+        if star >= 0:
+            magnitude = star_table[star, STAR_MAGNITUDE]
+            r0, r1, _, _, _ = residual(star_table, seen, rotation, i, star)
+            spread2 = numbers[VARIANCE] * seen[i, SIGMA] * seen[i, SIGMA]
+            here = math.exp(-0.5 * (r0 * r0 + r1 * r1) / spread2) / (2.0 * math.pi * spread2)
+            deviation = (magnitude - seen[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
+            brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
+            weight = min(brightness / _stars_per_magnitude(counts, cell, magnitude), 1.0)
+            gain = field_px * weight * here
+        for k in range(len(SHARES)):
+            totals[k] += math.log(1.0 - SHARES[k] + SHARES[k] * gain)
+    best = totals[0]
+    for k in range(1, len(SHARES)):
+        best = max(best, totals[k])
+    mean = 0.0
+    for k in range(len(SHARES)):
+        mean += math.exp(totals[k] - best) / len(SHARES)
+    return float(best + math.log(mean))
+
+
+@inner
 def log_false_probability(
     index: IndexArrays,
-    observations: Observations,
-    refined: Refined,
-    sigmas_known: bool,
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    matched: int,
+    normal: NDArray[np.float64],
+    numbers: NDArray[np.float64],
+    settings: NDArray[np.float64],
     prior_volume: float,
-    scale_range: float,
-    field_px: float,
 ) -> float:
     """Logarithm of the bound on the probability that an agreement is chance; see the module.
 
     Parameters
     ----------
-    observations : Observations
-        As the refined attitude sees them (rescaled where the focal length was free).
+    seen : Table
+        Detections as the refined attitude sees them (rescaled where the focal length was free).
+    rotation, stars, matched, normal, numbers
+        As `starid.refinement.refine` leaves them.
     prior_volume : float
         Volume of the rotations that were possible beforehand, rad³: `ROTATIONS` when lost in space.
-    scale_range : float
-        Range of the logarithm of the scale that was possible beforehand; 0 where it was known.
-    field_px : float
-        Pixels in the field.
     """
-    m = refined.matched
-    unknowns = 4 if scale_range > 0.0 else 3
-    freedom = 2 * m - unknowns
-    if freedom <= 0:
-        return 0.0
-    boresight = refined.rotation[2]
-    counts = index.counts[cell_of(boresight[0], boresight[1], boresight[2], COUNT_CELLS)]
-    variance = refined.variance
-    scatter = max(refined.magnitude_sigma, SCATTER_FLOOR)
-    totals = np.zeros(len(SHARES))
-    for i in range(refined.stars.shape[0]):
-        gain = 0.0
-        star = refined.stars[i]
-        if star >= 0:
-            rx, ry, _, _, _ = residual(index, observations, refined.rotation, i, star)
-            spread2 = variance * observations.sigmas[i] * observations.sigmas[i]
-            here = math.exp(-0.5 * (rx * rx + ry * ry) / spread2) / (2.0 * math.pi * spread2)
-            deviation = (index.magnitudes[star] - observations.magnitudes[i] - refined.zero_point) / scatter
-            brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
-            weight = min(brightness / _stars_per_magnitude(counts, index.magnitudes[star]), 1.0)
-            gain = field_px * weight * here
-        for k in range(len(SHARES)):
-            totals[k] += math.log(1.0 - SHARES[k] + SHARES[k] * gain)
-    best = totals.max()
-    mean = 0.0
-    for k in range(len(SHARES)):
-        mean += math.exp(totals[k] - best) / len(SHARES)
-    log_factor = best + math.log(mean)
-    n = refined.normal
+    spread = settings[SCALE_TOLERANCE]
+    freedom = 2 * matched - (4 if spread > 0.0 else 3)
+    variance = numbers[VARIANCE]
     determinant = (
-        n[0, 0] * (n[1, 1] * n[2, 2] - n[1, 2] * n[2, 1])
-        - n[0, 1] * (n[1, 0] * n[2, 2] - n[1, 2] * n[2, 0])
-        + n[0, 2] * (n[1, 0] * n[2, 1] - n[1, 1] * n[2, 0])
+        normal[0, 0] * (normal[1, 1] * normal[2, 2] - normal[1, 2] * normal[2, 1])
+        - normal[0, 1] * (normal[1, 0] * normal[2, 2] - normal[1, 2] * normal[2, 0])
+        + normal[0, 2] * (normal[1, 0] * normal[2, 1] - normal[1, 1] * normal[2, 0])
     )
-    if not (determinant > 0.0 and variance > 0.0):
+    if freedom <= 0 or not (determinant > 0.0 and variance > 0.0):
         return 0.0
+    log_factor = _log_detections(index, seen, rotation, stars, numbers, settings[FIELD_PX])
     half_volume = 1.5 * math.log(2.0 * math.pi * variance) - 0.5 * math.log(determinant)
     log_factor += min(half_volume - math.log(prior_volume), 0.0)
-    log_factor += min(math.log(math.sqrt(2.0 * math.pi / m) * scatter / ZERO_POINT_RANGE), 0.0)
-    if not sigmas_known:
+    scatter = max(numbers[SCATTER], SCATTER_FLOOR)
+    log_factor += min(math.log(math.sqrt(2.0 * math.pi / matched) * scatter / ZERO_POINT_RANGE), 0.0)
+    if settings[SIGMAS_KNOWN] == 0.0:
         log_factor += min(math.log(math.sqrt(math.pi / freedom) / NOISE_RANGE), 0.0)
-    if scale_range > 0.0:
-        error = math.sqrt(variance * refined.scale_variance)
-        log_factor += min(math.log(math.sqrt(2.0 * math.pi) * error / scale_range), 0.0)
+    if spread > 0.0:
+        error = math.sqrt(variance * numbers[SCALE_VARIANCE])
+        log_factor += min(math.log(math.sqrt(2.0 * math.pi) * error / (2.0 * spread)), 0.0)
     return min(-log_factor, 0.0)
