@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.jit_kernels import inner
-from starid.observation import SIGMA, SOURCE, Table, rescale
+from starid.observation import SIGMA_U, SIGMA_V, SOURCE, Table, rescale
 from starid.pattern_index import IndexArrays
 from starid.refinement import (
     NUMBERS,
@@ -194,7 +194,7 @@ def finish(
         if candidate.stars[i] >= 0:
             pairs[0, filled] = np.int64(given[i, SOURCE])
             pairs[1, filled] = candidate.stars[i]
-            mean_sigma2 += given[i, SIGMA] * given[i, SIGMA] / m
+            mean_sigma2 += 0.5 * (given[i, SIGMA_U] ** 2 + given[i, SIGMA_V] ** 2) / m
             filled += 1
     freedom = float(max(2 * m - (4 if settings[SCALE_TOLERANCE] > 0.0 else 3), 1))
     variance = numbers[VARIANCE]

@@ -219,8 +219,9 @@ class Identifier:
             Positions, pixels.
         flux : array (n,)
             Brightness in any linear unit.
-        xy_sigma_px : array (n,), optional
-            One-sigma error of each position per axis, pixels; estimated from the residuals when not given.
+        xy_sigma_px : array (n,) or (n, 2), optional
+            One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
+            the residuals when not given.
 
         Raises
         ------
@@ -338,12 +339,14 @@ def _checked(
         raise StaridError(
             f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
         )
-    if xy_sigma_px is None:
-        sigmas = np.ones(n)
-    else:
-        sigmas = np.array(xy_sigma_px, dtype=np.float64, order="C")
-        if sigmas.shape != (n,):
-            raise StaridError(f"detections: errors {sigmas.shape} given for {n} positions, (n,) needed")
+    sigmas = np.ones((n, 2))
+    if xy_sigma_px is not None:
+        given = np.asarray(xy_sigma_px, dtype=np.float64)
+        if given.shape not in {(n,), (n, 2)}:
+            raise StaridError(
+                f"detections: errors {given.shape} given for {n} positions, (n,) or (n, 2) needed"
+            )
+        sigmas[:] = given if given.ndim == 2 else given[:, None]
         if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):
             raise StaridError("detections: every position error must be finite and positive")
     if not (np.isfinite(xy).all() and np.isfinite(brightness).all()):

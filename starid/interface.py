@@ -50,8 +50,9 @@ class StarIdentifier(Protocol):
             Positions, pixels.
         flux : array (n,)
             Brightness in any linear unit.
-        xy_sigma_px : array (n,), optional
-            One-sigma error of each position per axis, pixels; estimated from the residuals when not given.
+        xy_sigma_px : array (n,) or (n, 2), optional
+            One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
+            the residuals when not given.
         """
         ...
 

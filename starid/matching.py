@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from starid.jit_kernels import inner
 from starid.observation import (
     MAGNITUDE,
-    SIGMA,
+    SIGMA_U,
+    SIGMA_V,
     U_X,
     U_Y,
     U_Z,
@@ -102,10 +103,11 @@ def _best_star(
     """Likeliest star for detection i and its cost, −1 where there is none; see `match_detections`."""
     star_table, grid_start, grid_stars = index.stars, index.grid_start, index.grid_stars
     reach, sigma, gate, px_per_rad = windows
-    error = reach / 3.0
+    error_u, error_v = reach / WINDOW_SIGMAS, reach / WINDOW_SIGMAS
     if reach == BY_NOISE:
-        error = sigma * seen[i, SIGMA]
-        reach = max(WINDOW_SIGMAS * error, SMALLEST_WINDOW_PX)
+        least = SMALLEST_WINDOW_PX / WINDOW_SIGMAS
+        error_u, error_v = max(sigma * seen[i, SIGMA_U], least), max(sigma * seen[i, SIGMA_V], least)
+        reach = WINDOW_SIGMAS * max(error_u, error_v)
     limit = min(reach / px_per_rad, index.numbers[GRID_MARGIN])
     x, y, z = to_sky(rotation, seen, i)
     expected = seen[i, MAGNITUDE] + zero_point
@@ -120,9 +122,9 @@ def _best_star(
         if deviation < -gate or dx * dx + dy * dy + dz * dz > limit * limit:
             continue
         r0, r1, _, _, _ = residual(star_table, seen, rotation, i, star)
-        distance2 = r0 * r0 + r1 * r1
-        cost = distance2 / (error * error) + (deviation / scatter) ** 2
-        if distance2 <= reach * reach and cost < best_cost:
+        distance2 = (r0 / error_u) ** 2 + (r1 / error_v) ** 2
+        cost = distance2 + (deviation / scatter) ** 2
+        if distance2 <= WINDOW_SIGMAS * WINDOW_SIGMAS and cost < best_cost:
             best, best_cost = star, cost
     return best, best_cost
 

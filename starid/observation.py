@@ -35,11 +35,12 @@ V_Z: Final = 8
 """Derivative of the row by the direction, pixels per unit."""
 MAGNITUDE: Final = 9
 """−2.5·log10(flux)."""
-SIGMA: Final = 10
-"""One-sigma error of the position per axis, pixels, or in units of an unknown common one."""
-SOURCE: Final = 11
+SIGMA_U: Final = 10
+SIGMA_V: Final = 11
+"""One-sigma errors of column and row, pixels, or in units of an unknown common one."""
+SOURCE: Final = 12
 """Row of the detection as given."""
-COLUMNS: Final = 12
+COLUMNS: Final = 13
 
 FAINTEST: Final = 99.0
 """Instrumental magnitude of a detection without positive flux."""
@@ -90,7 +91,7 @@ def observe(
         table[n, V_Y] = fy * (j12 * ay + j22 * by)
         table[n, V_Z] = fy * (j12 * az + j22 * bz)
         table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
-        table[n, SIGMA] = sigmas[row]
+        table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
         table[n, SOURCE] = row
         n += 1
     return table[:n]
@@ -114,8 +115,5 @@ def rescale(given: Table, scale: float, seen: Table) -> None:
             given[i, V_Y] * lateral,
             given[i, V_Z] * norm,
         )
-        seen[i, MAGNITUDE], seen[i, SIGMA], seen[i, SOURCE] = (
-            given[i, MAGNITUDE],
-            given[i, SIGMA],
-            given[i, SOURCE],
-        )
+        for column in range(MAGNITUDE, COLUMNS):
+            seen[i, column] = given[i, column]

@@ -24,7 +24,8 @@ from starid.matching import (
 )
 from starid.observation import (
     MAGNITUDE,
-    SIGMA,
+    SIGMA_U,
+    SIGMA_V,
     U_X,
     U_Y,
     U_Z,
@@ -146,12 +147,13 @@ def normal_equations(
         slopes[1, 0], slopes[1, 1], slopes[1, 2] = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
         slopes[0, 3] = uz * dz * lateral2 - (ux * dx + uy * dy) * (1.0 - lateral2)
         slopes[1, 3] = vz * dz * lateral2 - (vx * dx + vy * dy) * (1.0 - lateral2)
-        weight = 1.0 / (seen[i, SIGMA] * seen[i, SIGMA])
-        chi2 += weight * (r0 * r0 + r1 * r1)
+        weight_u, weight_v = 1.0 / seen[i, SIGMA_U] ** 2, 1.0 / seen[i, SIGMA_V] ** 2
+        chi2 += weight_u * r0 * r0 + weight_v * r1 * r1
         for a in range(4):
-            right[a] += weight * (slopes[0, a] * r0 + slopes[1, a] * r1)
+            at_u, at_v = weight_u * slopes[0, a], weight_v * slopes[1, a]
+            right[a] += at_u * r0 + at_v * r1
             for b in range(a + 1):
-                normal[a, b] += weight * (slopes[0, a] * slopes[0, b] + slopes[1, a] * slopes[1, b])
+                normal[a, b] += at_u * slopes[0, b] + at_v * slopes[1, b]
     for a in range(4):
         for b in range(a):
             normal[b, a] = normal[a, b]
@@ -194,7 +196,7 @@ def distances(
     for i in range(count):
         if stars[i] >= 0:
             r0, r1, _, _, _ = residual(star_table, seen, rotation, i, stars[i])
-            scratch[m] = math.sqrt(r0 * r0 + r1 * r1) / seen[i, SIGMA]
+            scratch[m] = math.sqrt((r0 / seen[i, SIGMA_U]) ** 2 + (r1 / seen[i, SIGMA_V]) ** 2)
             total += r0 * r0 + r1 * r1
             m += 1
     return middle_value(scratch, m) / _RAYLEIGH_MEDIAN, math.sqrt(total / max(m, 1))

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from starid.jit_kernels import inner
 from starid.matching import residual
-from starid.observation import MAGNITUDE, SIGMA, Table, X, Y, Z
+from starid.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z
 from starid.pattern_index import (
     BINS_PER_MAGNITUDE,
     COUNT_CELLS,
@@ -190,6 +190,7 @@ def _log_detections(
     star_table, counts = index.stars, index.counts
     cell = cell_of(rotation[2, 0], rotation[2, 1], rotation[2, 2], COUNT_CELLS)
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
+    deviation_of_one = math.sqrt(numbers[VARIANCE])
     totals = np.zeros(len(SHARES))
     for i in range(stars.shape[0]):
         gain = 0.0
@@ -197,8 +198,8 @@ def _log_detections(
         if star >= 0:
             magnitude = star_table[star, STAR_MAGNITUDE]
             r0, r1, _, _, _ = residual(star_table, seen, rotation, i, star)
-            spread2 = numbers[VARIANCE] * seen[i, SIGMA] * seen[i, SIGMA]
-            here = math.exp(-0.5 * (r0 * r0 + r1 * r1) / spread2) / (2.0 * math.pi * spread2)
+            su, sv = deviation_of_one * seen[i, SIGMA_U], deviation_of_one * seen[i, SIGMA_V]
+            here = math.exp(-0.5 * ((r0 / su) ** 2 + (r1 / sv) ** 2)) / (2.0 * math.pi * su * sv)
             deviation = (magnitude - seen[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
             brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
             weight = min(brightness / _stars_per_magnitude(counts, cell, magnitude), 1.0)
