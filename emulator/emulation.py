@@ -303,7 +303,7 @@ class Emulation:
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError, EmulatorError):
                     await task
-        for link in (self.serial, self.can, self.canopen):
+        for link in (self.serial, self.canopen, self.can):  # the bus may be a hub that the CAN link holds
             if link is not None:
                 await link.close()
         if self.control is not None:
