@@ -24,6 +24,7 @@ from emulator.links.serial import SerialLink
 from emulator.modes import Mode
 from emulator.profile import Profile
 from emulator.pump import ClockPump, StepPump
+from emulator.scenario import load_scenario
 from emulator.state_store import FileStore, MemoryStore, StateStore
 from emulator.truth import TruthSource
 from emulator.truth_config import LiveConfig, TruthConfig
@@ -55,10 +56,13 @@ class RunOptions:
         CSV file of truth and measurement a frame.
     control
         `off`, `auto` (a free port on loopback) or HOST:PORT.
+    scenario
+        Name or path of a scenario; empty: none.
     """
 
     truth_log: Path | None = None
     control: str = "off"
+    scenario: str = ""
 
 
 class Emulation:
@@ -148,6 +152,8 @@ class Emulation:
             device.on_frame.append(truth_log.write)
             self._closers.append(truth_log.close)
         device.on_frame.append(_log_frame)
+        if self.options.scenario:
+            load_scenario(self.options.scenario).enter(self)
         device.power_on()
         await self._open_links(device)
         if isinstance(self.clock, SteppedClock):

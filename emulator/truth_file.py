@@ -7,6 +7,9 @@ The file is CSV with one header line. Columns, in any order:
 - if known, ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them the rate between two rows is
   the constant one that leads from the first to the second.
 
+A truth log (`starhil run --truth-log`) is such a file too: its ``run_time_s``, ``true_qx`` … ``true_qw`` and ``true_wx_deg_s`` …
+stand for the columns above and its other columns are passed over, so that a run can be replayed.
+
 Empty lines and lines that begin with ``#`` are passed over.
 """
 
@@ -27,6 +30,12 @@ from starid.attitude import Attitude, interpolate, rate_between
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
 ANGLE_COLUMNS: Final = ("ra_deg", "dec_deg", "roll_deg")
 RATE_COLUMNS: Final = ("wx_deg_s", "wy_deg_s", "wz_deg_s")
+
+LOG_COLUMNS: Final = {
+    "run_time_s": "t",
+    **{f"true_{name}": name for name in (*QUATERNION_COLUMNS, *RATE_COLUMNS)},
+}
+"""Columns of a truth log → what they are here."""
 
 NORM_TOLERANCE: Final = 0.01
 """A quaternion whose length is off by more than this is taken for a mistake, not for rounding."""
@@ -117,6 +126,8 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     if not lines:
         raise EmulatorError(f"truth file {path}: empty; the first line names the columns, e.g. t,qx,qy,qz,qw")
     columns = [name.strip() for name in next(csv.reader([lines[0][1]]))]
+    if "run_time_s" in columns and "true_qx" in columns:
+        columns = [LOG_COLUMNS.get(name, "") for name in columns]
     needed = _attitude_columns(path, columns)
     has_rates = all(name in columns for name in RATE_COLUMNS)
     times: list[float] = []
@@ -139,7 +150,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
 
 def _attitude_columns(path: Path, columns: list[str]) -> tuple[str, ...]:
     known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS}
-    unknown = [name for name in columns if name not in known]
+    unknown = [name for name in columns if name not in known | {""}]
     if unknown:
         raise EmulatorError(
             f"truth file {path} line 1: unknown column {unknown[0]!r}; known: {', '.join(sorted(known))}"
@@ -158,6 +169,8 @@ def _row(where: str, columns: list[str], line: str) -> dict[str, float]:
         raise EmulatorError(f"{where}: {len(cells)} values for {len(columns)} columns")
     row: dict[str, float] = {}
     for name, cell in zip(columns, cells, strict=True):
+        if not name:
+            continue
         try:
             row[name] = float(cell)
         except ValueError:

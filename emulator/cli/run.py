@@ -31,6 +31,10 @@ def command(
     truth_log: Annotated[
         Path | None, typer.Option(help="CSV file of truth and measurement, a row a frame.")
     ] = None,
+    scenario: Annotated[
+        str,
+        typer.Option(help="Scenario file, or a name of configs/scenarios: faults and truths by run time."),
+    ] = "",
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value over the profile; may be repeated.")
     ] = None,
@@ -73,7 +77,7 @@ def command(
     async def run() -> None:
         import signal
 
-        emulation = Emulation(loaded, RunOptions(truth_log, control), worker=worker)
+        emulation = Emulation(loaded, RunOptions(truth_log, control, scenario), worker=worker)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, emulation.ended.set)

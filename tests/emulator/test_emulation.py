@@ -11,7 +11,9 @@ from emulator.emulation import Emulation, RunOptions
 from emulator.errors import EmulatorError
 from emulator.frames import Warm
 from emulator.imager import DirectImager, ProcessImager
-from emulator.profile import Profile, RunConfig
+from emulator.profile import Profile, RunConfig, configs_folder
+from emulator.scenario import load_scenario
+from emulator.truth_file import read_truth_file
 from emulator.truth_log import COLUMNS
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
@@ -281,6 +283,87 @@ def test_the_truth_log_has_a_row_a_frame(run, tmp_path):
     assert float(records[0]["cross_boresight_arcsec"]) < 1e-3
     assert records[-1]["measured_qx"] == ""
     assert records[-1]["reason"] == "no_match"
+
+
+def test_a_truth_log_can_be_replayed(run, tmp_path):
+    path = tmp_path / "truth.csv"
+    rate = {"kind": "rate", "attitude": {"ra_deg": 10.0, "dec_deg": 20.0}, "rate_deg_s": [0.1, 0.2, 0.3]}
+    wanted = []
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+        await emulation.stepper.step(5.0)
+        wanted.append(emulation.device.cycle.truth.state(2.4))
+
+    run(scenario, options=RunOptions(truth_log=path), truth=rate)
+    replayed = read_truth_file(path).state(2.4)
+    assert replayed.attitude.error_to(wanted[0].attitude).total_arcsec < 1e-3
+    assert replayed.rate_rad_s == pytest.approx(wanted[0].rate_rad_s, rel=1e-5)
+
+
+def test_a_scenario_happens_at_its_run_times(run, tmp_path):
+    path = tmp_path / "day.toml"
+    path.write_text(
+        """
+        [[at]]
+        run_time_s = 3.0
+        clear_faults = true
+        truth = { kind = "fixed", attitude = { ra_deg = 10.0, dec_deg = 20.0 } }
+        [[at]]
+        run_time_s = 2.0
+        fault = { device = { stuck = true }, optical = { false_stars = 3 } }
+        [[at]]
+        run_time_s = 4.0
+        fault = { can = { drop = 1.0 } }
+        """
+    )
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.99)
+        assert not emulation.device.deaf
+        await emulation.stepper.step(0.02)
+        assert emulation.faults.describe() == {"optical": {"false_stars": 3}, "device": {"stuck": True}}
+        await emulation.stepper.step(1.0)
+        assert emulation.faults.describe() == {}
+        assert emulation.device.cycle.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
+        await emulation.stepper.step(2.0)  # there is no CAN link to break: told in the log, and no more
+
+    run(scenario, options=RunOptions(scenario=str(path)))
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
+def test_every_scenario_of_the_product_is_valid(name):
+    assert load_scenario(name).name == name
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "at: field required"),
+        ("[[at]]\nrun_time_s = 1.0\n", "give fault, truth or clear_faults"),
+        (
+            "[[at]]\nrun_time_s = 1.0\nfault = { optical = { false_star = 1 } }\n",
+            "did you mean 'false_stars'?",
+        ),
+        ("[[at]]\nrun_time_s = 1.0\ntruth = { kind = 'live' }\n", "live feed"),
+        ("[[at]]\nrun_time_s = -1.0\nclear_faults = true\n", "run_time_s"),
+        ("[[at", "not TOML"),
+    ],
+)
+def test_a_bad_scenario_is_named_with_file_and_key(tmp_path, text, said):
+    path = tmp_path / "day.toml"
+    path.write_text(text)
+    with pytest.raises(EmulatorError) as refusal:
+        load_scenario(str(path))
+    assert said in str(refusal.value)
+    assert str(path) in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_unknown_scenario_tells_the_known_ones():
+    with pytest.raises(EmulatorError, match="bad_day"):
+        load_scenario("bad_dya")
 
 
 def test_quit_ends_the_run(run):
