@@ -17,7 +17,7 @@ given, comes back in the answer. An answer has `ok`; where that is false, `error
 ``quit``                  end the emulator as SIGTERM does
 ========================  =======================================================================================
 
-Faults: `optical` = fields of the sky's objects (false_stars, missing_stars, blocked_share, …); `device` = stuck (requests are
+Faults: `optical` = fields of `emulator.sky_objects.SkyObjects` (false_stars, missing_stars, moon, …) or blocked_share; `device` = stuck (requests are
 neither taken nor answered), error (a name of the enumeration `device_error`: enter the error mode), reset (a name of `reset_cause`:
 restart now); `serial` and `can` = drop, corrupt, junk (chances 0 … 1), delay_s, split (bytes a piece, serial only), gap_s.
 """

@@ -249,7 +249,10 @@ class Emulation:
 
     async def _warm_up(self) -> None:
         """Wait for the pipeline, then wait for boot to end; start the pipeline anew when it ends by itself."""
-        self.warm = await self.imager.start()
+        try:
+            self.warm = await self.imager.start()
+        except EmulatorError as error:
+            raise EmulatorError(f"profile {self.profile.source}: {error}") from None
         log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
         self.imager.on_failure = self._pipeline_failed
         device = self.device
@@ -329,6 +332,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
     return PipelineSetup(
         camera=profile.camera.values(),
         sensor=dict(profile.sensor),
+        sky=dict(profile.sky),
         identifier=dict(profile.identifier),
         catalog_path=str(profile.folder / Path(path).expanduser()) if path else "",
         epoch=profile.catalog.epoch,

@@ -4,28 +4,37 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from emulator.errors import EmulatorError
 from emulator.links.wire_faults import WireFaultSettings
+from emulator.sky_objects import SkyObjects
 from emulator.truth_config import Strict
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation
 
+
+def check_sky(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values if sky objects can be made of them.
+
+    Raises
+    ------
+    ValueError
+        Names the key and what is allowed.
+    """
+    try:
+        SkyObjects.from_dict(values)
+    except EmulatorError as error:
+        raise ValueError(str(error)) from None
+    return values
+
+
+SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
+"""Fields of `SkyObjects` as TOML and JSON hold them."""
+
 Chance = Annotated[float, Field(ge=0.0, le=1.0)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
-
-
-class OpticalFault(Strict):
-    """What goes wrong in what the sensor sees."""
-
-    false_stars: Annotated[int, Field(ge=0, le=1000)] = 0
-    """Bright points that are no stars, at other places in every frame."""
-    missing_stars: Annotated[int, Field(ge=0, le=1000)] = 0
-    """So many of the brightest stars in the field are not seen."""
-    blocked_share: Chance = 0.0
-    """Share of the field that is covered."""
 
 
 class DeviceFault(Strict):
@@ -57,7 +66,8 @@ class WireFault(Strict):
 class FaultRequest(Strict):
     """One `fault` request; what is not given stays as it is."""
 
-    optical: OpticalFault | None = None
+    optical: SkyValues | None = None
+    """What the sensor sees besides the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
     serial: WireFault | None = None
     can: WireFault | None = None
@@ -81,7 +91,7 @@ class Faults:
         self._check(request)
         device = self._emulation.device
         if request.optical is not None:
-            self._optical = request.optical.model_dump(exclude_defaults=True)
+            self._optical = dict(request.optical)
             device.cycle.faults = lambda _index: self._optical
         if request.serial is not None and self._emulation.serial is not None:
             self._emulation.serial.wire.settings = request.serial.settings()

@@ -28,8 +28,8 @@ class PipelineSetup:
 
     Attributes
     ----------
-    camera, sensor, identifier
-        Values of the camera, fields of the sensor model and options of the algorithm, by name.
+    camera, sensor, sky, identifier
+        Values of the camera, fields of the sensor model, of the sky's objects and options of the algorithm, by name.
     catalog_path, epoch
         The catalogue's file (empty: the installed one) and the Julian year of its positions.
     algorithm
@@ -40,6 +40,7 @@ class PipelineSetup:
 
     camera: dict[str, Any]
     sensor: dict[str, Any]
+    sky: dict[str, Any]
     identifier: dict[str, Any]
     catalog_path: str
     epoch: float
@@ -91,7 +92,7 @@ class FrameRequest:
     settings
         Parameters of detection and identification.
     faults
-        Optical faults by name, as the control channel sets them.
+        Fields of the sky's objects that take the place of the run's own, as the control channel sets them.
     """
 
     index: int

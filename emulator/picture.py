@@ -23,6 +23,7 @@ from emulator.frames import (
 )
 from emulator.sensor import Frame, Renderer
 from emulator.sensor_model import SensorModel
+from emulator.sky_objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
@@ -72,6 +73,7 @@ class Picture:
         self._renderer = Renderer(self.camera, self.catalog, self._sensor, setup.seed)
         self._identifier: StarIdentifier | None = None
         self._identifier_key: object = None
+        self._sky = SkyObjects.from_dict(setup.sky)
         self._last: Frame | None = None
 
     def warm_up(self) -> None:
@@ -116,8 +118,9 @@ class Picture:
         if sensor.gain != self._renderer.sensor.gain:
             self._renderer = self._renderer.with_sensor(sensor)
         attitude = Attitude(np.array(request.attitude_xyzw))
+        sky = SkyObjects.from_dict({**self._setup.sky, **request.faults}) if request.faults else self._sky
         frame = self._renderer.render(
-            attitude, request.rate_rad_s, request.index, exposure_s=request.exposure_s
+            attitude, request.rate_rad_s, request.index, exposure_s=request.exposure_s, objects=sky
         )
         self._last = frame
         rendered = time.perf_counter()
@@ -213,7 +216,7 @@ class Picture:
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
             detected=len(found.flux),
-            refused=int(getattr(found, "refused", 0)),
+            refused=found.refused,
             matched=solution.star_count,
             stars=tuple(stars[:STARS_SENT]),
             probability_false=solution.probability_false if valid else 1.0,
@@ -237,7 +240,12 @@ class Picture:
 
 def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
     """Detection as the device's parameters set it."""
-    return sensor.detection_settings(threshold_sigma=settings.detection_threshold)
+    return sensor.detection_settings(
+        threshold_sigma=settings.detection_threshold,
+        pixel_sigma=settings.star_threshold,
+        min_star_pixels=settings.min_star_pixels,
+        max_star_pixels=settings.max_star_pixels,
+    )
 
 
 def own_camera(optics: Camera, settings: SolverSettings) -> Camera:

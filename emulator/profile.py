@@ -139,6 +139,8 @@ class Profile(Strict):
     camera: CameraConfig = CameraConfig()
     sensor: dict[str, Any] = Field(default_factory=dict)
     """Fields of `emulator.sensor_model.SensorModel`, but for those that are parameters of the device."""
+    sky: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `emulator.sky_objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
@@ -150,12 +152,17 @@ class Profile(Strict):
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Parameters of the device by the names of the interface definition: its defaults in this profile."""
 
-    _folder: Path = PrivateAttr(default_factory=Path)
+    _source: Path | None = PrivateAttr(default=None)
+
+    @property
+    def source(self) -> str:
+        """How messages name the profile: by its file, if it came from one."""
+        return self.name if self._source is None else str(self._source)
 
     @property
     def folder(self) -> Path:
         """Folder of the profile's file, from which its relative paths count."""
-        return self._folder
+        return Path() if self._source is None else self._source.parent
 
 
 ALTERNATIVES: Final = (
@@ -223,7 +230,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
             raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
-    profile._folder = path.parent  # noqa: SLF001 (not a key of the file)
+    profile._source = path  # noqa: SLF001 (not a key of the file)
     return profile
 
 
