@@ -11,6 +11,7 @@ import multiprocessing as mp
 import random
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -27,6 +28,11 @@ DEVICE: Final = 4
 TALKER: Final = 0x20
 """CAN address of the other traffic's sender; it speaks to LISTENER, an address nobody has."""
 LISTENER: Final = 0x21
+ECHO: Final = 0x22
+"""CAN address at which the process of the other traffic answers at once: what the machine itself takes."""
+
+ECHO_ROW: Final = 133
+"""Telemetry identifier of the other traffic."""
 
 ASKED: Final = (
     "identification",
@@ -55,12 +61,16 @@ def _talk(spec: str, rate: float, pipe: Connection) -> None:
 
 
 async def _talk_until_told(spec: str, rate: float, pipe: Connection) -> None:
-    identifier = CanIdentifier(MessageType.TELEMETRY, 133, TALKER, LISTENER).pack()
+    identifier = CanIdentifier(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
+    ping = CanIdentifier(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
+    pong = CanIdentifier(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
     seen: list[int] = []
 
     def count(frame: CanFrame) -> None:
         if frame.id == identifier:
             seen.append(int.from_bytes(frame.data, "little"))
+        elif frame.id == ping:
+            listener.send(CanFrame(pong, frame.data))
 
     talker, listener = open_can(spec), open_can(spec)
     await listener.start(count)
@@ -79,7 +89,7 @@ async def _talk_until_told(spec: str, rate: float, pipe: Connection) -> None:
     seconds = time.monotonic() - begin
     await talker.drain()
     await asyncio.sleep(SETTLE_S)
-    disordered = sum(later <= earlier for earlier, later in zip(seen, seen[1:], strict=False))
+    disordered = sum(later <= earlier for earlier, later in pairwise(seen))
     pipe.send((seconds, sent, sent - len(set(seen)), disordered, refused))
     await talker.close()
     await listener.close()
@@ -116,37 +126,40 @@ class OtherTraffic:
 
 
 class _CanAsker:
-    """Asks for telemetry over CAN, one request at a time, and judges the replies."""
+    """Asks one node for telemetry over CAN, one request at a time, and judges the replies."""
 
-    def __init__(self, icd: InterfaceDefinition, device: int) -> None:
-        self._icd = icd
-        self._device = device
-        self._receiver = CanHostReceiver(HOST, device)
+    def __init__(self, node: int, send: Callable[[CanFrame], bool]) -> None:
+        self._node = node
+        self._send = send
+        self._receiver = CanHostReceiver(HOST, node)
         self._answer: asyncio.Future[Reply] | None = None
         self.latencies: list[float] = []
+        self.requests = 0
         self.unanswered = 0
-        self.wrong = 0
+        self.faults = 0
 
     def take(self, frame: CanFrame) -> None:
+        """Take a frame of the bus."""
         for event in self._receiver.feed(frame, time.monotonic()):
             if isinstance(event, LinkFault):
-                self.wrong += 1
+                self.faults += 1
             elif self._answer is not None and not self._answer.done():
                 self._answer.set_result(event)
 
-    async def ask(self, name: str, send: Callable[[CanFrame], bool]) -> None:
-        row = self._icd.telemetry[name]
+    async def ask(self, identifier: int) -> Reply | None:
+        """Ask for a row; return the reply, or None if there was none in time."""
+        self.requests += 1
         self._answer = asyncio.get_running_loop().create_future()
         begin = time.perf_counter()
-        for frame in encode_request_frames(Request.of(row.id), HOST, self._device):
-            send(frame)
+        for frame in encode_request_frames(Request.of(identifier), HOST, self._node):
+            self._send(frame)
         try:
             reply = await asyncio.wait_for(self._answer, REPLY_WITHIN_S)
         except TimeoutError:
             self.unanswered += 1
-            return
+            return None
         self.latencies.append(time.perf_counter() - begin)
-        self.wrong += not _is_right(self._icd, reply, row.id)
+        return reply
 
 
 def _is_right(icd: InterfaceDefinition, reply: Reply, identifier: int) -> bool:
@@ -174,16 +187,25 @@ async def load_can(spec: str, seconds: float, rate: float, *, device: int = DEVI
     device
         CAN address of the device.
     """
-    asker = _CanAsker(load_icd(), device)
+    icd = load_icd()
     transport = open_can(spec)
-    await transport.start(asker.take)
+    asker, echo = _CanAsker(device, transport.send), _CanAsker(ECHO, transport.send)
+
+    def take(frame: CanFrame) -> None:
+        asker.take(frame)
+        echo.take(frame)
+
+    await transport.start(take)
     traffic = await asyncio.to_thread(OtherTraffic, spec, rate)
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
     end = time.monotonic() + seconds
-    number = 0
+    wrong = 0
     while time.monotonic() < end:
-        await asker.ask(ASKED[number % len(ASKED)], transport.send)
-        number += 1
+        row = icd.telemetry[ASKED[asker.requests % len(ASKED)]]
+        reply = await asker.ask(row.id)
+        wrong += reply is not None and not _is_right(icd, reply, row.id)
+        await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
+        await echo.ask(ECHO_ROW)
         await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
     duration, sent, lost, disordered, refused = await asyncio.to_thread(traffic.stop)
     await transport.close()
@@ -193,8 +215,9 @@ async def load_can(spec: str, seconds: float, rate: float, *, device: int = DEVI
         sent=sent,
         lost=lost + refused,
         disordered=disordered,
-        requests=number,
+        requests=asker.requests,
         unanswered=asker.unanswered,
-        wrong=asker.wrong,
+        wrong=wrong + asker.faults,
         latency=Spread.of(asker.latencies),
+        machine=Spread.of(echo.latencies),
     )

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from statistics import fmean
 from typing import Final
 
 from hil_tests.errors import BenchError
 from hil_tests.load_figures import Jitter, Spread
-from protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
+from protocol.can_framing import MAX_STANDARD_ID, CanFrame, CanHostReceiver, encode_request_frames
 from protocol.icd import load_icd
 from protocol.messages import Reply, ReplyKind, Request
 from protocol.transports import CanTransport, open_can
@@ -25,7 +26,14 @@ NMT: Final = 0x000
 HEARTBEAT: Final = 0x700
 SDO_REQUEST: Final = 0x600
 SDO_REPLY: Final = 0x580
+SDO_ABORT: Final = 0x80
 PRODUCER_HEARTBEAT: Final = 0x1017
+TPDO_COMMUNICATION: Final = 0x1800
+DISABLED: Final = 0x8000_0000
+EVERY_SYNC: Final = 1
+OPERATIONAL: Final = 1
+PRE_OPERATIONAL: Final = 128
+SETTLE_S: Final = 0.2
 
 
 class _Arrivals:
@@ -44,7 +52,7 @@ class _Arrivals:
         times = self.times[WARM_UP:]
         if len(times) < 3:
             raise BenchError(f"jitter of {what}: only {len(self.times)} messages came; is it switched on?")
-        intervals = [later - earlier for earlier, later in zip(times, times[1:], strict=False)]
+        intervals = [later - earlier for earlier, later in pairwise(times)]
         mean = fmean(intervals)
         deviations = [abs(interval - mean) for interval in intervals]
         return Jitter(what, round(1e3 * mean, 3), len(times), Spread.of(deviations))
@@ -102,69 +110,110 @@ async def _command(
         raise BenchError(f"jitter: the device refuses set_unsolicited with code {int(answer.code)}")
 
 
+class _Node:
+    """Just enough of a CANopen master to set a node up."""
+
+    def __init__(self, transport: CanTransport, node: int) -> None:
+        self._transport = transport
+        self._node = node
+        self._answer: asyncio.Future[bytes] | None = None
+
+    def take(self, frame: CanFrame) -> None:
+        """Take a frame of the bus."""
+        waiting = self._answer is not None and not self._answer.done()
+        if frame.id == SDO_REPLY + self._node and not frame.extended and waiting and self._answer is not None:
+            self._answer.set_result(frame.data)
+
+    async def write(self, index: int, subindex: int, value: int, size: int) -> None:
+        """Write an entry of up to four bytes. Raises BenchError if the node refuses or does not answer."""
+        await self._transfer(0x23 | (4 - size) << 2, index, subindex, value)
+
+    async def read(self, index: int, subindex: int) -> int:
+        """Read an entry of up to four bytes. Raises BenchError if the node refuses or does not answer."""
+        return await self._transfer(0x40, index, subindex, 0)
+
+    async def _transfer(self, command: int, index: int, subindex: int, value: int) -> int:
+        self._answer = asyncio.get_running_loop().create_future()
+        head = bytes((command, index & 0xFF, index >> 8, subindex))
+        self.send(SDO_REQUEST + self._node, head + value.to_bytes(4, "little"))
+        try:
+            answer = await asyncio.wait_for(self._answer, ANSWER_S)
+        except TimeoutError:
+            raise BenchError(
+                f"jitter: CANopen node {self._node} does not answer; is it on this bus?"
+            ) from None
+        content = int.from_bytes(answer[4:8], "little")
+        if answer[0] == SDO_ABORT:
+            raise BenchError(
+                f"jitter: node {self._node} refuses {index:04X}h:{subindex} with abort code {content:08X}h"
+            )
+        return content
+
+    def send(self, identifier: int, data: bytes = b"") -> None:
+        """Send a frame with an 11-bit identifier."""
+        self._transport.send(CanFrame(identifier, data, extended=False))
+
+
 async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
-    """Set a node's heartbeat period over SDO and measure the intervals."""
+    """Set a node's heartbeat period and measure the intervals."""
     arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
-    answered = asyncio.Event()
+    transport = open_can(spec)
+    master = _Node(transport, node)
 
     def take(frame: CanFrame) -> None:
         arrivals.take(frame)
-        if frame.id == SDO_REPLY + node and not frame.extended:
-            answered.set()
+        master.take(frame)
 
-    transport = open_can(spec)
     await transport.start(take)
     try:
-        await _write_u16(transport, answered, node, PRODUCER_HEARTBEAT, period_ms)
+        await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
         arrivals.times.clear()
         await asyncio.sleep(seconds)
+        await master.write(PRODUCER_HEARTBEAT, 0, 0, 2)
     finally:
         await transport.close()
     return arrivals.jitter(f"heartbeat every {period_ms} ms")
 
 
-async def _write_u16(
-    transport: CanTransport, answered: asyncio.Event, node: int, index: int, value: int
-) -> None:
-    data = bytes((0x2B, index & 0xFF, index >> 8, 0)) + value.to_bytes(2, "little") + bytes(2)
-    transport.send(CanFrame(SDO_REQUEST + node, data, extended=False))
-    try:
-        await asyncio.wait_for(answered.wait(), ANSWER_S)
-    except TimeoutError:
-        raise BenchError(f"jitter: CANopen node {node} does not answer; is it on this bus?") from None
+async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> Jitter:
+    """Make a node's first TPDO synchronous, send SYNC, and measure how long the PDO takes.
 
-
-async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> tuple[Jitter, int]:
-    """Put a node into OPERATIONAL, send SYNC, and measure how long its first PDO takes.
-
-    Returns the figures, whose `deviation` is the time itself and not its distance from the mean, and the number of SYNCs
-    that no PDO followed. PDOs must have a synchronous transmission type, which is the caller's business.
+    `deviation` holds the delays themselves, `period_ms` their mean. Raises BenchError if a SYNC stays without a PDO.
     """
     delays: list[float] = []
-    sent_at = 0.0
-    waiting = False
-    transmit = {0x180 + node, 0x280 + node, 0x380 + node, 0x480 + node}
+    sent_at: float | None = None
+    pdo = -1
+    transport = open_can(spec)
+    master = _Node(transport, node)
 
     def take(frame: CanFrame) -> None:
-        nonlocal waiting
-        if waiting and frame.id in transmit and not frame.extended:
+        nonlocal sent_at
+        master.take(frame)
+        if sent_at is not None and frame.id == pdo and not frame.extended:
             delays.append(time.perf_counter() - sent_at)
-            waiting = False
+            sent_at = None
 
-    transport = open_can(spec)
     await transport.start(take)
-    missed = 0
+    syncs = 0
     try:
-        transport.send(CanFrame(NMT, bytes((1, node)), extended=False))
-        await asyncio.sleep(0.1)
+        master.send(NMT, bytes((PRE_OPERATIONAL, node)))
+        identifier = await master.read(TPDO_COMMUNICATION, 1)
+        await master.write(TPDO_COMMUNICATION, 1, identifier | DISABLED, 4)
+        await master.write(TPDO_COMMUNICATION, 2, EVERY_SYNC, 1)
+        await master.write(TPDO_COMMUNICATION, 1, identifier & ~DISABLED, 4)
+        pdo = identifier & MAX_STANDARD_ID
+        master.send(NMT, bytes((OPERATIONAL, node)))
+        await asyncio.sleep(SETTLE_S)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            waiting, sent_at = True, time.perf_counter()
-            transport.send(CanFrame(SYNC, extended=False))
+            sent_at = time.perf_counter()
+            master.send(SYNC)
+            syncs += 1
             await asyncio.sleep(period_s)
-            missed += waiting
     finally:
         await transport.close()
-    return Jitter(
-        "SYNC to TPDO", round(1e3 * fmean(delays), 3) if delays else 0.0, len(delays), Spread.of(delays)
-    ), missed
+    if len(delays) < syncs:
+        raise BenchError(
+            f"jitter: {syncs - len(delays)} of {syncs} SYNCs were followed by no PDO of node {node}"
+        )
+    return Jitter("SYNC to TPDO", round(1e3 * fmean(delays), 3), len(delays), Spread.of(delays))

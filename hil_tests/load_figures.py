@@ -41,6 +41,8 @@ class CanLoad:
     wrong: int
     """Replies that were refusals, had a wrong length or a value outside its limits, and faults of the framing."""
     latency: Spread
+    machine: Spread
+    """Latency of a process on the same bus that does nothing but answer: what the machine itself takes."""
 
     @property
     def good(self) -> bool:

@@ -18,7 +18,7 @@ from protocol.serial_framing import Dialect, HostReceiver, encode_request
 from protocol.transports import SerialTransport, open_serial
 
 REPLY_WITHIN_S: Final = 1.0
-PIPELINE: Final = 12
+PIPELINE: Final = 60
 """Exchanges under way at once, so that both directions of the line stay busy."""
 
 
@@ -26,10 +26,10 @@ class _SerialPipeline:
     """Keeps several exchanges under way: long telecommands out, long telemetry back."""
 
     def __init__(self, icd: InterfaceDefinition, dialect: Dialect) -> None:
-        frame = icd.telemetry["image_frame"]
+        stars = icd.telemetry["identified_stars"]
         hole_map = icd.telecommands["set_hole_map_1"]
         self._receiver = HostReceiver(dialect)
-        self._cycle = [(Request.of(frame.id), frame.size)]
+        self._cycle = [(Request.of(stars.id), stars.size)]
         self._cycle += [
             (Request.of(hole_map.id, bytes((value,)) * MAP_PART_SIZE), 0) for value in range(1, 6)
         ]
@@ -111,13 +111,13 @@ async def load_serial(spec: str, seconds: float, baud: int, dialect: Dialect) ->
             await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
         except TimeoutError:
             lost = True
-    duration = time.monotonic() - begin
     while pipeline.under_way and not lost:
         pipeline.answered.clear()
         try:
             await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
         except TimeoutError:
             lost = True
+    duration = time.monotonic() - begin
     sent, received = transport.statistics.sent, pipeline.received
     flags = 0 if lost else await _error_flags(icd, transport, pipeline)
     await transport.close()

@@ -141,7 +141,9 @@ def bus(
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for each link.")] = 60.0,
     rate: Annotated[float, typer.Option(min=0.0, help="Frames a second of other nodes on CAN.")] = 7000.0,
     baud: Annotated[int, typer.Option(min=1200, help="Serial bit rate.")] = 921_600,
-    p99_limit_ms: Annotated[float, typer.Option(help="Exit status 1 if CAN replies are later.")] = 5.0,
+    p99_limit_ms: Annotated[
+        float, typer.Option(help="Most that CAN replies may be later than a process that only answers.")
+    ] = 5.0,
     can: Annotated[str | None, typer.Option(help="CAN of a running device, e.g. vcan0.")] = None,
     serial: Annotated[str | None, typer.Option(help="Serial port of a running device.")] = None,
     canopen: Annotated[int | None, typer.Option(help="CANopen node of a running device.")] = None,
@@ -152,7 +154,7 @@ def bus(
     """Load the links of a device to the full and measure what is lost, wrong, late or irregular.
 
     Without --can and --serial it starts an emulator that solves frames at 10 Hz, and a CAN hub. The exit status is 0 only if
-    nothing was lost or wrong and the latency of CAN replies keeps the limit.
+    nothing was lost or wrong and the latency of CAN replies (99th percentile) keeps the limit.
     """
     import json
     from contextlib import nullcontext

@@ -1,0 +1,142 @@
+"""`starhil bench bus`: links under full load and the regularity of periodic messages."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hil_tests.bus_load import DEVICE, load_can
+from hil_tests.client import ObcClient
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.jitter import heartbeat_jitter, sync_to_pdo, unsolicited_jitter
+from hil_tests.load_figures import CanLoad, Jitter, SerialLoad
+from hil_tests.serial_load import load_serial
+from protocol.serial_framing import Dialect
+
+UPDATE_RATE_HZ = 10.0
+NODE = 44
+UNSOLICITED_HZ = 20.0
+HEARTBEAT_MS = 50
+SYNC_S = 0.05
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is measured: the links of one device, each None where it has none."""
+
+    can: str | None
+    serial: str | None
+    canopen: int | None
+    device: int = DEVICE
+    baud: int = 921_600
+    dialect: Dialect = Dialect.B
+
+
+@dataclass
+class BusFigures:
+    """All figures of one run."""
+
+    can: CanLoad | None = None
+    serial: SerialLoad | None = None
+    jitter: list[Jitter] = field(default_factory=list)
+
+    def good(self, p99_limit_ms: float) -> bool:
+        """Whether nothing was lost or wrong, and replies no later than the limit beyond what the machine itself takes."""
+        can_good = self.can is None or (
+            self.can.good and self.can.latency.p99_ms - self.can.machine.p99_ms <= p99_limit_ms
+        )
+        return can_good and (self.serial is None or self.serial.good)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures as plain values."""
+        return asdict(self)
+
+
+@contextmanager
+def own_device(baud: int, report: Callable[[str], None]) -> Iterator[Target]:
+    """Start a hub and an emulator that solves frames at 10 Hz, each a process of its own."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory()))
+        hub = stack.enter_context(EmulatorProcess(hub_command()))
+        command = emulator_command(
+            profile="demo",
+            serial="auto",
+            can=hub.ready["can"],
+            state_dir=folder,
+            settings=[f"links.serial.baud={baud}"],
+            extra=["--canopen", str(NODE)],
+        )
+        report("starting the emulator")
+        emulator = stack.enter_context(EmulatorProcess(command))
+        with ObcClient.open(can=hub.ready["can"], device_address=DEVICE) as client:
+            client.command("set_update_rate", rate=UPDATE_RATE_HZ)
+            client.command("set_mode", mode="lost_in_space")
+        yield Target(hub.ready["can"], emulator.ready["serial"], NODE, baud=baud)
+
+
+def hub_command() -> list[str]:
+    """Command line of a hub at a free port."""
+    import sys
+
+    from hil_tests.emulator_process import STARHIL
+
+    return [sys.executable, "-c", STARHIL, "hub", "--port", "0"]
+
+
+def measure(target: Target, seconds: float, rate: float, report: Callable[[str], None]) -> BusFigures:
+    """Measure each link of the target in turn."""
+    figures = BusFigures()
+    if target.can is not None:
+        report(f"CAN: {rate:g} frames/s for {seconds:g} s")
+        figures.can = asyncio.run(load_can(target.can, seconds, rate, device=target.device))
+    if target.serial is not None:
+        report(f"serial: {target.baud} Bd both ways for {seconds:g} s")
+        figures.serial = asyncio.run(load_serial(target.serial, seconds, target.baud, target.dialect))
+    short = max(min(seconds / 3.0, 20.0), 2.0)
+    if target.can is not None:
+        report(f"jitter: {short:g} s each")
+        figures.jitter.append(
+            asyncio.run(unsolicited_jitter(target.can, short, UNSOLICITED_HZ, device=target.device))
+        )
+        if target.canopen is not None:
+            node = target.canopen
+            figures.jitter.append(asyncio.run(heartbeat_jitter(target.can, short, HEARTBEAT_MS, node=node)))
+            figures.jitter.append(asyncio.run(sync_to_pdo(target.can, short, SYNC_S, node=node)))
+    return figures
+
+
+def print_figures(figures: BusFigures, good: bool) -> None:
+    """Print the figures for people."""
+    if figures.can is not None:
+        load = figures.can
+        print(
+            f"CAN     {load.offered_per_s:g} frames/s of other nodes for {load.seconds:g} s: {load.sent} sent, {load.lost} lost, "
+            f"{load.disordered} out of order"
+        )
+        print(
+            f"        {load.requests} requests: {load.unanswered} unanswered, {load.wrong} wrong; latency p50 "
+            f"{load.latency.p50_ms:.2f} ms, p99 {load.latency.p99_ms:.2f} ms, max {load.latency.max_ms:.2f} ms"
+        )
+        machine = load.machine
+        print(
+            f"        a process that only answers: p50 {machine.p50_ms:.2f} ms, p99 {machine.p99_ms:.2f} ms, "
+            f"max {machine.max_ms:.2f} ms"
+        )
+    if figures.serial is not None:
+        line = figures.serial
+        print(
+            f"serial  {line.baud} Bd for {line.seconds:g} s: {line.sent_share:.0%} of the line out, {line.received_share:.0%} in; "
+            f"{line.exchanges} exchanges, {line.wrong} wrong"
+        )
+    for jitter in figures.jitter:
+        spread = jitter.deviation
+        print(
+            f"jitter  {jitter.what}: mean {jitter.period_ms:.2f} ms over {jitter.messages}; p50 {spread.p50_ms:.2f} ms, "
+            f"p99 {spread.p99_ms:.2f} ms, max {spread.max_ms:.2f} ms"
+        )
+    print("good" if good else "NOT good: something was lost, wrong or late")

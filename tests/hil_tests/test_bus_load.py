@@ -1,0 +1,178 @@
+"""The load measurement: it tells a good device from one that loses, lies or is late."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+
+import pytest
+
+from hil_tests.bus_load import DEVICE, HOST, load_can
+from hil_tests.errors import BenchError
+from hil_tests.jitter import unsolicited_jitter
+from hil_tests.load_figures import CanLoad, SerialLoad, Spread
+from hil_tests.serial_load import load_serial
+from protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
+from protocol.hub import CanHub
+from protocol.icd import load_icd
+from protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
+from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from protocol.transports import CanTransport, SerialTransport, open_can, open_serial
+
+ICD = load_icd()
+RATE = 300.0
+SECONDS = 0.6
+BAUD = 460_800
+
+Answer = Callable[[Request, int], list[Reply]]
+
+
+def good(request: Request, _: int) -> list[Reply]:
+    """Answer as a device does."""
+    if request.kind is RequestKind.TELECOMMAND:
+        return [Reply(ReplyKind.ACK, request.id, destination=HOST)]
+    row = ICD.telemetry_by_id[request.id]
+    return [Reply(ReplyKind.TELEMETRY, request.id, row.encode(), destination=HOST)]
+
+
+def every_tenth(fault: Answer) -> Answer:
+    """Answer rightly but for every tenth request."""
+    return lambda request, number: fault(request, number) if number % 10 == 9 else good(request, number)
+
+
+def silent(_request: Request, _number: int) -> list[Reply]:
+    return []
+
+
+def refusing(request: Request, _number: int) -> list[Reply]:
+    return [Reply(ReplyKind.NACK, request.id, code=ErrorCode.BUSY, destination=HOST)]
+
+
+def outside_limits(request: Request, _number: int) -> list[Reply]:
+    size = ICD.telemetry_by_id[request.id].size if request.kind is RequestKind.TELEMETRY else 0
+    return [Reply(ReplyKind.TELEMETRY, request.id, b"\xfe" * size, destination=HOST)]
+
+
+def too_short(request: Request, _number: int) -> list[Reply]:
+    return [Reply(ReplyKind.TELEMETRY, request.id, b"\x01\x02\x03", destination=HOST)]
+
+
+@contextlib.asynccontextmanager
+async def can_device(answer: Answer) -> AsyncIterator[str]:
+    """A device on a hub, both in this process."""
+    hub = CanHub(port=0)
+    await hub.start()
+    spec = f"socketcand:127.0.0.1:{hub.port}/vcan0"
+    transport: CanTransport = open_can(spec)
+    receiver = CanDeviceReceiver(DEVICE)
+    number = 0
+
+    def take(frame: CanFrame) -> None:
+        nonlocal number
+        for event in receiver.feed(frame, 0.0):
+            if isinstance(event, Request):
+                for reply in answer(event, number):
+                    for one in encode_reply_frames(reply, DEVICE):
+                        transport.send(one)
+                number += 1
+
+    await transport.start(take)
+    try:
+        yield spec
+    finally:
+        await transport.close()
+        await hub.close()
+
+
+def measure_can(answer: Answer) -> CanLoad:
+    async def main() -> CanLoad:
+        async with can_device(answer) as spec:
+            return await load_can(spec, SECONDS, RATE)
+
+    return asyncio.run(main())
+
+
+@pytest.mark.process
+def test_a_good_device_on_can_is_found_good() -> None:
+    load = measure_can(good)
+    assert load.good
+    assert load.sent > 0
+    assert load.requests > 0
+    assert 0 < load.latency.p50_ms <= load.latency.p99_ms <= load.latency.max_ms
+    assert load.machine.p50_ms > 0
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("fault", [refusing, outside_limits, too_short])
+def test_wrong_replies_on_can_are_found(fault: Answer) -> None:
+    load = measure_can(every_tenth(fault))
+    assert not load.good
+    assert load.wrong > 0
+    assert (load.lost, load.unanswered) == (0, 0)
+
+
+@pytest.mark.process
+def test_a_silent_device_on_can_is_found() -> None:
+    load = measure_can(silent)
+    assert not load.good
+    assert load.unanswered == load.requests > 0
+
+
+def measure_serial(answer: Answer, dialect: Dialect) -> SerialLoad:
+    async def main() -> SerialLoad:
+        transport: SerialTransport = open_serial("pty", BAUD)
+        receiver = DeviceReceiver()
+        number = 0
+
+        def take(data: bytes) -> None:
+            nonlocal number
+            for event in receiver.feed(data, 0.0):
+                if isinstance(event, Request):
+                    for reply in answer(event, number):
+                        transport.send(encode_reply(reply, dialect))
+                    number += 1
+
+        await transport.start(take)
+        load = await load_serial(transport.description, SECONDS, BAUD, dialect)
+        await transport.close()
+        return load
+
+    return asyncio.run(main())
+
+
+@pytest.mark.parametrize("dialect", Dialect)
+def test_a_good_device_on_serial_is_found_good(dialect: Dialect) -> None:
+    load = measure_serial(good, dialect)
+    assert load.good
+    assert load.exchanges > 20
+    assert 0 < load.sent_share <= 1.0
+    assert 0 < load.received_share <= 1.0
+
+
+@pytest.mark.parametrize("dialect", Dialect)
+@pytest.mark.parametrize("fault", [refusing, silent])
+def test_a_bad_device_on_serial_is_found(fault: Answer, dialect: Dialect) -> None:
+    load = measure_serial(every_tenth(fault), dialect)
+    assert not load.good
+
+
+def test_a_device_that_sends_nothing_unasked_is_told() -> None:
+    async def main() -> None:
+        async with can_device(good) as spec:
+            with pytest.raises(BenchError, match="only 0 messages came"):
+                await unsolicited_jitter(spec, 0.1, 20.0, device=DEVICE)
+        async with can_device(silent) as spec:
+            with pytest.raises(BenchError, match="does not answer"):
+                await unsolicited_jitter(spec, 0.1, 20.0, device=DEVICE)
+        async with can_device(refusing) as spec:
+            with pytest.raises(BenchError, match="refuses set_unsolicited with code 6"):
+                await unsolicited_jitter(spec, 0.1, 20.0, device=DEVICE)
+
+    asyncio.run(main())
+
+
+def test_spreads_are_those_of_the_ordered_values() -> None:
+    spread = Spread.of([value / 1000 for value in range(100, 0, -1)])
+    assert (spread.p50_ms, spread.p99_ms, spread.max_ms) == (51.0, 100.0, 100.0)
+    assert Spread.of([]).max_ms != Spread.of([]).max_ms
