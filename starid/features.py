@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from starid.errors import StaridError
+from starid.jit import compiled
 
 FEATURE_NAMES: Final = ("n", "A", "r", "sigma_A", "sigma_r")
 """Order of the components of a feature vector."""
@@ -68,14 +68,14 @@ class FeatureVector:
         return np.array([self.n, self.A, self.r, self.sigma_A, self.sigma_r], dtype=np.float64)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def clear_sums(sums: NDArray[np.float64]) -> None:
     """Empty the accumulator of one frame, (8,)."""
     for i in range(SUM_COUNT):
         sums[i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_star(sums: NDArray[np.float64], brightness: float, x: float, y: float, pivot: float) -> None:
     """Add one star to the accumulator; `pivot` is a brightness near the mean, against cancellation."""
     q = x * x + y * y
@@ -90,7 +90,7 @@ def add_star(sums: NDArray[np.float64], brightness: float, x: float, y: float, p
     sums[7] += brightness
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def finish_features(sums: NDArray[np.float64], pivot: float, out: NDArray[np.float64]) -> float:
     """Turn an accumulator into the five features in `out` and return the polar angle in radians.
 
@@ -122,7 +122,7 @@ def finish_features(sums: NDArray[np.float64], pivot: float, out: NDArray[np.flo
     return math.atan2(y, x)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def frame_features(
     brightness: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64], out: NDArray[np.float64]
 ) -> float:

@@ -438,22 +438,35 @@ class LostInSpace:
         )
         return LsiSolution(observation, nearest, float(found[0]), cells, dictionary, weights, results)
 
-    def solve_region(
-        self, features: FeatureVector, ra_deg: float, dec_deg: float, side_deg: float
-    ) -> tuple[LsiSolution | None, int]:
-        """Estimate from the cells of a square region only; None if it holds none. Also how many cells it holds."""
-        observation = self.database.normalise(features)
+    def nearest(self, observation: NDArray[np.float64]) -> tuple[int, float]:
+        """Nearest cell of the whole database and its distance, for a normalised observation; the search alone."""
         self._check(observation)
-        cells, dictionary, weights, results, found = _outputs()
-        nearest = region_nearest(
+        found = np.empty(2)
+        if self.exact:
+            return exact_nearest(self.index, self.arrays, observation, found), float(found[0])
+        cells = np.empty(1, dtype=np.int64)
+        stored_neighbours(self.index, observation * 2.55, found[:1], cells)
+        return int(cells[0]), math.sqrt(found[0]) / 2.55
+
+    def nearest_in_region(
+        self, observation: NDArray[np.float64], ra_deg: float, dec_deg: float, side_deg: float
+    ) -> tuple[int, float, int]:
+        """Nearest cell of a square region, its distance, and how many cells the region holds; cell −1 if none."""
+        self._check(observation)
+        found = np.empty(2)
+        cell = region_nearest(
             self.arrays, self.stored, self.exact, observation, ra_deg, dec_deg, side_deg, found
         )
-        if nearest < 0:
-            return None, int(found[1])
+        return cell, float(found[0]), int(found[1])
+
+    def estimate(self, observation: NDArray[np.float64], cell: int, distance: float) -> LsiSolution:
+        """Dictionary, LASSO and estimates about a given cell."""
+        self._check(observation)
+        cells, dictionary, weights, results, _ = _outputs()
         estimate_from_cell(
             self.arrays,
             self.stored,
-            nearest,
+            cell,
             self.exact,
             observation,
             LAMBDAS,
@@ -462,9 +475,7 @@ class LostInSpace:
             weights,
             results,
         )
-        return LsiSolution(observation, nearest, float(found[0]), cells, dictionary, weights, results), int(
-            found[1]
-        )
+        return LsiSolution(observation, cell, distance, cells, dictionary, weights, results)
 
     def _check(self, observation: NDArray[np.float64]) -> None:
         if observation.shape != (5,) or not np.isfinite(observation).all():

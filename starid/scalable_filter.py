@@ -152,6 +152,8 @@ class TrackFilter:
 
     def reset(self) -> None:
         """Forget everything, as after a gap in the frames."""
+        self._last_frame: ObservedFrame | None = None
+        self._last_result: TrackResult | None = None
         self._next_number = 0
         self._frame = 0
         self._anchor = _STILL.copy()
@@ -160,12 +162,16 @@ class TrackFilter:
         self._suspect = np.empty(0, dtype=np.bool_)
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
-        """Compare two frames on their own, whatever was seen before."""
-        pair = TrackFilter(self.settings)
-        first = pair.update(before).track
-        second = pair.update(now)
+        """Compare two frames; if the first is the one seen last, with what is known from those before it."""
+        if before is not self._last_frame or self._last_result is None:
+            self.reset()
+            self._last_result = self.update(before)
+        first = self._last_result.track
+        second = self.update(now)
+        self._last_frame, self._last_result = now, second
         place = {int(number): i for i, number in enumerate(first)}
-        found = [(place[int(second.track[j])], int(j)) for j in np.flatnonzero(second.true_now)]
+        pairs = [(place.get(int(second.track[j])), int(j)) for j in np.flatnonzero(second.true_now)]
+        found = [pair for pair in pairs if pair[0] is not None]
         matches = np.array(found, dtype=np.int64).reshape(-1, 2)
         true_before = np.zeros(len(before), dtype=np.bool_)
         true_before[matches[:, 0]] = True
