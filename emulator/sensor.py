@@ -14,6 +14,8 @@ from emulator.fixed_pattern import make_fixed_pattern
 from emulator.noise import digitize
 from emulator.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from emulator.sensor_model import SOLAR_COLOUR_B_V, SensorModel
+from emulator.sky_light import AreaLight, AreaPainter, add_cosmic_rays, icrs_vector
+from emulator.sky_objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
@@ -21,6 +23,8 @@ from starid.catalog import StarCatalog
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
 _MOST_RATE_RAD_S: Final = 20.0
+_VISIBLE_SHARE: Final = 0.5
+_OBJECT_STREAM: Final = 2
 _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
 
@@ -40,6 +44,8 @@ class StarTruth:
         Mean electrons of the star in the exposure.
     magnitude : ndarray (n,)
         V magnitude.
+    visible : ndarray (n,) of bool
+        False for stars that are hidden or left out.
     """
 
     hip: npt.NDArray[np.int32]
@@ -47,6 +53,29 @@ class StarTruth:
     xy_px: npt.NDArray[np.float64]
     electrons: npt.NDArray[np.float64]
     magnitude: npt.NDArray[np.float64]
+    visible: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ObjectTruth:
+    """What else is on a frame.
+
+    Attributes
+    ----------
+    false_xy_px : ndarray (n, 2)
+        Places of the false stars, the fixed ones first.
+    planet_xy_px : ndarray (m, 2)
+        Places of the planets, in the order given; NaN for those outside the image.
+    cosmic_rays_px : ndarray (k, 4)
+        x, y of both ends of each streak.
+    covered_share : float
+        Share of the image on which less than half of the sky's light is seen.
+    """
+
+    false_xy_px: npt.NDArray[np.float64]
+    planet_xy_px: npt.NDArray[np.float64]
+    cosmic_rays_px: npt.NDArray[np.float64]
+    covered_share: float
 
 
 @dataclass(frozen=True)
@@ -59,6 +88,8 @@ class Frame:
         Counts.
     stars : StarTruth
         The catalogue stars on it.
+    objects : ObjectTruth or None
+        What else is on it, where there is anything else.
     attitude : Attitude
         Attitude at mid-exposure.
     rate_rad_s : tuple of 3 floats
@@ -76,6 +107,7 @@ class Frame:
     exposure_s: float
     seed: int
     frame_index: int
+    objects: ObjectTruth | None = None
 
 
 class Renderer:
@@ -93,15 +125,24 @@ class Renderer:
         Optics and detector.
     seed : int
         Seed of a run, not negative.
+    objects : SkyObjects, optional
+        What else there is in all frames that are not told otherwise.
     """
 
     def __init__(
-        self, camera: Camera, catalog: StarCatalog, sensor: SensorModel | None = None, seed: int = 0
+        self,
+        camera: Camera,
+        catalog: StarCatalog,
+        sensor: SensorModel | None = None,
+        seed: int = 0,
+        objects: SkyObjects | None = None,
     ) -> None:
         self.camera = camera
         self.catalog = catalog
         self.sensor = SensorModel() if sensor is None else sensor
         self.seed = _whole_number("seed", seed)
+        self.objects = objects
+        self._painter = AreaPainter(camera, self.sensor)
         brightness = self.sensor_magnitudes()
         rows = np.flatnonzero(catalog.v <= self.sensor.limiting_magnitude)
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
@@ -121,7 +162,9 @@ class Renderer:
 
     def with_sensor(self, sensor: SensorModel) -> Renderer:
         """Renderer of the same sky, camera and seed for another sensor (this one if nothing changes)."""
-        return self if sensor == self.sensor else Renderer(self.camera, self.catalog, sensor, self.seed)
+        if sensor == self.sensor:
+            return self
+        return Renderer(self.camera, self.catalog, sensor, self.seed, self.objects)
 
     def render(
         self,
@@ -130,6 +173,7 @@ class Renderer:
         frame_index: int = 0,
         *,
         exposure_s: float | None = None,
+        objects: SkyObjects | None = None,
     ) -> Frame:
         """Make one frame.
 
@@ -143,6 +187,8 @@ class Renderer:
             Number of the frame in the run; chooses the noise together with the seed.
         exposure_s : float, optional
             Other exposure than the sensor's.
+        objects : SkyObjects, optional
+            What else is there in this frame, instead of the renderer's own objects.
 
         Raises
         ------
@@ -156,10 +202,17 @@ class Renderer:
         )
         rate = _rate(rate_rad_s)
         index = _whole_number("frame_index", frame_index)
+        others = self.objects if objects is None else objects
         mean = self._mean_without_stars(exposure)
         path, chosen, inside = self._paths(attitude, rate, exposure)
         electrons = self._flux_e_s[chosen] * exposure
-        self._add_light(mean, path, electrons)
+        drawn = electrons
+        object_truth = None
+        if others is not None:
+            drawn = electrons.copy()
+            drawn[np.flatnonzero(inside)[: others.missing_stars]] = 0.0
+            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, path, drawn)
+        self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[inside]]
         stars = StarTruth(
@@ -168,8 +221,78 @@ class Renderer:
             path[inside, :2].copy(),
             electrons[inside],
             self.catalog.v[rows].astype(np.float64),
+            drawn[inside] > _VISIBLE_SHARE * electrons[inside],
         )
-        return Frame(image, stars, attitude, (rate[0], rate[1], rate[2]), exposure, self.seed, index)
+        rates = (float(rate[0]), float(rate[1]), float(rate[2]))
+        return Frame(image, stars, attitude, rates, exposure, self.seed, index, object_truth)
+
+    def _add_objects(
+        self,
+        mean: npt.NDArray[np.float32],
+        objects: SkyObjects,
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        index: int,
+        path: npt.NDArray[np.float64],
+        electrons: npt.NDArray[np.float64],
+    ) -> ObjectTruth:
+        """Add all that is no star, and dim the stars (in place) that lie behind it."""
+        rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
+        covered = 0.0
+        area: AreaLight | None = None
+        if objects.any_light_or_cover:
+            area = self._painter.paint(objects, attitude)
+            light = area.electrons_s + (area.transmission - np.float32(1.0)) * self._sky_e_s
+            light *= self._pattern.sensitivity * np.float32(exposure_s)
+            mean += light
+            np.maximum(mean, 0.0, out=mean)
+            electrons *= area.seen_at(path[:, :2])
+            covered = float(np.mean(area.transmission < 0.5))
+        planet_xy = self._add_planets(mean, objects.planets, attitude, rate, exposure_s, area)
+        false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
+        streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
+        return ObjectTruth(false_xy, planet_xy, streaks, covered)
+
+    def _add_planets(
+        self,
+        mean: npt.NDArray[np.float32],
+        planets: tuple[PointSource, ...],
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        area: AreaLight | None,
+    ) -> npt.NDArray[np.float64]:
+        """Add points of light at fixed directions; return where (n, 2) they fall."""
+        places = np.full((len(planets), 2), np.nan)
+        if not planets:
+            return places
+        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
+        path, inside, touching = self._path_of(vectors, attitude, rate, exposure_s)
+        places[inside] = path[inside, :2]
+        electrons = np.array([self.sensor.electrons(planet.magnitude, exposure_s) for planet in planets])
+        path, electrons = path[touching], electrons[touching]
+        self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))
+        return places
+
+    def _add_false_stars(
+        self,
+        mean: npt.NDArray[np.float32],
+        objects: SkyObjects,
+        rng: np.random.Generator,
+        exposure_s: float,
+    ) -> npt.NDArray[np.float64]:
+        """Add points of light at random places of the image; return where (n, 2)."""
+        fixed = np.random.default_rng((self.seed, _OBJECT_STREAM))
+        size = np.array([self.camera.width, self.camera.height])
+        low, high = objects.false_star_magnitudes
+        numbers = ((objects.fixed_false_stars, fixed), (objects.false_stars, rng))
+        places = np.concatenate([source.uniform(-0.5, size - 0.5, (count, 2)) for count, source in numbers])
+        magnitudes = np.concatenate([source.uniform(low, high, count) for count, source in numbers])
+        path = np.zeros((len(places), 6))
+        path[:, :2] = places
+        self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * 10.0 ** (-0.4 * magnitudes))
+        return places
 
     def trails(self, frame: Frame) -> npt.NDArray[np.float64]:
         """Trails (n, 2) of a frame's stars during its exposure: from start to end along x and y, pixels."""
@@ -199,11 +322,21 @@ class Renderer:
         sweep = float(np.linalg.norm(rate)) * exposure_s
         cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
         near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
-        icrs = self._vectors[near]
+        path, inside, touching = self._path_of(self._vectors[near], attitude, rate, exposure_s)
+        return path[touching], near[touching], inside[touching]
+
+    def _path_of(
+        self,
+        icrs: npt.NDArray[np.float64],
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Paths (n, 6) of directions (n, 3), which of them have their middle inside, and which touch the pixels."""
         middle, inside = self.camera.project(attitude.to_sensor(icrs))
-        path = np.zeros((near.size, 6))
+        path = np.zeros((len(icrs), 6))
         path[:, :2] = middle
-        if sweep > 0.0:
+        if np.any(rate):
             half = 0.5 * exposure_s * rate
             start, _ = self.camera.project(attitude.rotated(-half).to_sensor(icrs))
             end, _ = self.camera.project(attitude.rotated(half).to_sensor(icrs))
@@ -214,7 +347,7 @@ class Renderer:
         size = np.array([self.camera.width, self.camera.height])
         touching = np.all((middle > -span) & (middle < size + span), axis=1)
         touching &= np.all(np.isfinite(path), axis=1)
-        return path[touching], near[touching], inside[touching]
+        return path, inside & touching, touching
 
     def _add_light(
         self,
@@ -241,9 +374,10 @@ def render(
     rate_rad_s: npt.ArrayLike = (0.0, 0.0, 0.0),
     seed: int = 0,
     frame_index: int = 0,
+    objects: SkyObjects | None = None,
 ) -> Frame:
     """Make a single frame; for several in a row keep a `Renderer`, whose caches this makes anew."""
-    return Renderer(camera, catalog, sensor, seed).render(attitude, rate_rad_s, frame_index)
+    return Renderer(camera, catalog, sensor, seed, objects).render(attitude, rate_rad_s, frame_index)
 
 
 def _whole_number(name: str, value: int) -> int:

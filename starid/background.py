@@ -128,13 +128,21 @@ def estimate_background(
 
 
 @compiled_loops
+def grid_place(position: float, block: float, count: int) -> tuple[int, int, float]:
+    """The two of `count` block centres that a pixel lies between, and how far towards the second.
+
+    Beyond the outermost centres the share runs on below 0 or above 1, so that slopes go on to the image's edge.
+    """
+    u = (position + 0.5) / block - 0.5
+    i = min(max(int(u), 0), max(count - 2, 0))
+    return i, min(i + 1, count - 1), u - i
+
+
+@compiled_loops
 def interpolate_at(grid: npt.NDArray[np.float32], block: float, x: float, y: float) -> float:
-    """Value of a grid of blocks at a pixel position, linear between block centres and constant beyond them."""
-    u = min(max((x + 0.5) / block - 0.5, 0.0), grid.shape[1] - 1.0)
-    v = min(max((y + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
-    i, j = min(int(v), max(grid.shape[0] - 2, 0)), min(int(u), max(grid.shape[1] - 2, 0))
-    i2, j2 = min(i + 1, grid.shape[0] - 1), min(j + 1, grid.shape[1] - 1)
-    p, q = u - j, v - i
+    """Value of a grid of blocks at a pixel position, linear between block centres and on to the edges."""
+    i, i2, q = grid_place(y, block, grid.shape[0])
+    j, j2, p = grid_place(x, block, grid.shape[1])
     upper = grid[i, j] * (1.0 - p) + grid[i, j2] * p
     lower = grid[i2, j] * (1.0 - p) + grid[i2, j2] * p
     return float(upper * (1.0 - q) + lower * q)

@@ -25,7 +25,7 @@ from starid.matched_filter import (
 from starid.measurement import AT_EDGE, SATURATED, TWICE, find_neighbours, measure
 from starid.spot_shape import SpotShape, moments_of, shape_from_moments
 from starid.trail_filter import smooth_along_trails, trail_noise_factor
-from starid.windows import WINDOW_COLUMNS, cut_windows, lay_windows
+from starid.windows import COLUMNS, SEEN_BEFORE, WINDOW_COLUMNS, cut_windows, lay_windows
 
 Grid: TypeAlias = npt.NDArray[np.float32]
 
@@ -340,7 +340,8 @@ def _measured(
     good = np.flatnonzero(stars[:, STATE] == GOOD)
     if good.size == 0:
         return _nothing(background, "nothing on the image has the shape of a star", count)
-    refused = count - good.size - int(np.count_nonzero(stars[:, STATE] == TWICE))
+    again = (stars[:, STATE] == TWICE) | (windows[:, COLUMNS] == SEEN_BEFORE)
+    refused = count - good.size - int(np.count_nonzero(again))
     good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
     fits, marks = stars[good], flags[good]
     freedom = np.maximum(fits[:, PIXELS] - _FIT_PARAMETERS, 1.0)

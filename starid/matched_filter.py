@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.background import grid_place
 from starid.jit_loops import compiled_loops
 
 INTEGER_TAPS_SUM: Final = 16
@@ -138,17 +139,15 @@ def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDA
     columns = grid.shape[1]
     width = out.size
     start = 0
-    for j in range(columns):
-        # from the centre of block j − 1 to that of block j
-        end = min(math.ceil((j + 0.5) * block - 0.5), width)
-        low = grid[i, max(j - 1, 0)]
-        slope = (grid[i, j] - low) / np.float32(block)
-        origin = np.float32((j - 0.5) * block - 0.5)
+    for j in range(max(columns - 1, 1)):
+        # from the centre of block j to that of the next, the first and the last on to the edges
+        end = width if j >= columns - 2 else min(math.ceil((j + 1.5) * block - 0.5), width)
+        low = grid[i, j]
+        slope = (grid[i, min(j + 1, columns - 1)] - low) / np.float32(block)
+        origin = np.float32((j + 0.5) * block - 0.5)
         for x in range(start, end):
             out[x] = low + slope * (np.float32(x) - origin)
         start = max(end, start)
-    for x in range(start, width):
-        out[x] = grid[i, columns - 1]
 
 
 @compiled_loops
@@ -217,12 +216,11 @@ def _set_lines(
     grid: npt.NDArray[np.float32], block: float, y: int, current: int, lines: npt.NDArray[np.float32]
 ) -> tuple[int, np.float32]:
     """Have the two lines of a grid of blocks ready that row y lies between; return which, and how far between."""
-    v = min(max((y + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
-    i = min(int(v), max(grid.shape[0] - 2, 0))
+    i, i2, q = grid_place(float(y), block, grid.shape[0])
     if i != current:
         _grid_line(grid, i, block, lines[0])
-        _grid_line(grid, min(i + 1, grid.shape[0] - 1), block, lines[1])
-    return i, np.float32(v - i)
+        _grid_line(grid, i2, block, lines[1])
+    return i, np.float32(q)
 
 
 @compiled_loops

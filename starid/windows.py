@@ -41,6 +41,7 @@ MOST_SATURATED: Final = 400
 EXTENDED: Final = -1.0
 SEEN_BEFORE: Final = -2.0
 NO_ROOM: Final = -3.0
+ONE_PIXEL: Final = -4.0
 """Values of COLUMNS that say why a candidate has no window."""
 
 _RING_PIXELS: Final = 48
@@ -51,6 +52,9 @@ _QUARTILE_SIGMA: Final = 1.349
 _LEAST_REACH_SIGMA: Final = 2.5
 _MOST_REACH_SIGMA: Final = 6.0
 _VISIBLE_NOISE: Final = 0.33
+_LEAST_SPREAD_PX: Final = 0.5
+_ALONE_SIGMA: Final = 8.0
+_ALONE_SHARE: Final = 0.125
 
 
 @compiled_loops
@@ -63,16 +67,29 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
 
 
 @compiled_loops
+def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) -> tuple[float, float]:
+    """Slopes of the background along x and y, counts a pixel."""
+    return (
+        0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y)),
+        0.5 * (interpolate_at(level, block, x, y + 1.0) - interpolate_at(level, block, x, y - 1.0)),
+    )
+
+
+@compiled_loops
 def _ring(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x: int,
     y: int,
     radius_x: int,
     radius_y: int,
+    slopes: tuple[float, float],
     circle: npt.NDArray[np.float64],
     values: npt.NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window."""
+    """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
+
+    The sky's slopes along x and y are taken off first.
+    """
     height, width = image.shape
     count = 0
     for k in range(_RING_PIXELS):
@@ -80,7 +97,7 @@ def _ring(
         column = x + math.floor((radius_x + out) * circle[0, k] + 0.5)
         row = y + math.floor((radius_y + out) * circle[1, k] + 0.5)
         if 0 <= column < width and 0 <= row < height:
-            key = float(image[row, column])
+            key = image[row, column] - slopes[0] * (column - x) - slopes[1] * (row - y)
             j = count - 1
             while j >= 0 and values[j] > key:
                 values[j + 1] = values[j]
@@ -177,6 +194,22 @@ def _middle(
 
 
 @compiled_loops
+def _stands_alone(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float, noise: float
+) -> bool:
+    """Whether a pixel is bright and none of its neighbours has even an eighth of its light: a hot pixel."""
+    height, width = image.shape
+    peak = image[row, column] - sky
+    if peak < _ALONE_SIGMA * noise:
+        return False
+    for b in range(max(row - 1, 0), min(row + 2, height)):
+        for a in range(max(column - 1, 0), min(column + 2, width)):
+            if (a != column or b != row) and image[b, a] - sky > _ALONE_SHARE * peak:
+                return False
+    return True
+
+
+@compiled_loops
 def lay_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -241,7 +274,8 @@ def lay_windows(
         radius_x = min(math.ceil(radius + 0.5 * abs(trail_x) + extra), LARGEST_HALF_WIDTH)
         radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
         centre_x, centre_y = round(x), round(y)
-        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, circle, ring)
+        slopes = _slopes(level, block, x, y)
+        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
         sky_level, window[NOISE] = _sky(
             around,
             spread,
@@ -250,6 +284,9 @@ def lay_windows(
             typical_noise,
         )
         window[BASE] = sky_level
+        if sigma >= _LEAST_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
+            window[COLUMNS] = ONE_PIXEL
+            continue
         left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)
         columns = min(centre_x + radius_x, width - 1) - left + 1
         rows = min(centre_y + radius_y, height - 1) - top + 1
@@ -287,8 +324,7 @@ def cut_windows(
         if window[COLUMNS] <= 0.0:
             continue
         x, y, base = window[START_X], window[START_Y], window[BASE]
-        slope_x = 0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y))
-        slope_y = 0.5 * (interpolate_at(level, block, x, y + 1.0) - interpolate_at(level, block, x, y - 1.0))
+        slope_x, slope_y = _slopes(level, block, x, y)
         left, top = int(window[LEFT]), int(window[TOP])
         for j in range(top, top + int(window[ROWS])):
             for i in range(left, left + int(window[COLUMNS])):
