@@ -292,4 +292,17 @@ def _predicted(
 
 
 def _empty_step(true_stars: NDArray[np.bool_], motion: CameraMotion | None) -> RsiStep:
-    return RsiStep(None, math.nan, False, "lsi", False, True, math.nan, 0, motion, true_stars, 0.0, 0.0)
+    return RsiStep(
+        estimate=None,
+        roll_deg=math.nan,
+        valid=False,
+        mode="lsi",
+        triggered=False,
+        exceeded=True,
+        region_deg=math.nan,
+        region_cells=0,
+        motion=motion,
+        true_stars=true_stars,
+        search_s=0.0,
+        lasso_s=0.0,
+    )
