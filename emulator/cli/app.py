@@ -28,6 +28,7 @@ COMMANDS: Final[dict[str, str]] = {
     "hub": "hub",
     "features": "features",
     "database": "database",
+    "reproduce": "reproduce",
 }
 """Sub-command → module under `emulator.cli`: its `command` function, or its `group` of sub-commands.
 

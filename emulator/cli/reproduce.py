@@ -1,0 +1,88 @@
+"""`starhil reproduce`: the thesis's experiments from the real catalogue, beside the published figures."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments; without any, all of them.")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for report.md, tables and figures.")
+    ] = Path("out/reproduce"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A subset in a few minutes, with its checks.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all chance.")] = 1,
+    list_them: Annotated[bool, typer.Option("--list", help="Name the experiments and end.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Make the thesis's experiments again: tables, figures, and report.md with published values beside ours.
+
+    The report holds all that is finished in the folder. A second run in the same folder goes on where the first stopped, and does nothing again that is finished with the
+    same parameters. Exit status 1 when a check fails.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from emulator.reproduce.registry import experiments, select
+    from emulator.reproduce.report import summary, write_report
+    from emulator.reproduce.runner import finished_in, run
+
+    if list_them:
+        _list(as_json=as_json, known={n: (e.title, e.quick is not None) for n, e in experiments().items()})
+        return
+    chosen = select(names or [], quick=quick)
+    start = time.perf_counter()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:
+        task = bar.add_task("starting", total=None)
+        results = run(
+            chosen,
+            output,
+            quick=quick,
+            seed=seed,
+            jobs=jobs,
+            progress=lambda name, done, total: bar.update(
+                task, description=name, completed=done, total=total
+            ),
+        )
+    everything = finished_in(output, list(experiments().values()), quick=quick, seed=seed)
+    report = write_report(everything, output, quick=quick, seed=seed)
+    figures = {
+        "report": str(report),
+        "seed": seed,
+        "quick": quick,
+        "seconds": round(time.perf_counter() - start, 2),
+        **summary(results),
+    }
+    if as_json:
+        print(json.dumps(figures, ensure_ascii=False))
+    else:
+        for result in results:
+            state = "missed" if result.outcome.failed else "ok"
+            print(f"{result.experiment.name:<24} {result.seconds:7.1f} s  {state}")
+            for row in result.outcome.failed:
+                print(f"    {row.quantity}: {row.ours}, target {row.target}")
+        print(
+            f"{figures['checks']} checks, {figures['failed']} missed, {figures['seconds']} s; report: {report}"
+        )
+    if figures["failed"]:
+        raise typer.Exit(1)
+
+
+def _list(*, as_json: bool, known: dict[str, tuple[str, bool]]) -> None:
+    if as_json:
+        print(json.dumps({name: {"title": title, "quick": quick} for name, (title, quick) in known.items()}))
+        return
+    for name, (title, quick) in known.items():
+        print(f"{name:<24} {'quick  ' if quick else '       '}{title}")

@@ -1,0 +1,127 @@
+"""Trials of the LSI algorithm on the thesis's 1 701 frames, on and off the grid, rolled, and with noise."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.reproduce.experiment import Context, Results
+from starid.features import extract_features
+from starid.subcell import SubcellSearch
+from starid.thesis_simulation import NoiseModel, add_noise, turned
+
+COLUMNS: Final = 63
+"""Test frames along right ascension: α corner 2° + 5°·k."""
+
+ROWS: Final = 27
+"""Test frames along declination: δ corner −88° + 5°·m."""
+
+FRAMES: Final = COLUMNS * ROWS
+"""The thesis's number of test frames, 1 701."""
+
+HALF_FRAME_DEG: Final = 20.0
+"""From the corner of a frame to its centre, degrees: the frames behind the published numbers are 40° wide."""
+
+ON, OFF = "on", "off"
+"""The frames as they are, and moved off the grid."""
+
+
+def centres(every: int = 1) -> NDArray[np.float64]:
+    """Centres of the test frames, (n, 2) degrees, row by row; only every so-many-th if asked for."""
+    ra = 2.0 + 5.0 * np.arange(COLUMNS) + HALF_FRAME_DEG
+    dec = -88.0 + 5.0 * np.arange(ROWS) + HALF_FRAME_DEG
+    grid = np.stack(np.meshgrid(ra, dec), axis=-1).reshape(-1, 2)
+    return np.asarray(grid[::every], dtype=np.float64)
+
+
+def test_frames(rng: np.random.Generator, grid: str, step_deg: float, every: int = 1) -> NDArray[np.float64]:
+    """Centres of the test frames; `grid` "off" moves each by its own random fraction of the grid step, both ways."""
+    places = centres(every)
+    if grid == OFF:
+        places = places + step_deg * rng.uniform(0.0, 1.0, places.shape)
+    return places
+
+
+def boresight_error(answer: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Error of the boresight ε_f in the flat plane, eq. 2.21, degrees; right ascension wraps."""
+    ra = (answer[..., 0] - truth[..., 0] + 180.0) % 360.0 - 180.0
+    return np.asarray(np.hypot(ra, answer[..., 1] - truth[..., 1]), dtype=np.float64)
+
+
+def angle_error(answer_rad: float, truth_rad: float) -> float:
+    """Error of an angle ε_θ, eq. 2.22, degrees, 0 … 180."""
+    return abs(math.degrees(math.remainder(answer_rad - truth_rad, 2.0 * math.pi)))
+
+
+def solve_frames(
+    context: Context,
+    overlap: float,
+    grid: str,
+    *,
+    rng: np.random.Generator,
+    noise: NoiseModel | None = None,
+    roll_deg: float = 0.0,
+    every: int = 1,
+) -> Results:
+    """Run LSI, and the sub-cell search after it, on the test frames.
+
+    Parameters
+    ----------
+    context
+        Databases.
+    overlap
+        Overlap ratio p as a fraction.
+    grid
+        "on" or "off".
+    rng
+        Where frames are moved to, and their noise.
+    noise, roll_deg
+        Noise of the stars, and the camera's roll.
+    every
+        Use only every so-many-th frame.
+
+    Returns
+    -------
+    Results
+        `frames` (n, 2) degrees; `f_mse`, `f_1se`, `f_fine` (n,): ε_f in degrees of the two LSI estimates and of the
+        sub-cell search; `theta_mse`, `theta_1se`, `theta_fine`: ε_θ in degrees; `psi_mse`, `residual`: ε_ψ of LSI and
+        of the sub-cell search.
+    """
+    lsi = context.lost_in_space(overlap)
+    fine = SubcellSearch(lsi)
+    sky = context.sky()
+    frames = test_frames(rng, grid, lsi.database.grid.step_deg, every)
+    answers = np.empty((3, len(frames), 2))
+    angles = np.empty((3, len(frames)))
+    psi = np.empty((2, len(frames)))
+    roll = math.radians(roll_deg)
+    for i, (ra, dec) in enumerate(frames):
+        brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
+        if noise is not None:
+            brightness, places, _ = add_noise(rng, brightness, places, noise, sky.half_width)
+        if roll_deg != 0.0:
+            places = turned(places, roll_deg)
+        features = extract_features(brightness, places)
+        solution = lsi.solve(features)
+        better = fine.solve(features)
+        for j, estimate in enumerate((solution.mse, solution.one_se, better)):
+            answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
+            angles[j, i] = angle_error(features.theta_rad - estimate.theta_rad, roll)
+        psi[:, i] = solution.mse.error_psi, better.residual
+    errors = boresight_error(answers, frames)
+    names = ("mse", "1se", "fine")
+    return {
+        "frames": frames,
+        **{f"f_{name}": errors[j] for j, name in enumerate(names)},
+        **{f"theta_{name}": angles[j] for j, name in enumerate(names)},
+        "psi_mse": psi[0],
+        "residual": psi[1],
+    }
+
+
+def share(errors: NDArray[np.float64], limit: float) -> float:
+    """Share of errors within a limit, percent."""
+    return float(100.0 * np.mean(errors <= limit))

@@ -1,0 +1,61 @@
+"""One look for all figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from starid.cache import write_atomically
+
+_STYLE: Any = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.titlesize": 10,
+    "legend.fontsize": 7,
+    "legend.framealpha": 0.85,
+    "lines.linewidth": 1.2,
+    "figure.dpi": 130,
+}
+
+
+def figure(
+    rows: int = 1, columns: int = 1, *, width: float = 7.0, height: float = 4.2, **options: Any
+) -> Any:
+    """A figure without a window, and its axes as `matplotlib.pyplot.subplots` returns them (inches)."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with mpl.rc_context(_STYLE):
+        return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
+
+
+def save(fig: Any, path: Path) -> str:
+    """Write a figure as PNG, close it, and return the file's name."""
+    import matplotlib.pyplot as plt
+
+    write_atomically(path, lambda part: fig.savefig(part, format="png", dpi=130))
+    plt.close(fig)
+    return path.name
+
+
+def colours(count: int) -> list[Any]:
+    """Colours for curves in an order, from dark to light."""
+    import matplotlib as mpl
+
+    return [mpl.colormaps["viridis"](0.05 + 0.85 * i / max(count - 1, 1)) for i in range(count)]
+
+
+def precision_curve(axes: Any, errors: Any, limit: float, **options: Any) -> None:
+    """Draw the share of errors at or below a threshold, in percent, over thresholds 0 … limit in steps of limit/1000."""
+    import numpy as np
+
+    thresholds = np.linspace(0.0, limit, 1001)
+    ordered = np.sort(np.asarray(errors, dtype=np.float64))
+    share = 100.0 * np.searchsorted(ordered, thresholds, side="right") / max(ordered.size, 1)
+    axes.plot(thresholds, share, **options)
+    axes.set_xlim(0.0, limit)
+    axes.set_ylim(0.0, 102.0)
+    axes.set_ylabel("precision rate / %")
