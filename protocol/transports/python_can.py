@@ -34,6 +34,9 @@ SENDS_PER_TURN: Final = 64
 ECHO_S: Final = 0.5
 """How long an own frame is expected to come back on buses that echo."""
 
+BUS_OFF: Final = 0x40
+"""Flag of the kernel's error frames: the controller has left the bus."""
+
 OpenBus = Callable[[], can.BusABC]
 
 
@@ -130,7 +133,11 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
             loop.call_soon_threadsafe(call)
 
     def _take(self, message: can.Message) -> None:
-        if message.is_error_frame or message.is_fd or self._bus is None:
+        if self._bus is None or message.is_fd:
+            return
+        if message.is_error_frame:
+            if message.arbitration_id & BUS_OFF:
+                self._complain(f"CAN {self.description}: bus-off; check the wiring and restart the interface")
             return
         frame = CanFrame(
             message.arbitration_id,

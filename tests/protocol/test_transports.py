@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import subprocess
+import time
 import tty
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -18,7 +20,9 @@ from protocol.errors import ProtocolError
 from protocol.hub import CanHub
 from protocol.transports import CanTransport, SerialTransport, TransportError, open_can, open_serial
 from protocol.transports.can import kernel_can_is_up
+from protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
 from protocol.transports.paced_writer import BACKLOG_LIMIT
+from protocol.transports.python_can import PythonCanTransport
 
 DEADLINE_S = 10.0
 HAS_VCAN = kernel_can_is_up("vcan0")
@@ -447,6 +451,95 @@ def test_a_hub_that_goes_and_comes_back_is_found_again() -> None:
         await pair.one.close()
         await pair.two.close()
         await again.close()
+
+    asyncio.run(main())
+
+
+def test_a_hub_that_stops_reading_neither_blocks_nor_fills_memory() -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"< hi >")
+        for _ in range(3):
+            await reader.readuntil(b">")
+            writer.write(b"< ok >")
+        await asyncio.Event().wait()
+
+    async def main() -> None:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0, limit=64)
+        transport = open_can(f"socketcand:127.0.0.1:{server.sockets[0].getsockname()[1]}/vcan0")
+        await transport.start(lambda _: None)
+        for number in range(1_000_000):
+            if not transport.send(FRAMES[0]):
+                break
+            if number % 500 == 0:
+                await asyncio.sleep(0)
+        assert transport.statistics.dropped == 1
+        assert transport._connection.transport.get_write_buffer_size() < HUB_BACKLOG + 100_000  # type: ignore[attr-defined]
+        await transport.close()
+        server.close()
+
+    asyncio.run(main())
+
+
+def _set_link(state: str) -> None:
+    result = subprocess.run(
+        ["ip", "link", "set", "vcan0", state], capture_output=True, text=True, check=False
+    )
+    if result.returncode:
+        pytest.skip(f"vcan0 cannot be set {state} here: {result.stderr.strip()}")
+
+
+@pytest.mark.socketcan
+@pytest.mark.skipif(not HAS_VCAN, reason="no vcan0 here")
+def test_an_interface_that_goes_down_is_told_and_found_again() -> None:
+    async def main() -> None:
+        async with can_pair("socketcan") as pair:
+            _set_link("down")
+            try:
+                pair.one.send(FRAMES[0])
+                await until(lambda: len(pair.errors) == 2)
+                assert "lost" in str(pair.errors[0])
+            finally:
+                _set_link("up")
+            await until(lambda: pair.one.statistics.reconnects == pair.two.statistics.reconnects == 1)
+            pair.one.send(FRAMES[1])
+            await until(lambda: pair.got_two == [FRAMES[1]])
+
+    asyncio.run(main())
+
+
+class _BusInTrouble(can.BusABC):
+    """A bus that reports bus-off once and is silent then."""
+
+    def __init__(self) -> None:
+        super().__init__(channel="trouble")
+        self._messages = [
+            can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=True, data=bytes(8))
+        ]
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self._messages:
+            return self._messages.pop(), True
+        time.sleep(timeout or 0.0)
+        return None, True
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
+        raise can.CanOperationError("bus-off")
+
+
+def test_bus_off_is_told_and_no_frame() -> None:
+    async def main() -> None:
+        transport = PythonCanTransport("trouble:0", _BusInTrouble)
+        errors: list[ProtocolError] = []
+        got: list[CanFrame] = []
+        await transport.start(got.append, errors.append)
+        await until(lambda: bool(errors))
+        assert "bus-off; check the wiring" in str(errors[0])
+        transport.send(FRAMES[0])
+        await until(lambda: len(errors) >= 2)
+        assert "lost: bus-off" in str(errors[1])
+        await transport.close()
+        assert got == []
+        assert transport.statistics.dropped == 1
 
     asyncio.run(main())
 
