@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from emulator.binning import mean_over_squares
 from emulator.clock import NANOSECONDS
 from emulator.cycle import FrameCycle
 from emulator.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
@@ -41,10 +42,9 @@ class StoredImage:
         """Return the image made smaller by averaging squares of pixels."""
         if edge == self.edge:
             return self
-        step = self.edge // edge
-        grid = np.frombuffer(self.pixels, dtype=np.uint8).reshape(edge, step, edge, step)
-        means = (grid.sum(axis=(1, 3), dtype=np.uint32) + step * step // 2) // (step * step)
-        return StoredImage(edge, means.astype(np.uint8).tobytes(), self.frame, self.number)
+        image = np.frombuffer(self.pixels, dtype=np.uint8).reshape(self.edge, self.edge)
+        small = mean_over_squares(image, self.edge // edge)
+        return StoredImage(edge, small.tobytes(), self.frame, self.number)
 
     def bmp(self) -> bytes:
         """Return the image as a grey BMP file."""

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.binning import mean_over_squares
 from emulator.errors import EmulatorError
 from emulator.frames import (
     Failure,
@@ -284,10 +285,6 @@ def square_image(image: NDArray[Any], bits: int, edge: int) -> bytes:
     height, width = image.shape
     full = 1 << (max(height, width) - 1).bit_length()
     full = max(full, edge)
-    square = np.zeros((full, full), dtype=np.uint32)
+    square = np.zeros((full, full), dtype=np.uint8)
     square[:height, :width] = eight_bits(image, bits)
-    step = full // edge
-    if step > 1:
-        summed = square.reshape(edge, step, edge, step).sum(axis=(1, 3), dtype=np.uint64)
-        square = ((summed + step * step // 2) // (step * step)).astype(np.uint32)
-    return square.astype(np.uint8).tobytes()
+    return mean_over_squares(square, full // edge).tobytes()

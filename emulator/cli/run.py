@@ -49,6 +49,7 @@ def command(
     worker = WorkerProcess()  # first of all: it imports and warms up while this process does the rest
 
     import asyncio
+    import gc
     import logging
 
     from emulator.emulation import Emulation, RunOptions
@@ -87,6 +88,8 @@ def command(
             stop = asyncio.create_task(emulation.ended.wait())
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
+                gc.collect()
+                gc.freeze()  # what is there now stays: the collector need not stop the links to look at it
                 print(line.result(), flush=True)
                 await stop
             else:
