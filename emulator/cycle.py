@@ -28,6 +28,7 @@ MAX_PENDING: Final = 2
 """Frames in the pipeline above which the next exposure is left out."""
 
 HISTORY: Final = 10
+RATE_GAP_PERIODS: Final = 2.5
 RATE_SPAN_S: Final = 2.0
 """Time back to which attitudes count for the rate, seconds; the last two always count."""
 
@@ -100,8 +101,10 @@ class RateEstimator:
         """The last valid attitude and its time, or None."""
         return self._fixes[-1] if self._fixes else None
 
-    def add(self, mid_ns: int, attitude: Attitude) -> None:
-        """Take in a valid attitude."""
+    def add(self, mid_ns: int, attitude: Attitude, period_s: float) -> None:
+        """Take in a valid attitude; after a gap of more than `RATE_GAP_PERIODS` the ones before it say nothing."""
+        if self._fixes and mid_ns - self._fixes[-1][0] > RATE_GAP_PERIODS * period_s * NANOSECONDS:
+            self._fixes.clear()
         self._fixes.append((mid_ns, attitude))
 
     def rate(self, window: int) -> Triple | None:
@@ -387,7 +390,7 @@ class FrameCycle:
         """Return whether the device stands by a result, why not, and the rate."""
         if not result.valid:
             return False, result.reason, None
-        self._rates.add(frame.mid_ns, Attitude(np.array(result.quaternion_xyzw)))
+        self._rates.add(frame.mid_ns, Attitude(np.array(result.quaternion_xyzw)), frame.period_s)
         rate = result.rate_rad_s or self._rates.rate(self._rate_window)
         if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):
             return False, "timeout", rate

@@ -177,6 +177,7 @@ class Device:
         self.parameters.set_defaults()
         for name in self.parameters.take_stored(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; its default is used", name)
+        self._plan_unsolicited()
         self._persist(lambda error: log.error("%s", error) if error else None)
         if self.store.corrupt:
             log.warning("the stored state was not whole: it is set aside, defaults are used")

@@ -379,6 +379,20 @@ def test_an_attitude_that_is_not_renewed_goes_out_of_date(bench):
     assert (attitude["valid"], attitude["reason"]) == (False, "no_frame")
 
 
+def test_a_rate_is_never_taken_over_a_gap(make_bench):
+    bench = make_bench(truth=RateTruth(ORION, np.radians([0.0, 0.5, 0.0]))).start()
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(3.5)
+    bench.command("set_mode", mode="standby")
+    bench.step(500.0)  # the sensor has turned by 250 degrees
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(0.9)
+    attitude = bench.read("precise_attitude")
+    assert (attitude["valid"], attitude["rate_valid"]) == (True, False)
+    bench.step(1.0)
+    assert bench.read("rates")["rate_y"] == pytest.approx(0.5, abs=1e-4)
+
+
 def test_too_high_a_rate_is_flagged(make_bench):
     bench = make_bench(truth=RateTruth(ORION, np.radians([0.0, 6.0, 0.0]))).start()
     bench.command("set_mode", mode="lost_in_space")
@@ -589,4 +603,16 @@ def test_unsolicited_telemetry_goes_out_at_its_rate(bench):
     bench.command("set_unsolicited", telemetry=160, rate=0.0)
     bench.step(5.0)
     assert len(sent) == 40
+
+
+def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
+    bench = make_bench(Profile(parameters={"unsolicited_rate": 2.0, "unsolicited_selection": 128}))
+    sent = []
+    bench.device.outlets.append(sent.append)
+    bench.start()
+    assert len(sent) == 3
+    assert sent[0].id == 128
+
+
+def test_unsolicited_telemetry_needs_a_row(bench):
     assert bench.command("set_unsolicited", telemetry=200, rate=1.0) is ErrorCode.INVALID_PARAMETER
