@@ -25,6 +25,7 @@ COMMANDS: Final[dict[str, str]] = {
     "catalog": "catalog",
     "calibrate": "calibrate",
     "session": "session",
+    "conformance": "conformance",
     "hub": "hub",
     "features": "features",
     "database": "database",

@@ -131,7 +131,7 @@ def time_identifier(probe: CanopenProbe) -> None:
     for identifier in (*FORBIDDEN, 0x2000_0100):
         probe.expect_refusal(0x1012, 0, identifier, 4, *REFUSED)
     probe.set(0x1012, 0, 0x8000_0100)
-    probe.expect_refusal(0x1012, 0, 0x8000_0110, 4, *REFUSED)
+    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *REFUSED)
 
 
 @case(

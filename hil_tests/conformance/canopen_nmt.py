@@ -239,7 +239,7 @@ def guarding(probe: CanopenProbe) -> None:
     probe.command(STOP)
     check_equal(_guard(probe), 0x04, "answer in STOPPED")
     probe.command(PRE_OPERATIONAL)
-    _guard(probe)
+    check_equal([_guard(probe) for _ in range(2)], [0xFF, 0x7F], "answers in PRE-OPERATIONAL")
     probe.reset_communication()
     _prepare(probe, 0)
     probe.drain()

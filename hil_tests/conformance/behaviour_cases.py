@@ -1,0 +1,491 @@
+"""Conformance of what the device does, on any link: acknowledge, counters, echo, time, modes, reset, store."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
+
+ACKNOWLEDGE: Final = "CubeComputer TLM 240: last telecommand, processed, error, index (AlbertaSat, CTS)"
+COUNTERS: Final = "CubeComputer TLM 144: counts of telecommands and telemetry (AlbertaSat, CTS)"
+CLOCK: Final = "CubeComputer TC 2 and TLM 140 (AlbertaSat, CTS)"
+RESET: Final = "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)"
+HOLE_MAP: Final = "CubeComputer TC 120 to 127 and TLM 247 to 254 (AlbertaSat, CTS)"
+OURS: Final = "rule of this product (docs of the interface definition)"
+
+CLOCK_STEP_S: Final = 1_700_000_000
+CLOCK_TOLERANCE_S: Final = 0.25
+TEST_VALUE: Final = 137.0
+COUNTED: Final = 30
+
+_CASES: list[Case[LinkProbe]] = []
+
+
+# --- acknowledge ---
+
+
+@case(
+    _CASES,
+    "acknowledge.accepted",
+    "after an accepted telecommand: its identifier, processed, no error",
+    ACKNOWLEDGE,
+    intrusive=True,
+)
+def acknowledge_accepted(probe: LinkProbe) -> None:
+    """Two different ones."""
+    for name, values in (("select_parameter", {"parameter": 1}), ("clear_counters", {})):
+        probe.command(name, **values)
+        seen = probe.telemetry("acknowledge")
+        wanted = {
+            "last_telecommand": probe.icd.telecommands[name].id,
+            "processed": True,
+            "error": "ok",
+            "parameter_index": 0,
+        }
+        check_equal(seen, wanted, "acknowledge")
+
+
+@case(
+    _CASES,
+    "acknowledge.unknown",
+    "after an unknown telecommand: its identifier and invalid_id",
+    ACKNOWLEDGE,
+    intrusive=True,
+)
+def acknowledge_unknown(probe: LinkProbe) -> None:
+    """Number 60."""
+    probe.expect_refusal(60, b"", INVALID_ID)
+    seen = probe.telemetry("acknowledge")
+    check_equal(
+        (seen["last_telecommand"], seen["processed"], seen["error"]), (60, True, "invalid_id"), "acknowledge"
+    )
+
+
+@case(
+    _CASES,
+    "acknowledge.kept",
+    "reading telemetry does not change the acknowledge",
+    ACKNOWLEDGE,
+    intrusive=True,
+)
+def acknowledge_kept(probe: LinkProbe) -> None:
+    """It stays that of the last telecommand."""
+    probe.expect_refusal(96, b"\x4d", INVALID_PARAMETER)
+    first = probe.telemetry("acknowledge")
+    for name in ("identification", "acknowledge", "device_status"):
+        probe.telemetry(name)
+    check_equal(probe.telemetry("acknowledge"), first, "acknowledge")
+
+
+@case(_CASES, "acknowledge.forgets", "a later success clears the error", ACKNOWLEDGE, intrusive=True)
+def acknowledge_forgets(probe: LinkProbe) -> None:
+    """Error and index."""
+    probe.expect_refusal(2, bytes.fromhex("00000000FFFF"), INVALID_PARAMETER)
+    probe.command("clear_counters")
+    seen = probe.telemetry("acknowledge")
+    check_equal((seen["error"], seen["parameter_index"]), ("ok", 0), "error and index")
+
+
+# --- counters ---
+
+
+def _counts(probe: LinkProbe) -> tuple[int, int]:
+    seen = probe.telemetry("communication_status")
+    return int(seen["telecommand_count"]), int(seen["telemetry_count"])
+
+
+@case(
+    _CASES,
+    "counters.telemetry",
+    "each request of telemetry counts once, the reading of the counters too",
+    COUNTERS,
+)
+def counters_telemetry(probe: LinkProbe) -> None:
+    """Thirty of them; telecommands do not count along."""
+    commands, before = _counts(probe)
+    for _ in range(COUNTED):
+        probe.telemetry("identification")
+    after_commands, after = _counts(probe)
+    check_equal((after - before) % 65536, COUNTED + 1, "increase")
+    check_equal(after_commands, commands, "count of telecommands")
+
+
+@case(_CASES, "counters.refused-telemetry", "a refused request of telemetry counts as well", COUNTERS)
+def counters_refused_telemetry(probe: LinkProbe) -> None:
+    """It was received."""
+    _, before = _counts(probe)
+    probe.expect_refusal(200, b"", INVALID_ID)
+    check_equal((_counts(probe)[1] - before) % 65536, 2, "increase")
+
+
+@case(
+    _CASES,
+    "counters.telecommands",
+    "each telecommand counts once, accepted or refused",
+    COUNTERS,
+    intrusive=True,
+)
+def counters_telecommands(probe: LinkProbe) -> None:
+    """Accepted, of a wrong length, unknown, out of limits."""
+    before, _ = _counts(probe)
+    probe.command("select_parameter", parameter=1)
+    probe.expect_refusal(60, b"", INVALID_ID)
+    probe.ask(2, b"\x01")
+    probe.expect_refusal(96, b"\x4d", INVALID_PARAMETER)
+    check_equal((_counts(probe)[0] - before) % 65536, 4, "increase")
+
+
+@case(_CASES, "counters.clear", "clear_counters sets both counts to zero", COUNTERS, intrusive=True)
+def counters_clear(probe: LinkProbe) -> None:
+    """The command itself does not count any more, the reading does."""
+    probe.command("clear_counters")
+    check_equal(_counts(probe), (0, 1), "counts")
+
+
+# --- data goes through unchanged: the hole map as an echo ---
+
+ECHOES: Final = (
+    ("zeros", bytes(16)),
+    ("ones", b"\xff" * 16),
+    ("escapes", b"\x1f" * 16),
+    ("starts", b"\x1f\x7f" * 8),
+    ("ends", b"\x1f\xff" * 8),
+    ("escape-last", bytes(15) + b"\x1f"),
+    ("escape-first", b"\x1f" + bytes(15)),
+    ("ramp", bytes(range(16))),
+    ("ramp-of-escapes", bytes(range(0x18, 0x28))),
+)
+
+
+def _echo_case(name: str, data: bytes) -> Case[LinkProbe]:
+    def run(probe: LinkProbe) -> None:
+        for part in (1, 8):
+            probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{part}"].id, data)
+            row = probe.icd.telemetry[f"hole_map_{part}"]
+            probe.post(row.id)
+            check_equal(probe.expect_telemetry(row.id), data, "the same bytes")
+
+    return Case(
+        f"data.{name}",
+        "data",
+        f"16 bytes ({name}) go there and back unchanged",
+        HOLE_MAP,
+        run,
+        intrusive=True,
+    )
+
+
+_CASES += [_echo_case(*echo) for echo in ECHOES]
+
+
+@case(_CASES, "data.parts", "the eight parts of the hole map are kept apart", HOLE_MAP, intrusive=True)
+def parts(probe: LinkProbe) -> None:
+    """Each gets its own number."""
+    for part in range(1, 9):
+        probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{part}"].id, bytes([part]) * 16)
+    for part in range(1, 9):
+        row = probe.icd.telemetry[f"hole_map_{part}"]
+        probe.post(row.id)
+        check_equal(probe.expect_telemetry(row.id), bytes([part]) * 16, f"part {part}")
+
+
+# --- time ---
+
+
+def _clock(probe: LinkProbe) -> float:
+    seen = probe.telemetry("unix_time")
+    return int(seen["seconds"]) + int(seen["milliseconds"]) / 1000.0
+
+
+@case(_CASES, "time.set", "the clock is what it was set to", CLOCK, intrusive=True)
+def time_set(probe: LinkProbe) -> None:
+    """Seconds and milliseconds, with bytes that have to be stuffed; the clock is put back afterwards."""
+    before, began = _clock(probe), probe.now()
+    for seconds, milliseconds in ((CLOCK_STEP_S, 250), (0x1F1F1F1F, 31), (0, 0), (0xFFFFFFF0, 999)):
+        probe.command("set_unix_time", seconds=seconds, milliseconds=milliseconds)
+        wanted = seconds + milliseconds / 1000.0
+        seen = _clock(probe)
+        check(0.0 <= seen - wanted <= CLOCK_TOLERANCE_S, f"clock from {wanted:.3f} on", f"{seen:.3f}")
+    _put_back(probe, before, began)
+
+
+def _put_back(probe: LinkProbe, before: float, began: float) -> None:
+    whole = before + probe.now() - began
+    probe.command("set_unix_time", seconds=int(whole), milliseconds=int(whole % 1.0 * 1000))
+
+
+@case(_CASES, "time.runs", "the clock runs as fast as the tester's", CLOCK)
+def time_runs(probe: LinkProbe) -> None:
+    """Over one second, to 2 % and the time of the requests."""
+    begin, first = probe.now(), _clock(probe)
+    middle = probe.now()
+    probe.sleep(1.0)
+    third, last = probe.now(), _clock(probe)
+    end = probe.now()
+    check(0.98 * (third - middle) <= last - first <= 1.02 * (end - begin) + 0.002, f"{third - middle:.3f} to {end - begin:.3f} s", f"{last - first:.3f} s")  # fmt: skip
+
+
+@case(
+    _CASES,
+    "time.flag",
+    "device_status tells that the clock was set, and the same time",
+    CLOCK,
+    intrusive=True,
+)
+def time_flag(probe: LinkProbe) -> None:
+    """The two rows agree."""
+    before, began = _clock(probe), probe.now()
+    probe.command("set_unix_time", seconds=CLOCK_STEP_S, milliseconds=0)
+    status = probe.telemetry("device_status")
+    check(status["time_set"], "flag time_set", "not set")
+    check(
+        0.0 <= float(status["clock"]) - CLOCK_STEP_S <= CLOCK_TOLERANCE_S,
+        f"clock from {CLOCK_STEP_S} on",
+        status["clock"],
+    )
+    _put_back(probe, before, began)
+
+
+@case(_CASES, "time.uptime", "runtime and uptime agree and grow", RESET)
+def uptime(probe: LinkProbe) -> None:
+    """Identification wraps at 65536 s."""
+    first = probe.telemetry("identification")
+    status = probe.telemetry("device_status")
+    runtime = int(first["runtime_s"]) + int(first["runtime_ms"]) / 1000.0
+    check(int(first["runtime_ms"]) < 1000, "milliseconds below 1000", first["runtime_ms"])
+    difference = float(status["uptime"]) % 65536 - runtime
+    check(-0.002 <= difference <= 1.0, "uptime just after runtime", f"{difference:.3f} s apart")
+    probe.sleep(0.2)
+    second = probe.telemetry("device_status")
+    grown = float(second["uptime"]) - float(status["uptime"])
+    check(0.15 <= grown <= 2.0, "0.2 s more", f"{grown:.3f} s")
+
+
+# --- modes ---
+
+
+@case(
+    _CASES, "modes.standby", "in standby no attitude is valid, and the rows agree on it", OURS, intrusive=True
+)
+def standby(probe: LinkProbe) -> None:
+    """precise_attitude, device_status, star_performance_2."""
+    probe.standby()
+    probe.wait_for("device_status", {"attitude_valid": False}, 2.0)
+    attitude = probe.telemetry("precise_attitude")
+    check_equal((attitude["valid"], attitude["q_x"], attitude["q_w"]), (False, 0.0, 0.0), "valid, q_x, q_w")
+    check(attitude["reason"] != "ok", "a reason other than ok", attitude["reason"])
+    check(not probe.telemetry("star_performance_2")["attitude_ok"], "attitude_ok not set", "set")
+
+
+@case(
+    _CASES,
+    "modes.frames",
+    "out of standby frames are made at the update rate, in standby none",
+    OURS,
+    intrusive=True,
+)
+def frames(probe: LinkProbe) -> None:
+    """Two seconds at 5 Hz, with or without stars."""
+    probe.standby()
+    with probe.kept("update_rate"):
+        probe.set_parameter("update_rate", 5.0)
+        probe.command("set_mode", mode="lost_in_space")
+        probe.sleep(0.6)
+        first = int(probe.telemetry("device_status")["frames_captured"])
+        probe.sleep(2.0)
+        made = int(probe.telemetry("device_status")["frames_captured"]) - first
+        check(9 <= made <= 11, "9 to 11 frames in 2 s at 5 Hz", made)
+        probe.command("set_mode", mode="standby")
+        probe.sleep(1.0)
+        first = int(probe.telemetry("device_status")["frames_captured"])
+        probe.sleep(0.6)
+        check_equal(int(probe.telemetry("device_status")["frames_captured"]), first, "frames in standby")
+
+
+@case(_CASES, "modes.changes", "mode and its counter follow the command", OURS, intrusive=True)
+def changes(probe: LinkProbe) -> None:
+    """Standby to lost in space and back."""
+    probe.standby()
+    first = int(probe.telemetry("device_status")["mode_changes"])
+    probe.command("set_mode", mode="lost_in_space")
+    mode = probe.telemetry("device_status")["mode"]
+    check(mode in ("lost_in_space", "tracking"), "mode lost_in_space or tracking", mode)
+    probe.command("set_mode", mode="standby")
+    seen = probe.telemetry("device_status")
+    check_equal(seen["mode"], "standby", "mode")
+    check(
+        (int(seen["mode_changes"]) - first) % 256 >= 2,
+        "two changes or more",
+        (int(seen["mode_changes"]) - first) % 256,
+    )
+
+
+@case(
+    _CASES,
+    "modes.no-tracking",
+    "tracking without an attitude to start from is refused with code 7",
+    OURS,
+    intrusive=True,
+)
+def no_tracking(probe: LinkProbe) -> None:
+    """After a reset there is none."""
+    probe.reset()
+    row = probe.icd.telecommands["set_mode"]
+    probe.expect_refusal(row.id, row.encode({"mode": "tracking"}), SEQUENCE)
+    check_equal(probe.telemetry("device_status")["mode"], "standby", "mode")
+
+
+@case(
+    _CASES,
+    "modes.attitude",
+    "with stars in view: valid, of unit length, its time just past, all rows agree",
+    OURS,
+    intrusive=True,
+)
+def attitude(probe: LinkProbe) -> None:
+    """Skipped where no attitude is found within 20 s."""
+    probe.standby()
+    probe.command("set_mode", mode="lost_in_space")
+    end = probe.now() + 20.0
+    while not (seen := probe.telemetry("precise_attitude"))["valid"]:
+        if probe.now() > end:
+            probe.standby()
+            raise CaseSkipped("no attitude was found within 20 s: no stars in view?")
+        probe.sleep(0.1)
+    clock = float(probe.telemetry("device_status")["clock"])
+    length = sum(float(seen[key]) ** 2 for key in ("q_x", "q_y", "q_z", "q_w")) ** 0.5
+    check(abs(length - 1.0) < 1e-5, "a quaternion of length 1", f"{length:.7f}")
+    check(float(seen["q_w"]) >= 0.0, "scalar part not negative", seen["q_w"])
+    check_equal(seen["reason"], "ok", "reason")
+    check(int(seen["stars_matched"]) >= 3, "three stars or more", seen["stars_matched"])
+    age = clock - float(seen["time_of_exposure"])
+    check(0.0 <= age <= 5.0, "time of exposure up to 5 s ago", f"{age:.3f} s")
+    probe.command("set_mode", mode="standby")
+
+
+# --- reset ---
+
+
+@case(
+    _CASES, "reset.magic", "reset without its magic number is refused and does nothing", RESET, intrusive=True
+)
+def reset_magic(probe: LinkProbe) -> None:
+    """CubeWheel's 0x55 among them."""
+    before = probe.telemetry("boot_status")["boot_count"]
+    row = probe.icd.telecommands["reset"]
+    for magic in (0x00, 0x55, 0x59, 0x5B, 0xFF):
+        probe.expect_refusal(row.id, bytes([magic]), INVALID_PARAMETER)
+    probe.sleep(0.2)
+    check_equal(probe.telemetry("boot_status")["boot_count"], before, "boot count")
+
+
+@case(
+    _CASES,
+    "reset.acknowledged",
+    "reset is acknowledged, then the device restarts by command",
+    RESET,
+    intrusive=True,
+)
+def reset_acknowledged(probe: LinkProbe) -> None:
+    """Runtime from zero, one boot more, cause, counters at zero."""
+    before = probe.telemetry("boot_status")
+    began = probe.now()
+    probe.reset()
+    seen = probe.telemetry("boot_status")
+    check_equal(int(seen["boot_count"]), (int(before["boot_count"]) + 1) % 65536, "boot count")
+    check_equal(seen["reset_cause"], "command", "reset cause")
+    identification = probe.telemetry("identification")
+    runtime = int(identification["runtime_s"]) + int(identification["runtime_ms"]) / 1000.0
+    check(runtime <= probe.now() - began + 0.01, "runtime from zero", f"{runtime:.3f} s")
+    check_equal(_counts(probe)[0], 0, "count of telecommands")
+    check_equal(probe.telemetry("acknowledge")["last_telecommand"], 0, "last telecommand")
+
+
+# --- store ---
+
+
+@case(
+    _CASES,
+    "store.reset",
+    "a parameter that is not saved is lost at a reset, a saved one is kept",
+    OURS,
+    intrusive=True,
+)
+def store_reset(probe: LinkProbe) -> None:
+    """What was stored before is stored again afterwards."""
+    before = float(probe.parameter("exposure")["value"])
+    probe.set_parameter("exposure", TEST_VALUE)
+    probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
+    _save(probe)
+    probe.set_parameter("exposure", TEST_VALUE + 1)
+    probe.reset()
+    try:
+        check_equal(float(probe.parameter("exposure")["value"]), TEST_VALUE, "saved exposure")
+    finally:
+        probe.set_parameter("exposure", before)
+        _save(probe)
+
+
+def _save(probe: LinkProbe) -> None:
+    probe.command("save_parameters")
+    seen = probe.wait_for("acknowledge", {"processed": True}, 5.0)
+    check_equal(seen["error"], "ok", "result of save_parameters")
+    probe.wait_for("device_status", {"parameters_changed": False}, 2.0)
+
+
+@case(_CASES, "store.restore", "restore_parameters brings back what is stored", OURS, intrusive=True)
+def store_restore(probe: LinkProbe) -> None:
+    """Without a reset."""
+    before = float(probe.parameter("exposure")["value"])
+    _save(probe)
+    probe.set_parameter("exposure", TEST_VALUE)
+    probe.command("restore_parameters")
+    check_equal(float(probe.parameter("exposure")["value"]), before, "exposure")
+
+
+@case(
+    _CASES,
+    "store.defaults",
+    "default_parameters sets the defaults and leaves the store as it is",
+    OURS,
+    intrusive=True,
+)
+def store_defaults(probe: LinkProbe) -> None:
+    """Restored afterwards."""
+    _save(probe)
+    stored = float(probe.parameter("limiting_magnitude")["value"])
+    probe.set_parameter("limiting_magnitude", 4.25)
+    _save(probe)
+    probe.command("default_parameters")
+    seen = probe.parameter("limiting_magnitude")
+    check_equal(seen["value"], seen["default"], "limiting_magnitude")
+    probe.command("restore_parameters")
+    check_equal(float(probe.parameter("limiting_magnitude")["value"]), 4.25, "stored limiting_magnitude")
+    probe.set_parameter("limiting_magnitude", stored)
+    _save(probe)
+
+
+@case(
+    _CASES,
+    "store.config",
+    "set_star_config sets parameters, all or nothing, and star_config shows them",
+    "CubeComputer TC 37, TLM 202 (AlbertaSat)",
+    intrusive=True,
+)
+def star_config(probe: LinkProbe) -> None:
+    """53 bytes there and back; one bad field changes nothing."""
+    row = probe.icd.telecommands["set_star_config"]
+    before = probe.telemetry("star_config")
+    wanted = {**before, "exposure": 140, "max_stars_matched": 40}
+    probe.command("set_star_config", **wanted)
+    check_equal(probe.telemetry("star_config"), wanted, "star_config")
+    check_equal(float(probe.parameter("exposure")["value"]), 140.0, "parameter exposure")
+    bad = bytearray(row.encode({**wanted, "exposure": 160}))
+    bad[row.named_fields["max_stars_matched"].offset] = 0
+    probe.expect_refusal(row.id, bytes(bad), INVALID_PARAMETER)
+    check_equal(probe.telemetry("star_config"), wanted, "star_config after a refusal")
+    probe.command("set_star_config", **before)
+
+
+CASES: Final = tuple(_CASES)

@@ -1,0 +1,178 @@
+"""The tester's side of a device on CAN with the CubeSpace identifier layout: strict about every frame."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hil_tests.conformance.link_probe import (
+    BURST_ID,
+    FIRST_TELEMETRY,
+    Answer,
+    LinkProbe,
+    ProbeTimes,
+)
+from hil_tests.conformance.ports import Port
+from hil_tests.raw_exchange import format_frame
+from protocol.can_framing import CanFrame
+from protocol.icd import InterfaceDefinition
+
+TELECOMMAND: Final = 1
+ACK: Final = 2
+NACK: Final = 3
+TELEMETRY_REQUEST: Final = 4
+TELEMETRY: Final = 5
+TELEMETRY_NACK: Final = 6
+TELECOMMAND_SEGMENT: Final = 7
+TELEMETRY_SEGMENT: Final = 8
+UNSOLICITED: Final = (9, 10, 11, 12)
+ANSWERS: Final = (ACK, NACK, TELEMETRY, TELEMETRY_NACK, TELEMETRY_SEGMENT)
+
+
+def identifier_of(kind: int, number: int, source: int, destination: int) -> int:
+    """Put a 29-bit identifier together: type[28:24], id[23:16], source[15:8], destination[7:0]."""
+    return kind << 24 | number << 16 | source << 8 | destination
+
+
+def segments(data: bytes) -> list[bytes]:
+    """Cut data into segments of 7 bytes and a byte that counts those still to come."""
+    parts = [data[start : start + 7] for start in range(0, len(data), 7)]
+    return [part + bytes([len(parts) - 1 - number]) for number, part in enumerate(parts)]
+
+
+class CanProbe(LinkProbe):
+    """Talks over a CAN bus.
+
+    Parameters
+    ----------
+    bus
+        The bus.
+    icd
+        Rows and names.
+    host, device
+        CAN addresses of the tester and of the device.
+    """
+
+    link = "can"
+
+    def __init__(
+        self,
+        bus: Port[CanFrame],
+        icd: InterfaceDefinition,
+        *,
+        host: int = 1,
+        device: int = 4,
+        times: ProbeTimes | None = None,
+    ) -> None:
+        super().__init__(icd, times or ProbeTimes())
+        self.bus = bus
+        self.host = host
+        self.device = device
+        self.unsolicited: list[tuple[float, CanFrame]] = []
+        self._frames: list[CanFrame] = []
+
+    def now(self) -> float:
+        """Time of the port, s."""
+        return self.bus.now()
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass; what comes meanwhile is kept."""
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0:
+            self._take(left)
+
+    def post(self, identifier: int, data: bytes = b"") -> None:
+        """Send a request without waiting."""
+        self.post_as(self.host, identifier, data)
+
+    def post_as(self, source: int, identifier: int, data: bytes = b"") -> None:
+        """Send a request from another address than the tester's own."""
+        kind = TELEMETRY_REQUEST if identifier >= FIRST_TELEMETRY else TELECOMMAND
+        payloads = [data]
+        if len(data) > 8:
+            kind, payloads = TELECOMMAND_SEGMENT, segments(data)
+        for payload in payloads:
+            self.send(CanFrame(identifier_of(kind, identifier, source, self.device), payload))
+
+    def send(self, frame: CanFrame) -> None:
+        """Send a frame as it stands."""
+        self.log.append(f"{self.now():.4f} -> {format_frame(frame)}")
+        self.bus.send(frame)
+
+    def _take(self, timeout_s: float) -> bool:
+        frame = self.bus.receive(timeout_s)
+        if frame is None:
+            return False
+        if not frame.extended or frame.remote or frame.id >> 8 & 0xFF != self.device:
+            return True
+        self.log.append(f"{self.now():.4f} <- {format_frame(frame)}")
+        if frame.id >> 24 in UNSOLICITED:
+            self.unsolicited.append((self.now(), frame))
+        else:
+            self._frames.append(frame)
+        return True
+
+    def drain(self) -> None:
+        """Let go of all that has come."""
+        while self.bus.receive(0.0) is not None:
+            pass
+        self._frames.clear()
+        self.unsolicited.clear()
+
+    def surplus(self, quiet_s: float) -> Answer:
+        """Return what comes without having been asked for."""
+        self.sleep(quiet_s)
+        return self._read(0.0) if self._frames else Answer("none")
+
+    def next_frame(self, timeout_s: float | None = None) -> CanFrame | None:
+        """Return the next frame of the device that is not unsolicited, None if none comes."""
+        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        while not self._frames:
+            left = end - self.now()
+            if left <= 0 or not self._take(left):
+                break
+        return self._frames.pop(0) if self._frames else None
+
+    def next_answer(self, timeout_s: float | None = None) -> Answer:
+        """Return the next answer that was not yet looked at."""
+        return self._read(self.times.answer_s if timeout_s is None else timeout_s)
+
+    def _read(self, timeout_s: float) -> Answer:
+        frame = self.next_frame(timeout_s)
+        if frame is None:
+            return Answer("none")
+        kind, number = frame.id >> 24, frame.id >> 16 & 0xFF
+        other = frame.id & 0xFF
+        telemetry = number >= FIRST_TELEMETRY
+        match kind:
+            case 2 if not frame.data and not telemetry:
+                return Answer("ack", identifier=number, other=other)
+            case 3 | 6 if len(frame.data) == 1 and frame.data[0] and (kind == TELEMETRY_NACK) == telemetry:
+                return Answer("nack", code=frame.data[0], identifier=number, other=other)
+            case 5 if telemetry:
+                return Answer("telemetry", data=frame.data, identifier=number, other=other)
+            case 8 if telemetry or number == BURST_ID:
+                return self._segmented(frame, number, other)
+            case _:
+                return Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
+
+    def _segmented(self, first: CanFrame, number: int, other: int) -> Answer:
+        """Join the segments of one message; another counter or a short one in between is malformed."""
+        data = b""
+        frame: CanFrame | None = first
+        left = first.data[-1] if first.data else 0
+        while frame is not None and frame.id == first.id and frame.data and frame.data[-1] == left:
+            data += frame.data[:-1]
+            if left == 0:
+                kind = "burst" if number == BURST_ID else "telemetry"
+                whole = len(data) > 8
+                if not whole:
+                    return Answer("malformed", data=data, identifier=number, other=other)
+                return Answer(
+                    "burst" if kind == "burst" else "telemetry", data=data, identifier=number, other=other
+                )
+            if len(frame.data) != 8:
+                break
+            left -= 1
+            frame = self.next_frame()
+        seen = b"" if frame is None else frame.data
+        return Answer("malformed", data=data + seen, identifier=number, other=other)

@@ -1,0 +1,163 @@
+"""A conformance run from the options to the reports: unit, links, cases, and what to do with the results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from hil_tests.conformance.can_probe import CanProbe
+from hil_tests.conformance.case import Case
+from hil_tests.conformance.link_probe import ProbeTimes
+from hil_tests.conformance.ports import live_can, live_serial
+from hil_tests.conformance.runner import Outcome, run_cases, select_cases
+from hil_tests.conformance.serial_probe import SerialProbe
+from hil_tests.conformance.suites import can_suite, serial_suite
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.errors import BenchError
+from hil_tests.own_hub import OwnBus
+from protocol.icd import InterfaceDefinition, load_icd
+
+DEFAULT_BAUD: Final = 115200
+
+
+@dataclass(frozen=True)
+class ConformanceRequest:
+    """What a user asks for; see `starhil conformance --help`."""
+
+    serial: str | None = None
+    can: str | None = None
+    canopen_node: int | None = None
+    eds: Path | None = None
+    start: bool = False
+    profile: str | None = None
+    dialect: str = "b"
+    baud: int | None = None
+    host_address: int = 1
+    device_address: int = 4
+    patterns: tuple[str, ...] = ()
+    safe_only: bool = False
+    times: ProbeTimes = field(default_factory=ProbeTimes)
+
+
+def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
+    """Return the cases of all links that are asked for, chosen by pattern and safety.
+
+    Raises
+    ------
+    BenchError
+        No link is given, or a pattern matches no case.
+    """
+    cases: list[Case[Any]] = []
+    if request.serial is not None:
+        cases += serial_suite(icd)
+    if request.can is not None:
+        cases += can_suite(icd)
+    if request.canopen_node is not None:
+        from hil_tests.conformance.canopen_suite import CANOPEN_CASES
+
+        cases += CANOPEN_CASES
+    if not cases:
+        raise BenchError("no link given: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
+    return select_cases(cases, request.patterns, safe_only=request.safe_only)
+
+
+def run_conformance(
+    request: ConformanceRequest, on_outcome: Callable[[Outcome], None] = lambda _outcome: None
+) -> list[Outcome]:
+    """Run the cases on the links that are asked for.
+
+    Raises
+    ------
+    BenchError, ProtocolError
+        A port, a bus or the emulator cannot be had.
+    """
+    icd = load_icd()
+    cases = all_cases(request, icd)
+    outcomes: list[Outcome] = []
+    with ExitStack() as stack:
+        serial, can = request.serial, request.can
+        if request.start:
+            serial, can = _start(request, stack)
+        mine = [item for item in cases if item.id.startswith("serial.")]
+        if mine and serial is not None:
+            port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD))
+            baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
+            probe = SerialProbe(port, icd, dialect=request.dialect, baud=baud, times=request.times)
+            outcomes += run_cases(probe, mine, on_outcome)
+        mine = [item for item in cases if item.id.startswith("can.")]
+        if mine and can is not None:
+            bus = stack.enter_context(live_can(can))
+            addresses = {"host": request.host_address, "device": request.device_address}
+            outcomes += run_cases(CanProbe(bus, icd, times=request.times, **addresses), mine, on_outcome)
+        mine = [item for item in cases if item.id.startswith("canopen.")]
+        if mine and can is not None:
+            outcomes += _run_canopen(request, can, mine, on_outcome)
+    return outcomes
+
+
+def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, str | None]:
+    """Start an emulator with the links that are asked for; return port and channel."""
+    folder = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-conformance-")))
+    needs_bus = request.can is not None or request.canopen_node is not None
+    channel = "off"
+    if needs_bus:
+        channel = stack.enter_context(OwnBus()) if request.can in (None, "auto") else str(request.can)
+    extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
+    command = emulator_command(
+        profile=request.profile,
+        serial="off" if request.serial is None else request.serial,
+        can=channel,
+        seed=1,
+        state_dir=folder,
+        extra=extra,
+    )
+    emulator = stack.enter_context(EmulatorProcess(command))
+    return emulator.ready.get("serial"), emulator.ready.get("can")
+
+
+def _run_canopen(
+    request: ConformanceRequest, can: str, cases: Sequence[Case[Any]], on_outcome: Callable[[Outcome], None]
+) -> list[Outcome]:
+    """Run the CANopen cases; the data sheet is the one given, else that of the product."""
+    import canopen
+    from canopen.objectdictionary import import_od
+
+    from hil_tests.conformance.canopen_probe import CanopenProbe
+    from hil_tests.conformance.canopen_suite import run_canopen_case
+
+    node = int(request.canopen_node or 0)
+    text = _data_sheet(request.eds)
+    with TemporaryDirectory(prefix="starhil-eds-") as folder:
+        path = Path(folder) / "unit.eds"
+        path.write_text(text, encoding="utf-8")
+        try:
+            dictionary = import_od(str(path), node)
+        except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
+            raise BenchError(f"{request.eds}: not a data sheet that can be read: {error}") from None
+    outcomes = []
+    with live_can(can) as bus:
+        probe = CanopenProbe(bus, node, dictionary, text)
+        for item in cases:
+            found = run_canopen_case(probe, item)
+            outcome = Outcome(
+                item.id, item.area, item.title, item.clause, item.intrusive,
+                found.status, found.expected, found.seen, found.seconds, found.log,
+            )  # fmt: skip
+            outcomes.append(outcome)
+            on_outcome(outcome)
+    return outcomes
+
+
+def _data_sheet(path: Path | None) -> str:
+    if path is None:
+        from protocol.canopen import build_dictionary, build_eds
+
+        return build_eds(build_dictionary())
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise BenchError(f"{path}: the data sheet cannot be read: {error.strerror}") from None

@@ -1,0 +1,297 @@
+"""Conformance of image and file download, unsolicited telemetry and recovery, on any link."""
+
+from __future__ import annotations
+
+import random
+from typing import Final
+
+from hil_tests.conformance.can_probe import CanProbe
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
+from hil_tests.conformance.serial_probe import SerialProbe
+from hil_tests.images import bmp_file_size, decode_bmp
+from protocol.can_framing import CanFrame
+from protocol.values import Value
+
+FRAMES: Final = "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)"
+BURSTS: Final = "CubeComputer TC 112, 119 to 127 and TLM 242 (AlbertaSat, CTS)"
+SAVE: Final = "CubeComputer TC 80, TLM 233 (AlbertaSat, CTS)"
+OURS: Final = "rule of this product (docs of the interface definition)"
+EDGE: Final = 64
+FRAME: Final = 128
+PACKET: Final = 20
+
+_CASES: list[Case[LinkProbe]] = []
+
+
+def _save(probe: LinkProbe) -> None:
+    """Have an image of 64 x 64 pixels stored."""
+    probe.standby()
+    probe.command("save_image", camera="star", image_size="size_64")
+    probe.wait_for("image_status", {"percent": 100, "status": "ok"}, probe.times.image_s)
+
+
+@case(
+    _CASES, "images.none", "without a stored image a download is refused with code 7", FRAMES, intrusive=True
+)
+def no_image(probe: LinkProbe) -> None:
+    """After a reset."""
+    probe.reset()
+    for name, values in (("init_image_download", {"image_size": "size_64"}), ("advance_image_download", {"next_frame": 0}), ("start_burst", {})):  # fmt: skip
+        row = probe.icd.telecommands[name]
+        probe.expect_refusal(row.id, row.encode(values), SEQUENCE)
+
+
+@case(_CASES, "images.other-camera", "only the star camera exists", SAVE, intrusive=True)
+def other_camera(probe: LinkProbe) -> None:
+    """Cameras 1 and 2 are refused with code 3."""
+    row = probe.icd.telecommands["save_image"]
+    for camera in ("camera_1", "camera_2"):
+        probe.expect_refusal(
+            row.id, row.encode({"camera": camera, "image_size": "size_64"}), INVALID_PARAMETER
+        )
+
+
+@case(
+    _CASES,
+    "images.frames",
+    "an image comes in frames of 128 bytes, each with its number and checksum",
+    FRAMES,
+    intrusive=True,
+)
+def frames(probe: LinkProbe) -> None:
+    """All 32 frames of 64 x 64 pixels; a second look at a frame shows the same."""
+    _save(probe)
+    probe.command("init_image_download", image_size="size_64")
+    for number in range(EDGE * EDGE // FRAME):
+        if number:
+            probe.command("advance_image_download", next_frame=number)
+        data = probe.telemetry("image_frame")["data"]
+        info = probe.telemetry("image_frame_info")
+        check_equal(info["frame"], number, "number of the frame")
+        check(isinstance(data, bytes), "bytes", type(data))
+        check_equal(info["checksum"], sum(bytes(data)) % 256 if isinstance(data, bytes) else -1, "checksum")
+        check_equal(probe.telemetry("image_frame")["data"], data, "the same frame")
+
+
+@case(_CASES, "images.beyond", "a frame beyond the last is refused with code 3", FRAMES, intrusive=True)
+def beyond(probe: LinkProbe) -> None:
+    """The loaded frame stays."""
+    _save(probe)
+    probe.command("init_image_download", image_size="size_64")
+    probe.command("advance_image_download", next_frame=31)
+    row = probe.icd.telecommands["advance_image_download"]
+    probe.expect_refusal(row.id, row.encode({"next_frame": 32}), INVALID_PARAMETER)
+    check_equal(probe.telemetry("image_frame_info")["frame"], 31, "loaded frame")
+
+
+@case(_CASES, "images.jump", "frames may be asked for in any order, and again", FRAMES, intrusive=True)
+def jump(probe: LinkProbe) -> None:
+    """Forward, backward."""
+    _save(probe)
+    probe.command("init_image_download", image_size="size_64")
+    first = probe.telemetry("image_frame")["data"]
+    for number in (17, 3, 0):
+        probe.command("advance_image_download", next_frame=number)
+        check_equal(probe.telemetry("image_frame_info")["frame"], number, "loaded frame")
+    check_equal(probe.telemetry("image_frame")["data"], first, "frame 0 as before")
+
+
+def _crc(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE, bit by bit."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return crc
+
+
+def _load(probe: LinkProbe, offset: int, length: int) -> None:
+    probe.command("load_file_block", file_type="bmp", file_counter=0, offset=offset, length=length)
+    seen = probe.wait_for("file_block", {"ready": True}, probe.times.image_s)
+    check_equal(seen["length"], length, "length of the block")
+
+
+def _burst(probe: LinkProbe, count: int, *, everything: bool) -> list[tuple[int, bytes]]:
+    probe.command("start_burst", ignore_hole_map=everything)
+    packets: list[tuple[int, bytes]] = []
+    for _ in range(count):
+        answer = probe.next_answer()
+        if answer.kind != "burst" or len(answer.data) != PACKET + 2:
+            raise CaseFailed(f"{count} packets of 22 bytes", f"{len(packets)} of them, then {answer}")
+        packets.append((int.from_bytes(answer.data[:2], "little"), answer.data[2:]))
+    probe.expect_silence("all packets have come")
+    return packets
+
+
+@case(
+    _CASES,
+    "bursts.block",
+    "a block comes in numbered packets of 20 bytes with the right checksum",
+    BURSTS,
+    intrusive=True,
+)
+def block(probe: LinkProbe) -> None:
+    """990 bytes: 50 packets, the last filled up."""
+    _save(probe)
+    _load(probe, 0, 990)
+    wanted = probe.telemetry("file_block")["checksum"]
+    packets = _burst(probe, 50, everything=True)
+    check_equal([number for number, _ in packets], list(range(50)), "numbers")
+    data = b"".join(part for _, part in packets)
+    check_equal(_crc(data[:990]), wanted, "checksum")
+    check(bmp_file_size(data) > EDGE * EDGE, "a file larger than its pixels", bmp_file_size(data))
+
+
+@case(_CASES, "bursts.holes", "with a hole map only what is missing comes", BURSTS, intrusive=True)
+def holes(probe: LinkProbe) -> None:
+    """Packets 0, 7 and 49 of 50."""
+    _save(probe)
+    _load(probe, 0, 1000)
+    whole = dict(_burst(probe, 50, everything=True))
+    arrived = sum(1 << number for number in range(50) if number not in (0, 7, 49))
+    probe.command("set_hole_map_1", map=arrived.to_bytes(16, "little"))
+    again = dict(_burst(probe, 3, everything=False))
+    check_equal(sorted(again), [0, 7, 49], "numbers")
+    check_equal(again, {number: whole[number] for number in (0, 7, 49)}, "the same packets")
+
+
+@case(
+    _CASES,
+    "bursts.file",
+    "the whole file is a picture of the size that was asked for",
+    BURSTS,
+    intrusive=True,
+)
+def whole_file(probe: LinkProbe) -> None:
+    """Block after block."""
+    _save(probe)
+    _load(probe, 0, 54)
+    size = bmp_file_size(b"".join(part for _, part in _burst(probe, 3, everything=True)))
+    _load(probe, 0, size)
+    data = b"".join(part for _, part in _burst(probe, -(-size // PACKET), everything=True))[:size]
+    _pixels, width, height = decode_bmp(data)
+    check_equal((width, height), (EDGE, EDGE), "width and height")
+
+
+@case(
+    _CASES,
+    "bursts.range",
+    "a block outside the file is refused with code 3 and flagged",
+    BURSTS,
+    intrusive=True,
+)
+def out_of_range(probe: LinkProbe) -> None:
+    """Beyond the end; and a burst without a block is refused."""
+    _save(probe)
+    row = probe.icd.telecommands["load_file_block"]
+    values: dict[str, Value] = {"file_type": "bmp", "file_counter": 0, "offset": 1 << 24, "length": 100}
+    probe.expect_refusal(row.id, row.encode(values), INVALID_PARAMETER)
+    seen = probe.telemetry("file_block")
+    check_equal((seen["ready"], seen["parameter_error"]), (False, True), "ready, parameter_error")
+    row = probe.icd.telecommands["start_burst"]
+    probe.expect_refusal(row.id, row.encode({}), SEQUENCE)
+
+
+# --- unsolicited telemetry ---
+
+
+@case(
+    _CASES,
+    "unsolicited.rate",
+    "unsolicited telemetry comes at its rate, and stops",
+    "types 10 to 12 (libCubeObc), use ours",
+    intrusive=True,
+)
+def unsolicited(probe: LinkProbe) -> None:
+    """identification, 8 bytes, at 10 Hz for two seconds."""
+    if not isinstance(probe, CanProbe):
+        raise CaseSkipped("only CAN, and serial dialect c, have unsolicited telemetry")
+    row = probe.icd.telemetry["identification"]
+    probe.command("set_unsolicited", telemetry=row.id, rate=10.0)
+    try:
+        probe.unsolicited.clear()
+        probe.sleep(2.0)
+        seen = list(probe.unsolicited)
+    finally:
+        probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
+    check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
+    kinds = {(frame.id >> 24, frame.id >> 16 & 0xFF, len(frame.data)) for _, frame in seen}
+    check_equal(kinds, {(12, row.id, row.size)}, "type, identifier, length")
+    probe.unsolicited.clear()
+    probe.sleep(0.5)
+    check(len(probe.unsolicited) <= 1, "no more", len(probe.unsolicited))
+
+
+@case(
+    _CASES,
+    "unsolicited.segments",
+    "a long row comes as first, body and last, counters down to 0",
+    "types 10 to 12 (libCubeObc), use ours",
+    intrusive=True,
+)
+def unsolicited_segments(probe: LinkProbe) -> None:
+    """star_tracker, 54 bytes: 8 frames."""
+    if not isinstance(probe, CanProbe):
+        raise CaseSkipped("only CAN, and serial dialect c, have unsolicited telemetry")
+    row = probe.icd.telemetry["star_tracker"]
+    probe.unsolicited.clear()
+    probe.command("set_unsolicited", telemetry=row.id, rate=5.0)
+    try:
+        probe.sleep(1.0)
+        seen = [frame for _, frame in probe.unsolicited][:8]
+    finally:
+        probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
+    check_equal([frame.id >> 24 for frame in seen], [10, *[11] * 6, 12], "types")
+    check_equal([frame.data[-1] if frame.data else -1 for frame in seen], list(range(7, -1, -1)), "counters")
+    check_equal(sum(len(frame.data) - 1 for frame in seen), row.size, "bytes")
+
+
+@case(
+    _CASES,
+    "unsolicited.refused",
+    "unsolicited telemetry of a row that does not exist is refused",
+    "published error codes",
+    intrusive=True,
+)
+def unsolicited_refused(probe: LinkProbe) -> None:
+    """Number 200."""
+    row = probe.icd.telecommands["set_unsolicited"]
+    probe.expect_refusal(row.id, row.encode({"telemetry": 200, "rate": 1.0}), INVALID_PARAMETER)
+
+
+# --- recovery ---
+
+
+@case(_CASES, "recovery.noise", "after noise the next good request is answered", OURS)
+def noise(probe: LinkProbe) -> None:
+    """Serial: 4000 random bytes; CAN: 400 random frames that are no requests."""
+    rng = random.Random(7)  # noqa: S311 -- noise, not a secret
+    if isinstance(probe, SerialProbe):
+        for _ in range(20):
+            probe.send(rng.randbytes(200).replace(b"\x7f", b"\x00"))
+            probe.sleep(0.01)
+    elif isinstance(probe, CanProbe):
+        for _ in range(400):
+            kind = rng.choice((0, 2, 3, 5, 6, 9, 13, 20, 31))
+            identifier = kind << 24 | rng.randrange(256) << 16 | probe.host << 8 | probe.device
+            probe.send(CanFrame(identifier, rng.randbytes(rng.randrange(9))))
+    probe.sleep(probe.times.quiet_s)
+    probe.drain()
+    probe.expect_alive()
+
+
+@case(_CASES, "recovery.flood", "a flood of requests is answered whole and in order", OURS)
+def flood(probe: LinkProbe) -> None:
+    """Two rows in turn, a hundred times."""
+    rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]
+    for _ in range(100):
+        for row in rows:
+            probe.post(row.id)
+    for _ in range(100):
+        for row in rows:
+            probe.expect_telemetry(row.id, 2.0)
+
+
+CASES: Final = tuple(_CASES)

@@ -1,0 +1,254 @@
+"""The tester's side of a device on a serial line or on CAN: requests, strict reading of the answers, and a log of both.
+
+The framing here is written anew from its public description; it shares no code with the codecs of the product.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from hil_tests.conformance.case import CaseFailed, CaseSkipped
+from protocol.codec import Row
+from protocol.errors import ProtocolError
+from protocol.icd import InterfaceDefinition
+from protocol.values import Value
+
+OK: Final = 0
+INVALID_ID: Final = 1
+INVALID_LENGTH: Final = 2
+INVALID_PARAMETER: Final = 3
+SEQUENCE: Final = 7
+
+FIRST_TELEMETRY: Final = 128
+BURST_ID: Final = 119
+
+AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malformed", "none"]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back.
+
+    Attributes
+    ----------
+    kind
+        Which form it had; `none` for nothing within the time-out, `malformed` for what has no form.
+    code
+        Error code of a refusal.
+    data
+        Telemetry, or what was malformed.
+    identifier
+        Identifier in the answer; None where the dialect carries none.
+    other
+        CAN address that it was sent to; 0 on serial.
+    """
+
+    kind: AnswerKind
+    code: int = 0
+    data: bytes = b""
+    identifier: int | None = None
+    other: int = 0
+
+    def __str__(self) -> str:
+        match self.kind:
+            case "nack":
+                return f"refusal with code {self.code}"
+            case "telemetry" | "burst" | "unsolicited" | "malformed":
+                return f"{self.kind} of {len(self.data)} bytes: {self.data[:24].hex(' ')}"
+            case _:
+                return "acknowledge" if self.kind == "ack" else "nothing"
+
+
+@dataclass(frozen=True)
+class ProbeTimes:
+    """How long the tester waits.
+
+    Attributes
+    ----------
+    answer_s
+        Longest time for an answer.
+    quiet_s
+        Silence that counts as no answer.
+    boot_s
+        Longest time from a reset to the first answer in standby.
+    image_s
+        Longest time for an image to be taken.
+    """
+
+    answer_s: float = 1.0
+    quiet_s: float = 0.1
+    boot_s: float = 15.0
+    image_s: float = 20.0
+
+
+class LinkProbe(ABC):
+    """Talks to one device over one link."""
+
+    link: str
+    """`serial` or `can`."""
+
+    def __init__(self, icd: InterfaceDefinition, times: ProbeTimes) -> None:
+        self.icd = icd
+        self.times = times
+        self.log: list[str] = []
+
+    # --- the link ---
+
+    @abstractmethod
+    def post(self, identifier: int, data: bytes = b"") -> None:
+        """Send a request without waiting."""
+
+    @abstractmethod
+    def next_answer(self, timeout_s: float | None = None) -> Answer:
+        """Return the next answer that was not yet looked at; unsolicited telemetry is passed over."""
+
+    @abstractmethod
+    def surplus(self, quiet_s: float) -> Answer:
+        """Return what comes without having been asked for within a time."""
+
+    @abstractmethod
+    def drain(self) -> None:
+        """Let go of all that has come."""
+
+    @abstractmethod
+    def now(self) -> float:
+        """Time, s."""
+
+    @abstractmethod
+    def sleep(self, seconds: float) -> None:
+        """Let time pass; what comes meanwhile is kept."""
+
+    # --- requests ---
+
+    def ask(self, identifier: int, data: bytes = b"") -> Answer:
+        """Send a request and return the answer to it."""
+        self.post(identifier, data)
+        return self.next_answer()
+
+    def telemetry(self, name: str) -> dict[str, Value]:
+        """Read a row by name; anything but its telemetry fails the case."""
+        row = self.icd.telemetry[name]
+        answer = self.ask(row.id)
+        if answer.kind != "telemetry" or len(answer.data) != row.size:
+            raise CaseFailed(f"telemetry {row.id} ({name}) of {row.size} bytes", str(answer))
+        return row.decode(answer.data)
+
+    def command(self, name: str, **values: Value) -> None:
+        """Send a telecommand by name; anything but its acknowledge fails the case."""
+        row = self.icd.telecommands[name]
+        self.expect_ack(row.id, row.encode(values))
+
+    def expect_ack(self, identifier: int, data: bytes = b"") -> None:
+        """Send a telecommand that must be accepted."""
+        answer = self.ask(identifier, data)
+        if answer.kind != "ack":
+            raise CaseFailed(f"acknowledge of telecommand {self._name(identifier)}", str(answer))
+
+    def expect_refusal(self, identifier: int, data: bytes, code: int) -> None:
+        """Send a request that must be refused with a code."""
+        answer = self.ask(identifier, data)
+        if answer.kind != "nack" or answer.code != code:
+            raise CaseFailed(f"refusal of {self._name(identifier)} with code {code}", str(answer))
+
+    def expect_telemetry(self, identifier: int, timeout_s: float | None = None) -> bytes:
+        """Take the next answer, which must be the telemetry of a row, and return its data."""
+        row = self.icd.telemetry_by_id[identifier]
+        answer = self.next_answer(timeout_s)
+        right_id = answer.identifier in (None, identifier)
+        if answer.kind != "telemetry" or len(answer.data) != row.size or not right_id:
+            raise CaseFailed(f"telemetry {self._name(identifier)} of {row.size} bytes", str(answer))
+        return answer.data
+
+    def expect_silence(self, why: str, seconds: float | None = None) -> None:
+        """Fail the case if anything comes within a time."""
+        answer = self.surplus(self.times.quiet_s if seconds is None else seconds)
+        if answer.kind != "none":
+            raise CaseFailed(f"nothing ({why})", str(answer))
+
+    def expect_alive(self) -> None:
+        """Fail the case unless the next good request is answered."""
+        self.post(self.icd.telemetry["identification"].id)
+        self.expect_telemetry(self.icd.telemetry["identification"].id)
+
+    def _name(self, identifier: int) -> str:
+        row = self.icd.row_by_id(identifier)
+        return f"{identifier} ({row.name})" if row is not None else str(identifier)
+
+    # --- state of the device ---
+
+    def wait_for(self, name: str, wanted: Mapping[str, Value], within_s: float) -> dict[str, Value]:
+        """Read a row until its fields have the wanted values; the case fails if they do not get them in time."""
+        end = self.now() + within_s
+        while True:
+            answer = self.ask(self.icd.telemetry[name].id)
+            row = self.icd.telemetry[name]
+            seen: object = answer
+            if answer.kind == "telemetry" and len(answer.data) == row.size:
+                values = row.decode(answer.data)
+                if all(values[key] == value for key, value in wanted.items()):
+                    return values
+                seen = {key: values[key] for key in wanted}
+            if self.now() > end:
+                raise CaseFailed(f"{name} with {dict(wanted)} within {within_s:g} s", str(seen))
+            self.sleep(0.02)
+
+    def standby(self) -> None:
+        """Bring the device into standby."""
+        if self.telemetry("device_status")["mode"] != "standby":
+            self.command("set_mode", mode="standby")
+            self.wait_for("device_status", {"mode": "standby"}, 2.0)
+
+    def reset(self) -> None:
+        """Reset the device and wait until it is in standby."""
+        self.command("reset")
+        self.sleep(0.05)
+        self.drain()
+        self.wait_for("device_status", {"mode": "standby"}, self.times.boot_s)
+
+    def parameter(self, name: str) -> dict[str, Value]:
+        """Read a parameter's value and limits."""
+        self.command("select_parameter", parameter=self.icd.parameters[name].id)
+        return self.telemetry("parameter")
+
+    def set_parameter(self, name: str, number: float) -> None:
+        """Set a parameter, which must be accepted."""
+        self.command("set_parameter", parameter=self.icd.parameters[name].id, value=number)
+
+    @contextmanager
+    def kept(self, *names: str) -> Iterator[None]:
+        """Put parameters back to what they were before, whatever happens."""
+        before = {name: float(self.parameter(name)["value"]) for name in names}
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                self.set_parameter(name, value)
+
+    def needs_row(self, name: str) -> Row:
+        """Return a telemetry row; the case is skipped if the definition has none of that name."""
+        if name not in self.icd.telemetry:
+            raise CaseSkipped(f"the interface definition has no telemetry '{name}'")
+        return self.icd.telemetry[name]
+
+    def begin(self) -> None:
+        """Start a case with an empty log and an empty line."""
+        self.log.clear()
+        self.drain()
+
+    def end(self) -> None:
+        """End a case: nothing more may come."""
+        self.expect_silence("the case is over", self.times.quiet_s / 4)
+
+
+def checked_values(row: Row, data: bytes) -> dict[str, Value]:
+    """Decode telemetry with all limits checked; a value outside fails the case."""
+    try:
+        return row.decode(data, check=True)
+    except ProtocolError as error:
+        raise CaseFailed(
+            f"values of {row.name} within the limits of the interface definition", str(error)
+        ) from None

@@ -1,0 +1,96 @@
+"""What the cases send on and receive from: a port or bus with its own time, live here, simulated in the tests."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import time
+from types import TracebackType
+from typing import Generic, Protocol, Self, TypeVar
+
+from hil_tests.errors import LinkLostError
+from hil_tests.loop_thread import LoopThread
+from protocol.can_framing import CanFrame
+from protocol.errors import ProtocolError
+from protocol.transports import Transport, open_can, open_serial
+
+Item = TypeVar("Item")
+
+
+class Port(Protocol[Item]):
+    """A serial port (items are bytes) or a CAN bus (items are frames): plain calls, and a clock."""
+
+    def send(self, item: Item) -> None:
+        """Send an item."""
+
+    def receive(self, timeout_s: float) -> Item | None:
+        """Return the next item, None if none comes in time."""
+
+    def now(self) -> float:
+        """Time, s, from any origin."""
+
+
+class LivePort(Generic[Item]):
+    """A port over one of the asyncio transports, whose loop runs in a thread of its own; a context manager."""
+
+    def __init__(self, transport: Transport[Item]) -> None:
+        self._transport = transport
+        self._loop = LoopThread("conformance")
+        self._arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._lost: ProtocolError | None = None
+
+    def send(self, item: Item) -> None:
+        """Send an item.
+
+        Raises
+        ------
+        LinkLostError
+            The port or bus is gone.
+        """
+        if not self._loop.run(self._send(item)):
+            raise LinkLostError(f"{self._transport.description}: {self._lost or 'takes nothing more'}")
+
+    async def _send(self, item: Item) -> bool:
+        return self._transport.send(item)
+
+    def receive(self, timeout_s: float) -> Item | None:
+        """Return the next item, None if none comes in time."""
+        try:
+            return self._arrived.get(timeout=timeout_s) if timeout_s > 0 else self._arrived.get_nowait()
+        except queue.Empty:
+            return None
+
+    def now(self) -> float:
+        """Time, s, from any origin."""
+        return time.monotonic()
+
+    def _fail(self, error: ProtocolError) -> None:
+        self._lost = error
+
+    def __enter__(self) -> Self:
+        try:
+            self._loop.run(self._transport.start(self._arrived.put, self._fail))
+        except BaseException:
+            self._loop.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._loop.run(self._end())
+        self._loop.close()
+
+    async def _end(self) -> None:
+        await asyncio.sleep(0)
+        await self._transport.close()
+
+
+def live_serial(spec: str, baud: int) -> LivePort[bytes]:
+    """Make the port of a serial specification; it is opened as a context manager."""
+    return LivePort(open_serial(spec, baud=baud, paced=False))
+
+
+def live_can(spec: str) -> LivePort[CanFrame]:
+    """Make the bus of a CAN specification; it is opened as a context manager."""
+    return LivePort(open_can(spec))

@@ -1,0 +1,202 @@
+"""The tester's side of a device on a serial line, in any of the three reply dialects."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hil_tests.conformance.link_probe import BURST_ID, FIRST_TELEMETRY, Answer, LinkProbe, ProbeTimes
+from hil_tests.conformance.ports import Port
+from protocol.icd import InterfaceDefinition
+
+SHOWN_BYTES: Final = 48
+BURST_BODY: Final = 23
+"""Identifier, packet number and 20 bytes of data."""
+
+GENERATION_2: Final = {0x07: "ack", 0x0F: "nack", 0x2F: "event", 0x4F: "unsolicited"}
+
+
+def framed(identifier: int, data: bytes = b"") -> bytes:
+    """Frame a request: 1F 7F, identifier and data with each 1F doubled, 1F FF."""
+    return b"\x1f\x7f" + (bytes([identifier]) + data).replace(b"\x1f", b"\x1f\x1f") + b"\x1f\xff"
+
+
+class SerialProbe(LinkProbe):
+    """Talks over a serial port.
+
+    Parameters
+    ----------
+    port
+        The port.
+    icd
+        Rows and names.
+    dialect
+        `a`, `b` or `c`.
+    baud
+        Bit rate of the line, None if unknown; for the cases on its pace.
+    """
+
+    link = "serial"
+
+    def __init__(
+        self,
+        port: Port[bytes],
+        icd: InterfaceDefinition,
+        *,
+        dialect: str = "b",
+        baud: int | None = None,
+        times: ProbeTimes | None = None,
+    ) -> None:
+        super().__init__(icd, times or ProbeTimes())
+        self.port = port
+        self.dialect = dialect
+        self.baud = baud
+        self._buffer = bytearray()
+        self._asked: list[int] = []
+
+    def now(self) -> float:
+        """Time of the port, s."""
+        return self.port.now()
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass; what comes meanwhile is kept."""
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0:
+            self._take(left)
+
+    def post(self, identifier: int, data: bytes = b"") -> None:
+        """Send a request without waiting."""
+        self.expecting(identifier)
+        self.send(framed(identifier, data))
+
+    def expecting(self, *identifiers: int) -> None:
+        """Note what was asked, in order: dialect b does not say what an answer is about."""
+        self._asked.extend(identifiers)
+
+    def send(self, data: bytes) -> None:
+        """Send bytes as they stand."""
+        self._note("->", data)
+        self.port.send(data)
+
+    def _note(self, way: str, data: bytes) -> None:
+        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
+        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
+
+    def _take(self, timeout_s: float) -> bool:
+        data = self.port.receive(timeout_s)
+        if data is None:
+            return False
+        self._note("<-", data)
+        self._buffer += data
+        return True
+
+    def drain(self) -> None:
+        """Let go of all that has come."""
+        while self.port.receive(0.0) is not None:
+            pass
+        self._buffer.clear()
+        self._asked.clear()
+
+    def surplus(self, quiet_s: float) -> Answer:
+        """Return what comes without having been asked for."""
+        self.sleep(quiet_s)
+        while (packet := self._packet()) is not None:
+            answer = self._answer(*packet)
+            if answer.kind != "unsolicited":
+                return answer
+        return self._malformed() if self._buffer else Answer("none")
+
+    def next_answer(self, timeout_s: float | None = None) -> Answer:
+        """Return the next answer that was not yet looked at."""
+        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        while True:
+            if (packet := self._packet()) is not None:
+                answer = self._answer(*packet)
+                if answer.kind != "unsolicited":
+                    return answer
+                continue
+            if len(self._buffer) >= 2 and not self._starts_well():
+                return self._malformed()
+            left = end - self.now()
+            if left <= 0 or not self._take(left):
+                self._asked.clear()
+                return self._malformed() if self._buffer else Answer("none")
+
+    def _starts_well(self) -> bool:
+        starts = (0x7F, *GENERATION_2) if self.dialect == "c" else (0x7F,)
+        return self._buffer[0] == 0x1F and self._buffer[1] in starts
+
+    def _malformed(self) -> Answer:
+        data = bytes(self._buffer)
+        self._buffer.clear()
+        return Answer("malformed", data=data)
+
+    def _packet(self) -> tuple[int, bytes] | None:
+        """Take a whole packet off the buffer: its start byte and its body without stuffing; None if none is whole."""
+        if len(self._buffer) < 2 or not self._starts_well():
+            return None
+        body = bytearray()
+        position = 2
+        while position < len(self._buffer):
+            byte = self._buffer[position]
+            if byte != 0x1F:
+                body.append(byte)
+                position += 1
+                continue
+            if position + 1 >= len(self._buffer):
+                return None
+            follower = self._buffer[position + 1]
+            if follower == 0xFF:
+                start = self._buffer[1]
+                del self._buffer[: position + 2]
+                return start, bytes(body)
+            if follower != 0x1F:
+                return -1, self._malformed().data
+            body.append(0x1F)
+            position += 2
+        return None
+
+    def _answer(self, start: int, body: bytes) -> Answer:
+        if start < 0 or (not body and self.dialect != "b"):
+            return Answer("malformed", data=body)
+        if start == 0x7F and len(body) == BURST_BODY and body[0] == BURST_ID and not self._expects(len(body)):
+            return Answer("burst", data=body[1:], identifier=BURST_ID)
+        if self.dialect == "c":
+            return self._answer_generation_2(start, body)
+        if self.dialect == "b":
+            if not self._asked:
+                return Answer("malformed", data=body)
+            return self._plain(self._asked.pop(0), body, None)
+        if self._asked and self._asked[0] == body[0]:
+            self._asked.pop(0)
+        return self._plain(body[0], body[1:], body[0])
+
+    def _expects(self, size: int) -> bool:
+        """Tell whether the row that is asked for in dialect b has as many bytes as a burst packet."""
+        row = self.icd.telemetry_by_id.get(self._asked[0]) if self._asked and self.dialect == "b" else None
+        return row is not None and row.size == size
+
+    def _plain(self, identifier: int, data: bytes, seen: int | None) -> Answer:
+        """Read generation 1: telemetry as it is, one byte for an acknowledge or refusal."""
+        row = self.icd.telemetry_by_id.get(identifier)
+        if row is not None and len(data) == row.size:
+            return Answer("telemetry", data=data, identifier=seen)
+        is_telecommand = identifier < FIRST_TELEMETRY
+        if len(data) != 1:
+            return Answer("malformed" if is_telecommand else "telemetry", data=data, identifier=seen)
+        if data[0] == 0:
+            return Answer("ack" if is_telecommand else "malformed", data=data, identifier=seen)
+        return Answer("nack", code=data[0], identifier=seen)
+
+    def _answer_generation_2(self, start: int, body: bytes) -> Answer:
+        identifier, data = body[0], body[1:]
+        match GENERATION_2.get(start):
+            case "ack" if identifier >= FIRST_TELEMETRY:
+                return Answer("telemetry", data=data, identifier=identifier)
+            case "ack" if not data:
+                return Answer("ack", identifier=identifier)
+            case "nack" if len(data) == 1 and data[0]:
+                return Answer("nack", code=data[0], identifier=identifier)
+            case "unsolicited" | "event":
+                return Answer("unsolicited", data=data, identifier=identifier)
+            case _:
+                return Answer("malformed", data=body)
