@@ -26,6 +26,7 @@ from starid.lsi import LostInSpace
 _DIFFERENCE_DEG = 1e-4
 _MAX_STEPS = 8
 _CONVERGED_DEG = 1e-7
+_AGREED = 1e-12
 
 
 @compiled
@@ -136,7 +137,8 @@ def subcell_kernel(
 ) -> int:
     """Try the neighbours from the nearest outwards; return how many starts were made.
 
-    The nearest cell in full precision goes first. A start near an earlier one is left out. `answer` (4,) receives right
+    The nearest cell in full precision goes first, and the first start that agrees in all features ends the search. A
+    start near an earlier one is left out. `answer` (4,) receives right
     ascension, declination (degrees), polar angle (radians) and the length of the residual.
     """
     stored_neighbours(index, observation * 2.55, distances, cells)
@@ -147,6 +149,8 @@ def subcell_kernel(
     starts = 0
     best = math.inf
     for turn in range(-1, order.size):
+        if best < _AGREED:
+            break
         cell = first if turn < 0 else cells[order[turn]]
         if cell < 0:
             continue
