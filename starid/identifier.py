@@ -1,37 +1,34 @@
 """The geometric identifier: verified triangles of bright stars, over the whole sky, for any camera.
 
-How it finds an attitude that it knows nothing of (`starid.search`), what it believes (`starid.verification`)
-and how it polishes (`starid.refinement`) stand in those modules; here they are put together for a camera and
-a catalogue.
+How it finds an attitude that it knows nothing of (`starid.search`), follows one (`starid.tracking`), what it
+believes (`starid.verification`) and how it polishes (`starid.refinement`) stand in those modules; here they
+are put together for a camera and a catalogue.
 """
 
 from __future__ import annotations
 
-import hashlib
+import dataclasses
 import math
 import time
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starid import index_file
 from starid.answer import Answer
 from starid.attitude import Attitude
-from starid.cache import cache_dir
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.pattern_index import (
-    INDEX_VERSION,
-    IndexArrays,
-    IndexSettings,
-    build_arrays,
-    field_solid_angle,
-    seen_stars,
+from starid.index_choice import (
+    default_limiting_magnitude,
+    index_settings,
+    obtain_index,
+    pixels_per_radian,
 )
+from starid.pattern_index import field_solid_angle, seen_stars
 from starid.search import identify_kernel
 from starid.settings import (
     ACCEPTED,
@@ -54,37 +51,13 @@ from starid.settings import (
 from starid.solution import Mode, Reason, Solution
 from starid.tracking import track_kernel
 
-STARS_PER_FIELD: Final = 200
-"""Catalogue stars a field, on the average, that the default limiting magnitude aims at."""
-
-BRIGHTEST_LIMIT: Final = 6.0
-FAINTEST_LIMIT: Final = 9.0
 BLEND_PX: Final = 2.0
-TOLERANCE_PX: Final = 4.0
-WINDOW_PX: Final = 12.0
-TEST_WINDOW_PX: Final = 10.0
 TRACKING_WINDOW_PX: Final = 20.0
+WIDEST_TOLERANCE: Final = 0.3
+_SCALE_ERROR: Final = 0.012
+"""Difference of scale across the field that the look-up of triangles bears."""
+
 _REASONS: Final = {TOO_FEW: Reason.TOO_FEW_STARS, NOISY: Reason.RESIDUAL}
-
-
-def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> float:
-    """V to which a field holds `STARS_PER_FIELD` on the average, in steps of ¼, within 6…9."""
-    wanted = STARS_PER_FIELD * 4.0 * math.pi / field_area_sr
-    row = min(int(wanted), len(catalog)) - 1
-    limit = math.ceil(4.0 * float(catalog.v[row])) / 4.0
-    return min(max(limit, BRIGHTEST_LIMIT), FAINTEST_LIMIT)
-
-
-def pixels_per_radian(camera: Camera) -> float:
-    """Least pixels per radian anywhere in the field: the smaller singular value of the projection."""
-    steps = np.linspace(0.0, 1.0, 9)
-    grid = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), axis=-1).reshape(
-        -1, 2
-    )
-    directions = camera.back_project(grid)
-    directions = directions[np.isfinite(directions[:, 0])]
-    values = np.linalg.svd(camera.jacobian(directions), compute_uv=False)
-    return float(values[:, 1].min())
 
 
 @dataclass(frozen=True)
@@ -96,26 +69,46 @@ class Effort:
     tolerance_px : float
         Largest error of a triangle's side, pixels.
     window_px : float
-        First matching window, pixels.
+        First matching window, pixels; a third of it is the largest centroid noise believed.
     test_window_px : float
         Window in which a candidate attitude is tested, pixels.
     magnitude_gate : float
         Largest deviation of a star's magnitude from what its flux says.
     max_triangles : int
         Triangles of detections looked up before giving up.
-    max_false_probability : float
-        Largest bound on the probability of a false answer that is accepted, lost in space.
-    max_false_probability_tracking : float
-        The same near a predicted attitude.
+    max_false_probability, max_false_probability_tracking : float
+        Largest bound on the probability of a false answer that is accepted, lost in space and near a
+        predicted attitude.
     """
 
-    tolerance_px: float = TOLERANCE_PX
-    window_px: float = WINDOW_PX
-    test_window_px: float = TEST_WINDOW_PX
+    tolerance_px: float = 4.0
+    window_px: float = 12.0
+    test_window_px: float = 10.0
     magnitude_gate: float = 1.5
     max_triangles: int = 3000
     max_false_probability: float = 1e-5
     max_false_probability_tracking: float = 1e-5
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not 0.0 < value < math.inf:
+                raise StaridError(f"identifier {field.name}: {value} given, a positive number needed")
+
+    def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
+        """Settings for the kernels (`starid.settings`) with this camera, its focal length known."""
+        numbers = np.zeros(SETTING_COUNT)
+        numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
+        numbers[MAGNITUDE_GATE] = self.magnitude_gate
+        numbers[MAX_TRIANGLES] = self.max_triangles
+        numbers[WINDOW] = self.window_px
+        numbers[TEST_WINDOW] = self.test_window_px / px_per_rad
+        numbers[LARGEST_SIGMA] = self.window_px / 3.0
+        numbers[LOG_CHANCE] = math.log(self.max_false_probability)
+        numbers[LOG_CHANCE_TRACKING] = math.log(self.max_false_probability_tracking)
+        numbers[PX_PER_RAD] = px_per_rad
+        numbers[FIELD_PX] = camera.width * camera.height
+        return numbers
 
 
 class Identifier:
@@ -130,13 +123,19 @@ class Identifier:
     limiting_magnitude : float, optional
         Faintest V in the index; by default what gives some 200 stars a field, at least 6.
     fov_tolerance : float
-        Relative uncertainty of the focal length, 0 where it is calibrated.
+        Relative uncertainty of the focal length, 0 where it is calibrated. Solutions then carry the refined
+        camera.
     blend_px : float
         Stars closer than this are seen as one.
     effort : Effort
         Bounds of the search.
     cache : bool or path
         Keep the index on disk: in the cache folder, in a folder given, or not at all.
+
+    Raises
+    ------
+    StaridError
+        A value is out of its range, or the catalogue has too few stars for the field.
     """
 
     def __init__(
@@ -150,55 +149,24 @@ class Identifier:
         effort: Effort | None = None,
         cache: bool | str | Path = True,
     ) -> None:
-        if not 0.0 <= fov_tolerance <= 0.3:
-            raise StaridError(f"identifier fov_tolerance: {fov_tolerance} given, 0…0.3 needed")
+        if not 0.0 <= fov_tolerance <= WIDEST_TOLERANCE:
+            raise StaridError(
+                f"identifier fov_tolerance: {fov_tolerance} given, 0…{WIDEST_TOLERANCE:g} needed"
+            )
         self._camera = camera
         self._catalog = load_catalog() if catalog is None else catalog
         self._effort = effort or Effort()
-        area = field_solid_angle(camera)
-        limit = (
-            default_limiting_magnitude(self._catalog, area)
-            if limiting_magnitude is None
-            else limiting_magnitude
-        )
-        least = pixels_per_radian(camera)
-        self._settings_of_index = index_settings(
-            camera,
-            limit,
-            blend_px / least,
-            self._effort.window_px / least,
-            area,
-            len(self._catalog.brighter_than(limit)),
-        )
-        stars = seen_stars(self._catalog, limit, blend_px / least)
-        self._rows = self._catalog.index_of(stars.hip).astype(np.int64)
-        self._hip = stars.hip
-        self._index = self._load(stars, cache)
-        self._kernel_settings = np.zeros(SETTING_COUNT)
-        self._kernel_settings[SEARCH_TOLERANCE] = self._effort.tolerance_px / least
-        self._kernel_settings[MAGNITUDE_GATE] = self._effort.magnitude_gate
-        self._kernel_settings[MAX_TRIANGLES] = self._effort.max_triangles
-        self._kernel_settings[SCALE_TOLERANCE] = fov_tolerance
-        self._kernel_settings[WINDOW] = self._effort.window_px
-        self._kernel_settings[TEST_WINDOW] = self._effort.test_window_px / least
-        self._kernel_settings[LARGEST_SIGMA] = 0.3 * self._effort.window_px
-        self._kernel_settings[LOG_CHANCE] = math.log(self._effort.max_false_probability)
-        self._kernel_settings[LOG_CHANCE_TRACKING] = math.log(self._effort.max_false_probability_tracking)
-        self._kernel_settings[PX_PER_RAD] = least
-        self._kernel_settings[FIELD_PX] = camera.width * camera.height
-        self._settings_with_errors = self._kernel_settings.copy()
-        self._settings_with_errors[SIGMAS_KNOWN] = 1.0
-
-    def _load(self, stars: StarCatalog, cache: bool | str | Path) -> IndexArrays:
-        settings = self._settings_of_index
-        key = hashlib.sha256(repr((INDEX_VERSION, stars.identity, astuple(settings))).encode()).hexdigest()[
-            :16
-        ]
-        if cache is False:
-            return index_file.unpack(index_file.pack(build_arrays(stars, settings), key), key)
-        folder = cache_dir() if cache is True else Path(cache)
-        path = folder / f"index-{key}.bin"
-        return index_file.load(path, key) or index_file.store(path, build_arrays(stars, settings), key)
+        if limiting_magnitude is None:
+            limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(camera))
+        settings = index_settings(camera, self._catalog, limiting_magnitude, blend_px, self._effort.window_px)
+        self._stars = seen_stars(self._catalog, limiting_magnitude, settings.blend_rad)
+        self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
+        self._index = obtain_index(self._stars, settings, cache)
+        self._px_per_rad = pixels_per_radian(camera)
+        self._numbers = self._effort.numbers(camera, self._px_per_rad)
+        self._numbers_with_errors = self._numbers.copy()
+        self._numbers_with_errors[SIGMAS_KNOWN] = 1.0
+        self._fov_tolerance = fov_tolerance
 
     @property
     def camera(self) -> Camera:
@@ -209,6 +177,11 @@ class Identifier:
     def catalog(self) -> StarCatalog:
         """The catalogue that `Solution.catalog_index` counts in."""
         return self._catalog
+
+    @property
+    def stars(self) -> StarCatalog:
+        """The stars of the index as the camera sees them: doubles merged, brightest first."""
+        return self._stars
 
     def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
         """Lost in space: attitude without any knowledge of it.
@@ -230,15 +203,36 @@ class Identifier:
         """
         begin = time.perf_counter()
         xy, brightness, sigmas = _checked(xy_px, flux, xy_sigma_px)
-        answer = identify_kernel(
-            self._index,
-            self._camera.params,
-            xy,
-            brightness,
-            sigmas,
-            self._kernel_settings if xy_sigma_px is None else self._settings_with_errors,
-        )
+        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        if self._fov_tolerance > 0.0:
+            return self._identify_any_scale(xy, brightness, sigmas, numbers, begin)
+        answer = identify_kernel(self._index, self._camera.params, xy, brightness, sigmas, numbers)
         return self._solution(answer, "lost_in_space", begin)
+
+    def _identify_any_scale(
+        self,
+        xy: NDArray[np.float64],
+        brightness: NDArray[np.float64],
+        sigmas: NDArray[np.float64],
+        numbers: NDArray[np.float64],
+        begin: float,
+    ) -> Solution:
+        """Try focal lengths from the nominal one outward, each with its share of the tolerance."""
+        lateral2 = math.tan(min(self._camera.field_radius_rad, 1.4)) ** 2
+        steps = math.ceil(self._fov_tolerance * lateral2 / _SCALE_ERROR)
+        share = self._fov_tolerance / (2 * steps - 1)
+        numbers = numbers.copy()
+        numbers[SCALE_TOLERANCE] = share
+        solution = Solution.invalid(Reason.NO_MATCH)
+        for step in sorted(range(1 - steps, steps), key=abs):
+            camera = scaled_camera(self._camera, 1.0 + 2.0 * share * step)
+            answer = identify_kernel(self._index, camera.params, xy, brightness, sigmas, numbers)
+            solution = self._solution(answer, "lost_in_space", begin)
+            if solution.valid:
+                return dataclasses.replace(
+                    solution, camera=scaled_camera(camera, 1.0 / float(answer.numbers[3]))
+                )
+        return solution
 
     def track(
         self,
@@ -271,9 +265,10 @@ class Identifier:
         if not 0.0 < window < math.inf:
             raise StaridError(f"tracking window_px: {window} given, a positive number of pixels needed")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
+        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
         answer = track_kernel(
-            self._index, self._camera.params, xy, brightness, sigmas,
-            self._kernel_settings if xy_sigma_px is None else self._settings_with_errors, attitude.matrix, window / self._kernel_settings[PX_PER_RAD],
+            self._index, self._camera.params, xy, brightness, sigmas, numbers, attitude.matrix,
+            window / self._px_per_rad,
         )  # fmt: skip
         return self._solution(answer, "tracking", begin)
 
@@ -282,6 +277,26 @@ class Identifier:
         xy = self._camera.border(2)[:6]
         self.identify(xy, np.ones(6))
         self.track(xy, np.ones(6), Attitude.identity())
+
+    def with_camera(self, camera: Camera) -> Identifier:
+        """Identifier for a camera refined from this one (same size, focal length within the tolerance).
+
+        It shares the index, and takes the focal length as known.
+        """
+        if (camera.width, camera.height) != (self._camera.width, self._camera.height):
+            raise StaridError(
+                f"camera {camera.width}×{camera.height}: the identifier is for "
+                f"{self._camera.width}×{self._camera.height}; make another one"
+            )
+        other = object.__new__(Identifier)
+        other.__dict__.update(self.__dict__)
+        other._camera = camera
+        other._fov_tolerance = 0.0
+        other._px_per_rad = pixels_per_radian(camera)
+        other._numbers = self._effort.numbers(camera, other._px_per_rad)
+        other._numbers_with_errors = other._numbers.copy()
+        other._numbers_with_errors[SIGMAS_KNOWN] = 1.0
+        return other
 
     def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
         if answer.status != ACCEPTED:
@@ -295,7 +310,7 @@ class Identifier:
             quaternion_xyzw=answer.quaternion,
             detection_index=answer.pairs[0],
             catalog_index=self._rows[answer.pairs[1]],
-            hip=self._hip[answer.pairs[1]],
+            hip=self._stars.hip[answer.pairs[1]],
             covariance=answer.covariance,
             rms_px=rms,
             sigma_px=sigma,
@@ -305,25 +320,10 @@ class Identifier:
         )
 
 
-def index_settings(
-    camera: Camera, limit: float, blend_rad: float, window_rad: float, area: float, stars: int
-) -> IndexSettings:
-    """Settings of the index that suits a camera."""
-    diagonal = 2.0 * camera.field_radius_rad
-    width = math.sqrt(area)
-    spacing = math.sqrt(4.0 * math.pi / max(stars, 1))
-    cell = max(window_rad, 0.7 * spacing)
-    return IndexSettings(
-        limiting_magnitude=limit,
-        blend_rad=blend_rad,
-        window_rad=window_rad,
-        field_area_sr=area,
-        longest_side_rad=min(0.95 * width, 0.9 * diagonal),
-        shortest_side_rad=0.12 * width,
-        quota=10,
-        cells_per_edge=max(int(0.5 * math.pi / cell), 1),
-        side_bins=72,
-    )
+def scaled_camera(camera: Camera, factor: float) -> Camera:
+    """Camera with the focal length times a factor."""
+    fx, fy = camera.focal_px
+    return dataclasses.replace(camera, focal_px=(fx * factor, fy * factor))
 
 
 def _checked(
@@ -352,6 +352,3 @@ def _checked(
     if not (np.isfinite(xy).all() and np.isfinite(brightness).all()):
         raise StaridError("detections: positions and flux must be finite numbers")
     return xy, brightness, sigmas
-
-
-__all__ = ["Attitude", "Effort", "Identifier", "default_limiting_magnitude"]

@@ -1,0 +1,100 @@
+"""Missing stars: which catalogue stars should be on a frame and are not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+from starid.errors import StaridError
+from starid.solution import Solution
+
+COMPLETE_TO: Final = 0.8
+"""Share of the predicted stars found in a magnitude bin down to which a frame counts as complete."""
+
+_BIN: Final = 0.5
+_EDGE_PX: Final = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class MissingStars:
+    """Stars that should be visible and have no detection.
+
+    Attributes
+    ----------
+    hip : ndarray (k,) int32
+        Their numbers, brightest first.
+    xy_px : ndarray (k, 2)
+        Where they should be.
+    magnitude : ndarray (k,)
+        Their V.
+    complete_to : float
+        V down to which the frame shows nearly all predicted stars: only brighter ones can be missing.
+    """
+
+    hip: NDArray[np.int32]
+    xy_px: NDArray[np.float64]
+    magnitude: NDArray[np.float64]
+    complete_to: float
+
+
+def missing_stars(
+    solution: Solution, camera: Camera, stars: StarCatalog, xy_px: ArrayLike, *, radius_px: float = 4.0
+) -> MissingStars:
+    """Stars brighter than what the frame is complete to, inside the field, without a detection near them.
+
+    Parameters
+    ----------
+    solution : Solution
+        A valid one for the detections.
+    camera : Camera
+        The camera (the solution's refined one takes its place).
+    stars : StarCatalog
+        Stars as the camera sees them (`Identifier.stars`).
+    xy_px : array (n, 2)
+        All detections, pixels.
+    radius_px : float
+        A detection this near, matched or not, speaks for a star.
+
+    Raises
+    ------
+    StaridError
+        The solution is invalid.
+    """
+    if not radius_px > 0.0:
+        raise StaridError(f"missing stars radius_px: {radius_px} given, a positive number of pixels needed")
+    camera = solution.camera or camera
+    attitude = solution.attitude
+    near = stars.in_cone(attitude.boresight, camera.field_radius_rad)
+    xy, inside = camera.project(attitude.to_sensor(stars.vectors[near]))
+    border = np.minimum(xy, [camera.width - 1, camera.height - 1] - xy).min(axis=1)
+    chosen = inside & (border > _EDGE_PX)
+    near, xy = near[chosen], xy[chosen]
+    detections = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    seen = np.isin(stars.hip[near], solution.hip)
+    if len(detections):
+        for row in np.flatnonzero(~seen):
+            gap = detections - xy[row]
+            seen[row] = bool(np.min(np.einsum("ij,ij->i", gap, gap)) < radius_px * radius_px)
+    magnitude = stars.v[near]
+    limit = _complete_to(magnitude, seen)
+    lost = np.flatnonzero(~seen & (magnitude <= limit))
+    return MissingStars(stars.hip[near][lost], xy[lost], magnitude[lost], limit)
+
+
+def _complete_to(magnitude: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+    """Faint end of the last half-magnitude bin of which `COMPLETE_TO` is seen; −inf where there is none."""
+    limit = -math.inf
+    if magnitude.size == 0:
+        return limit
+    bins = np.floor(magnitude / _BIN).astype(np.int64)
+    for edge in range(int(bins.min()), int(bins.max()) + 1):
+        inside = bins == edge
+        if inside.any() and float(seen[inside].mean()) >= COMPLETE_TO:
+            limit = (edge + 1) * _BIN
+    return limit
