@@ -42,6 +42,10 @@ MODELS: Final[tuple[tuple[str, ...], ...]] = (
 )
 """Sets of free parameters from which "auto" takes the one that the frames justify."""
 
+IMAGE_MODELS: Final[tuple[tuple[str, ...], ...]] = (("focal",), ("focal", "k1"), ("focal", "k1", "k2"))
+"""What one image of an unknown camera may tell: in a narrow field the optical axis cannot be told from the
+attitude, and stays at the image's centre."""
+
 _ROUNDS: Final = 4
 _WINDOW_SIGMAS: Final = 5.0
 _LEAST_WINDOW_PX: Final = 1.0
@@ -68,12 +72,15 @@ class SelfCalibration:
         Camera, covariance and residuals.
     frame_index : tuple of int
         Frames given that were identified and used, in the order of `calibration.attitudes`.
+    matches : tuple of ndarray (m, 2), int64
+        Detection index and HIP of every pair that the calibration was given, for each of these frames.
     refused : dict of int to str
         Frames that could not be identified, and why.
     """
 
     calibration: Calibration
     frame_index: tuple[int, ...]
+    matches: tuple[NDArray[np.int64], ...]
     refused: dict[int, str]
 
 
@@ -84,6 +91,7 @@ def self_calibrate(
     *,
     fov_tolerance: float = 0.1,
     estimate: Sequence[str] | None = None,
+    models: Sequence[tuple[str, ...]] = MODELS,
 ) -> SelfCalibration:
     """Identify frames and estimate the camera that took them.
 
@@ -98,8 +106,10 @@ def self_calibrate(
     fov_tolerance : float
         Relative uncertainty of the start camera's focal length.
     estimate : sequence of str, optional
-        What is free (see `starid.calibration.GROUPS`); by default the set of `MODELS` with the least
+        What is free (see `starid.calibration.GROUPS`); by default the set of `models` with the least
         Bayesian information criterion.
+    models : sequence of tuple of str
+        Sets to choose from when `estimate` is not given.
 
     Raises
     ------
@@ -133,17 +143,23 @@ def self_calibrate(
     seen = blend(sky.brighter_than(faintest + _FAINTER), _BLEND_PX * camera.pixel_scale_rad)
     indices = tuple(matched)
     result = calibrate(list(matched.values()), camera, _enough(list(matched.values()), ("focal", "k1")))
+    matches: tuple[NDArray[np.int64], ...] = ()
     for _ in range(_ROUNDS):
-        again = [
-            _rematched(frames[index], result.camera, attitude, seen, result.sigma_px)
+        pairs = [
+            _paired(frames[index], result.camera, attitude, seen, result.sigma_px)
             for index, attitude in zip(indices, result.attitudes, strict=True)
         ]
+        again = [
+            _frame(frames[index], _floored_sigma(frames[index]), chosen, seen.vectors[rows], attitude)
+            for index, attitude, (chosen, rows) in zip(indices, result.attitudes, pairs, strict=True)
+        ]
+        matches = tuple(np.stack([chosen, seen.hip[rows]], axis=1) for chosen, rows in pairs)
         before = result
         start = dataclasses.replace(camera, focal_px=result.camera.focal_px)
-        result = _best(again, start) if estimate is None else calibrate(again, start, estimate)
+        result = _best(again, start, models) if estimate is None else calibrate(again, start, estimate)
         if _same(before, result):
             break
-    return SelfCalibration(result, indices, refused)
+    return SelfCalibration(result, indices, matches, refused)
 
 
 def _floored_sigma(stars: Stars) -> Array | None:
@@ -171,10 +187,10 @@ def _frame(
     )
 
 
-def _rematched(
+def _paired(
     stars: Stars, camera: Camera, attitude: Attitude, sky: StarCatalog, sigma_px: float
-) -> CalibrationFrame:
-    """Pair detections and catalogue stars that are each other's nearest, within a window."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pair detections and catalogue stars that are each other's nearest, within a window: indices of both (m,)."""
     near = sky.in_cone(attitude.boresight, camera.field_radius_rad * 1.02)
     xy, inside = camera.project(attitude.to_sensor(sky.vectors[near]))
     near, xy = near[inside], xy[inside]
@@ -184,7 +200,7 @@ def _rematched(
     _, of_detection = cKDTree(measured).query(xy)
     chosen = np.flatnonzero(np.isfinite(distance))
     chosen = chosen[of_detection[of_catalog[chosen]] == chosen]
-    return _frame(stars, _floored_sigma(stars), chosen, sky.vectors[near[of_catalog[chosen]]], attitude)
+    return chosen, near[of_catalog[chosen]]
 
 
 def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:
@@ -198,9 +214,11 @@ def _enough(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple
     return model if equations > 2 * _unknowns(model, frames) else ("focal",)
 
 
-def _best(frames: list[CalibrationFrame], camera: Camera) -> Calibration:
+def _best(
+    frames: list[CalibrationFrame], camera: Camera, candidates: Sequence[tuple[str, ...]]
+) -> Calibration:
     """Calibrate with each model and keep that with the least Bayesian information criterion."""
-    models = [model for model in MODELS if _enough(frames, model) == model] or [MODELS[0]]
+    models = [model for model in candidates if _enough(frames, model) == model] or [("focal",)]
     results = [calibrate(frames, camera, model) for model in models]
     equations = 2 * sum(len(frame.xy_px) for frame in frames)
     noise = results[-1].sigma_px
