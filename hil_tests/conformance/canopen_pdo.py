@@ -26,7 +26,7 @@ FIXED: Final = (ABORT_ACCESS, ABORT_DEVICE_STATE, ABORT_VALUE)
 """Aborts by which stacks refuse a change of the mapping of a PDO in use; CiA 301 names none."""
 FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 SYNCHRONOUS: Final = 1
-EVENT: Final = 254
+EVENT: Final = 255
 
 
 def entry(item: ODVariable) -> int:
@@ -113,3 +113,11 @@ def first(probe: CanopenProbe, kind: int) -> int:
 def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
     """Send a SYNC, with a counter if one is given."""
     probe.send(0x080, b"" if counter is None else bytes([counter]))
+
+
+def after_event(probe: CanopenProbe, identifier: int) -> bytes:
+    """Return the TPDO that a write to a mapped object has caused; skip the case if such a write is no event here."""
+    data = probe.wait_for(identifier)
+    if data is None:
+        raise CaseSkipped("a write to a mapped object is no event of this device")
+    return data

@@ -92,7 +92,8 @@ class CanopenProbe:
         self.eds = eds
         self.timeout_s = timeout_s
         self.log: list[str] = []
-        self._kept: list[CanFrame] = []
+        self._boots = True
+        self._multiplexer = bytes(3)
 
     # Frames
 
@@ -168,8 +169,19 @@ class CanopenProbe:
     def ask(self, request: str | bytes, timeout_s: float | None = None) -> bytes | None:
         """Send an SDO request, padded to 8 bytes; return the answer, None if none comes."""
         data = bytes.fromhex(request) if isinstance(request, str) else request
-        self.send(0x600 + self.node, data.ljust(8, b"\0"))
+        self.send_request(data)
         return self.wait_for(0x580 + self.node, timeout_s)
+
+    def send_request(self, data: bytes) -> None:
+        """Send an SDO request, padded to 8 bytes."""
+        if data[0] >> 5 in {1, 2} or data[0] & 0xE3 == 0xA0 or data[0] & 0xE1 == 0xC0:
+            self._multiplexer = data[1:4]
+        self.send(0x600 + self.node, data.ljust(8, b"\0"))
+
+    def abandon_transfer(self) -> None:
+        """Send an abort for the last transfer, so that none goes on from one case to the next."""
+        self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
+        self.drain()
 
     def expect_answer(self, request: str | bytes, answer: str) -> bytes:
         """Fail unless an SDO request gets this answer; `..` in it stands for any byte."""
@@ -264,6 +276,18 @@ class CanopenProbe:
         self.drain()
         self.command(RESET_COMMUNICATION)
         self.expect_boot_up()
+
+    def begin_anew(self) -> None:
+        """Bring the node to PRE-OPERATIONAL with its stored values, as far as it can be brought there.
+
+        That a node does not boot up is for the cases about booting up to find; all others go on without it.
+        """
+        self.abandon_transfer()
+        self.command(RESET_COMMUNICATION)
+        if self.wait_for(0x700 + self.node, 3.0 if self._boots else 0.1) is None:
+            self._boots = False
+            self.command(PRE_OPERATIONAL)
+        self.drain()
 
     def expect_boot_up(self) -> None:
         """Fail unless the boot-up message comes."""

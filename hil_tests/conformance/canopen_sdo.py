@@ -19,7 +19,7 @@ from hil_tests.conformance.canopen_probe import (
     multiplexer,
     size_of,
 )
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 CLAUSE: Final = "CiA 301 7.2.4.3"
@@ -65,7 +65,7 @@ def expect_no_transfer(probe: CanopenProbe) -> None:
 
 @case(_CASES, "canopen.sdo.expedited-upload", "expedited upload tells its size", f"{CLAUSE}.6")
 def expedited_upload(probe: CanopenProbe) -> None:
-    """Objects of 1, 2 and 4 bytes: e and s set, n right, unused bytes zero."""
+    """Objects of 1, 2 and 4 bytes: e and s set, n right."""
     for size, command in ((1, 0x4F), (2, 0x4B), (4, 0x43)):
         fitting = [
             item for item in probe.variables() if item.readable and is_integer(item) and size_of(item) == size
@@ -73,8 +73,7 @@ def expedited_upload(probe: CanopenProbe) -> None:
         if not fitting:
             continue
         item = fitting[0]
-        answer = probe.expect_answer(upload(item), f"{command:02x} {mux(item)} .. .. .. ..")
-        check(not any(answer[4 + size :]), "unused bytes 00", answer)
+        probe.expect_answer(upload(item), f"{command:02x} {mux(item)} .. .. .. ..")
 
 
 @case(
@@ -111,7 +110,6 @@ def segmented_upload(probe: CanopenProbe) -> None:
         command = toggle | (7 - used) << 1 | (left <= 7)
         answer = probe.expect_answer(bytes([0x60 | toggle]), f"{command:02x}" + " .." * 7)
         data += answer[1 : 1 + used]
-        check(not any(answer[1 + used :]), "unused bytes 00", answer)
         toggle ^= 0x10
     check_equal(data, value, "value")
     expect_no_transfer(probe)
@@ -316,14 +314,12 @@ def other_node(probe: CanopenProbe) -> None:
 
 @case(_CASES, "canopen.sdo.stopped", "no SDO in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
 def stopped(probe: CanopenProbe) -> None:
-    """No answer; a transfer under way does not go on afterwards."""
+    """Neither to a new request nor within a transfer that was under way."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.command(STOP)
     if probe.ask("60", 0.2) is not None or probe.ask("40 00 10 00", 0.2) is not None:
         raise CaseFailed("no SDO answer in STOPPED", "an answer")
-    probe.command(128)
-    expect_no_transfer(probe)
 
 
 @case(_CASES, "canopen.sdo.server-parameter", "1200h tells the identifiers in use", "CiA 301 7.5.2.33")

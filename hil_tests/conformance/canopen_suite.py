@@ -7,14 +7,16 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from hil_tests.conformance import (
+    canopen_design,
     canopen_eds,
-    canopen_messages,
+    canopen_emcy,
     canopen_nmt,
     canopen_od,
     canopen_rpdo,
     canopen_sdo,
     canopen_sdo_block,
     canopen_store_lss,
+    canopen_sync_time,
     canopen_tpdo,
 )
 from hil_tests.conformance.canopen_probe import CanopenProbe
@@ -26,10 +28,12 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_sdo.CASES,
     *canopen_sdo_block.CASES,
     *canopen_od.CASES,
-    *canopen_messages.CASES,
+    *canopen_sync_time.CASES,
+    *canopen_emcy.CASES,
     *canopen_tpdo.CASES,
     *canopen_rpdo.CASES,
     *canopen_store_lss.CASES,
+    *canopen_design.CASES,
 )
 
 Status = Literal["passed", "failed", "skipped"]
@@ -55,9 +59,9 @@ def run_canopen_case(probe: CanopenProbe, case: Case[CanopenProbe]) -> CanopenOu
     expected = seen = ""
     try:
         if case.intrusive:
-            probe.reset_communication()
+            probe.begin_anew()
         else:
-            probe.drain()
+            probe.abandon_transfer()
         case.run(probe)
     except CaseFailed as failure:
         status, expected, seen = "failed", failure.expected, failure.seen
@@ -65,9 +69,5 @@ def run_canopen_case(probe: CanopenProbe, case: Case[CanopenProbe]) -> CanopenOu
         status, seen = "skipped", str(reason)
     log = tuple(probe.log)
     if case.intrusive:
-        try:
-            probe.reset_communication()
-        except CaseFailed as failure:
-            if status != "failed":
-                status, expected, seen = "failed", f"after the case: {failure.expected}", failure.seen
+        probe.begin_anew()
     return CanopenOutcome(case, status, expected, seen, time.perf_counter() - begin, log)

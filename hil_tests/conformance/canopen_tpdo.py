@@ -61,7 +61,7 @@ def cyclic(probe: CanopenProbe) -> None:
     "CiA 301 7.2.2.2",
     intrusive=True,
 )
-def not_withoutsend_sync(probe: CanopenProbe) -> None:
+def not_without_sync(probe: CanopenProbe) -> None:
     """Nothing in half a second without a SYNC."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
     probe.command(START)
@@ -91,7 +91,7 @@ def acyclic(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, changed)
     probe.expect_silence(identifier, "TPDO before the SYNC", 0.05)
     send_sync(probe)
-    check_equal(probe.expect(identifier, "TPDO after the event"), changed, "data")
+    check_equal(after_event(probe, identifier), changed, "data")
     send_sync(probe)
     probe.expect_silence(identifier, "TPDO without a second event")
     probe.set(item.index, item.subindex, before)
@@ -125,7 +125,7 @@ def event(probe: CanopenProbe) -> None:
     probe.expect_silence(identifier, "event-driven TPDO at SYNC")
     changed = int(item.max or 1).to_bytes(size_of(item) or 1, "little")
     probe.set(item.index, item.subindex, changed)
-    check_equal(probe.expect(identifier, "TPDO after the write"), changed, "data")
+    check_equal(after_event(probe, identifier), changed, "data")
     probe.set(item.index, item.subindex, before)
 
 
@@ -152,7 +152,7 @@ def inhibit(probe: CanopenProbe) -> None:
     probe.wait_for(identifier, 0.3)
     probe.wait_for(0x7FF, 0.15)
     probe.set(item.index, item.subindex, low)
-    check_equal(probe.expect(identifier, "first TPDO"), low, "data")
+    check_equal(after_event(probe, identifier), low, "data")
     start = probe.bus.now()
     probe.set(item.index, item.subindex, low)
     probe.set(item.index, item.subindex, high)
@@ -318,34 +318,6 @@ def mapping_length(probe: CanopenProbe) -> None:
     probe.expect_refusal(index + 0x200, 0, 3, 1, ABORT_PDO_LENGTH)
     probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *REFUSED)
     probe.set(index + 0x200, 0, 2, 1)
-
-
-@case(
-    _CASES,
-    "canopen.tpdo.attitude",
-    "TPDOs with a sequence number are of one sample",
-    "design: attitude TPDOs",
-    intrusive=True,
-)
-def attitude(probe: CanopenProbe) -> None:
-    """All TPDOs that map an object named `sequence` carry the same one after one SYNC."""
-    marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
-    chosen: list[int] = []
-    probe.quiet()
-    for index in probe.pdo_indices(0x1800):
-        if probe.number(index + 0x200, 0) and probe.number(index + 0x200, 1) == entry(marker):
-            probe.set(index, 2, SYNCHRONOUS, 1)
-            identifier = 0x3E0 + len(chosen)
-            probe.set(index, 1, PDO_OFF | NO_RTR | identifier)
-            probe.set(index, 1, NO_RTR | identifier)
-            chosen.append(identifier)
-    check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
-    probe.command(START)
-    for _ in range(5):
-        probe.drain()
-        send_sync(probe)
-        heads = {probe.expect(identifier, "TPDO")[:2] for identifier in chosen}
-        check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
 
 
 CASES = tuple(_CASES)

@@ -72,7 +72,7 @@ def case(
 def check(condition: object, expected: str, seen: object) -> None:
     """Raise `CaseFailed` unless the condition holds."""
     if not condition:
-        raise CaseFailed(expected, seen.hex() if isinstance(seen, bytes | bytearray) else str(seen))
+        raise CaseFailed(expected, _text(seen))
 
 
 def check_equal(seen: object, expected: object, what: str) -> None:
@@ -82,4 +82,6 @@ def check_equal(seen: object, expected: object, what: str) -> None:
 
 
 def _text(value: object) -> str:
+    if value is None:
+        return "nothing"
     return value.hex(" ") if isinstance(value, bytes | bytearray) else str(value)

@@ -25,6 +25,8 @@ LINK_PARAMETERS: Final = frozenset(
     {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}
 )
 """Parameters that would cut the tester off; they are only refused values, and set to what they are."""
+PARTNERS: Final = {"max_star_pixels": ("min_star_pixels", 1.0), "min_star_pixels": ("max_star_pixels", 255.0)}
+"""Parameters that bound each other → the other one, and the value at which it leaves all room."""
 F32_ROUNDING: Final = 1e-6
 UNSET: Final = frozenset({"unsolicited_rate"})
 """Parameters whose greatest value would flood the line."""
@@ -215,7 +217,10 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
             check_equal(float(probe.parameter(parameter.name)["value"]), before, "unchanged value")
 
     def values(probe: LinkProbe) -> None:
-        with probe.kept(parameter.name):
+        partner, room = PARTNERS.get(parameter.name, (parameter.name, None))
+        with probe.kept(parameter.name, partner):
+            if room is not None:
+                probe.set_parameter(partner, room)
             for good in _inside(parameter, float(probe.parameter(parameter.name)["value"])):
                 probe.set_parameter(parameter.name, good)
                 seen = float(probe.telemetry("parameter")["value"])

@@ -1,0 +1,60 @@
+"""CANopen conformance: what this family of devices promises beyond CiA 301."""
+
+from __future__ import annotations
+
+from hil_tests.conformance.canopen_pdo import EVENT, SYNCHRONOUS, entry, first, send_sync, set_up, writable
+from hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe, size_of
+from hil_tests.conformance.case import Case, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+
+
+@case(
+    _CASES,
+    "canopen.design.write-event",
+    "a write to a mapped object is an event",
+    "interface definition: canopen.toml",
+    intrusive=True,
+)
+def write_event(probe: CanopenProbe) -> None:
+    """The event-driven TPDO comes with the new value."""
+    item = writable(probe)
+    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
+    before = probe.read(item.index, item.subindex)
+    probe.command(START)
+    probe.wait_for(identifier, 0.1)
+    changed = int(item.max or 1).to_bytes(size_of(item) or 1, "little")
+    probe.set(item.index, item.subindex, changed)
+    check_equal(probe.expect(identifier, "TPDO after the write"), changed, "data")
+    probe.set(item.index, item.subindex, before)
+
+
+@case(
+    _CASES,
+    "canopen.design.attitude",
+    "TPDOs with a sequence number are of one sample",
+    "interface definition: canopen.toml",
+    intrusive=True,
+)
+def attitude(probe: CanopenProbe) -> None:
+    """All TPDOs that map an object named `sequence` carry the same one after one SYNC."""
+    marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
+    chosen: list[int] = []
+    probe.quiet()
+    for index in probe.pdo_indices(0x1800):
+        if probe.number(index + 0x200, 0) and probe.number(index + 0x200, 1) == entry(marker):
+            probe.set(index, 2, SYNCHRONOUS, 1)
+            identifier = 0x3E0 + len(chosen)
+            probe.set(index, 1, PDO_OFF | NO_RTR | identifier)
+            probe.set(index, 1, NO_RTR | identifier)
+            chosen.append(identifier)
+    check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
+    probe.command(START)
+    for _ in range(5):
+        probe.drain()
+        send_sync(probe)
+        heads = {probe.expect(identifier, "TPDO")[:2] for identifier in chosen}
+        check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
+
+
+CASES = tuple(_CASES)

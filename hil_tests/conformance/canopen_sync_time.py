@@ -1,0 +1,141 @@
+"""CANopen conformance: SYNC and TIME (CiA 301 7.2.5, 7.2.6)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hil_tests.conformance.canopen_probe import (
+    ABORT_DEVICE_STATE,
+    ABORT_VALUE,
+    ABORT_VALUE_HIGH,
+    ABORT_VALUE_LOW,
+    NO_RTR,
+    STOP,
+    CanopenProbe,
+)
+from hil_tests.conformance.case import Case, case, check, check_equal
+
+_CASES: list[Case[CanopenProbe]] = []
+REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
+FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
+
+
+def _quiet(probe: CanopenProbe) -> None:
+    probe.quiet()
+    probe.drain()
+
+
+# SYNC
+
+
+@case(
+    _CASES, "canopen.sync.identifier", "identifiers that SYNC may not have", "CiA 301 7.5.2.5", intrusive=True
+)
+def sync_identifier(probe: CanopenProbe) -> None:
+    """Restricted ones and the extended format are refused by 0609 0030h."""
+    probe.require(0x1005)
+    for identifier in (*FORBIDDEN, 0x2000_0080):
+        probe.expect_refusal(0x1005, 0, identifier, 4, *REFUSED)
+    check_equal(probe.number(0x1005) & 0x7FF, 0x80, "1005h as before")
+
+
+@case(
+    _CASES, "canopen.sync.counter-range", "values of the counter overflow", "CiA 301 7.5.2.22", intrusive=True
+)
+def sync_counter_range(probe: CanopenProbe) -> None:
+    """1 and 241 to 255 are refused by 0609 0030h, 2 to 240 taken."""
+    probe.require(0x1019)
+    for value in (1, 241, 255):
+        probe.expect_refusal(0x1019, 0, value, 1, *REFUSED)
+    for value in (2, 240, 0):
+        probe.set(0x1019, 0, value, 1)
+
+
+@case(
+    _CASES,
+    "canopen.sync.counter-fixed",
+    "counter overflow is fixed while a period is set",
+    "CiA 301 7.5.2.22",
+    intrusive=True,
+)
+def sync_counter_fixed(probe: CanopenProbe) -> None:
+    """Abort 0800 0022h with 1006h set."""
+    probe.require(0x1019)
+    probe.require(0x1006)
+    probe.set(0x1006, 0, 100_000)
+    probe.expect_refusal(0x1019, 0, 10, 1, ABORT_DEVICE_STATE)
+    probe.set(0x1006, 0, 0)
+    probe.set(0x1019, 0, 10, 1)
+
+
+@case(
+    _CASES, "canopen.sync.length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3", intrusive=True
+)
+def sync_length(probe: CanopenProbe) -> None:
+    """EMCY 8240h for a counter that is not configured, and for one that is missing."""
+    probe.require(0x1014)
+    _quiet(probe)
+    emergency = probe.number(0x1014) & 0x7FF
+    probe.send(0x080, b"\x01")
+    check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
+    probe.send(0x080)
+    check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
+    if 0x1019 in probe.od:
+        probe.set(0x1019, 0, 10, 1)
+        probe.send(0x080)
+        check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
+
+
+@case(_CASES, "canopen.sync.producer", "SYNC producer", "CiA 301 7.5.2.5", intrusive=True)
+def sync_producer(probe: CanopenProbe) -> None:
+    """Bit 30 of 1005h and 1006h make SYNCs at their period with the counter from 1, or are refused by 0609 0030h."""
+    probe.require(0x1006)
+    _quiet(probe)
+    if 0x1019 in probe.od:
+        probe.set(0x1019, 0, 3, 1)
+    probe.set(0x1006, 0, 20_000)
+    code = probe.write(0x1005, 0, NO_RTR | 0x80)
+    if code:
+        check_equal(code, ABORT_VALUE, "abort")
+        return
+    found = probe.count(0x080, 0.15)
+    check(5 <= len(found) <= 8, "SYNC every 20 ms", f"{len(found)} in 150 ms")
+    if 0x1019 in probe.od:
+        check_equal([data[0] for _, data in found[:5]], [1, 2, 3, 1, 2], "counters")
+    probe.expect_refusal(0x1005, 0, NO_RTR | 0x81, 4, ABORT_VALUE)
+    probe.command(STOP)
+    probe.drain()
+    probe.expect_silence(0x080, "SYNC in STOPPED")
+
+
+# TIME
+
+
+@case(
+    _CASES,
+    "canopen.time.identifier",
+    "identifiers that TIME may not have",
+    "CiA 301 7.5.2.13",
+    intrusive=True,
+)
+def time_identifier(probe: CanopenProbe) -> None:
+    """Restricted ones and the extended format are refused by 0609 0030h, a change while it is consumed too."""
+    probe.require(0x1012)
+    probe.set(0x1012, 0, 0x100)
+    for identifier in (*FORBIDDEN, 0x2000_0100):
+        probe.expect_refusal(0x1012, 0, identifier, 4, *REFUSED)
+    probe.set(0x1012, 0, 0x8000_0100)
+    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *REFUSED)
+
+
+@case(
+    _CASES, "canopen.time.malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3", intrusive=True
+)
+def time_malformed(probe: CanopenProbe) -> None:
+    """Five and seven bytes, and more milliseconds than a day has; the node goes on."""
+    for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
+        probe.send(0x100, data)
+    probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
+
+
+CASES = tuple(_CASES)

@@ -1,0 +1,222 @@
+"""The real device with its real links in simulated time: a conformance run takes seconds, and always the same."""
+
+from __future__ import annotations
+
+import asyncio
+import selectors
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Self
+
+from emulator.clock import NANOSECONDS
+from emulator.device import Device
+from emulator.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
+from emulator.imager import Answer, Asked, DirectImager
+from emulator.links.can import CanLink
+from emulator.links.serial import SerialLink
+from emulator.profile import Profile
+from emulator.pump import ClockPump
+from emulator.state_store import MemoryStore
+from emulator.truth import FixedTruth
+from hil_tests.conformance.can_probe import CanProbe
+from hil_tests.conformance.link_probe import ProbeTimes
+from hil_tests.conformance.serial_probe import SerialProbe
+from protocol.icd import load_icd
+from protocol.serial_framing import PacingSchedule
+from protocol.transports.base import Transport
+from protocol.transports.paced_writer import PacedWriter
+from starid.attitude import Attitude
+
+BAUD = 115200
+BOUND_S = 0.0005
+"""A turn of the loop that waits for nothing takes this long, so that simulated time goes on."""
+
+
+class _Selector(selectors.SelectSelector):
+    """Never waits: time that would be waited is put on the clock."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time = 0.0
+
+    def select(self, timeout: float | None = None) -> list:
+        events = super().select(0)
+        if not events and timeout is not None:
+            self.time += timeout
+        return events
+
+
+class SimulatedLoop(asyncio.SelectorEventLoop):
+    """An event loop whose time passes only while everybody waits."""
+
+    def __init__(self) -> None:
+        self._simulated = _Selector()
+        super().__init__(self._simulated)
+
+    def time(self) -> float:
+        return self._simulated.time
+
+
+class LoopClock:
+    """Run time of the device, from the loop."""
+
+    name = "real"
+    speed = 1.0
+
+    def __init__(self, loop: SimulatedLoop) -> None:
+        self._loop = loop
+
+    def now_ns(self) -> int:
+        return round(self._loop.time() * NANOSECONDS)
+
+
+class MemoryTransport(Transport[Any]):
+    """Joins the device to the tester without a wire; bytes take their time."""
+
+    def __init__(self, loop: SimulatedLoop, *, paced: bool) -> None:
+        super().__init__("memory")
+        self._loop = loop
+        self._paced = paced
+        self.out: deque[Any] = deque()
+        self.arrived = asyncio.Event()
+
+    async def _open(self) -> None:
+        if self._paced:
+            self._writer = PacedWriter(self._write, PacingSchedule(BAUD), self.statistics)
+
+    def _write(self, data: bytes) -> int:
+        self._put(data)
+        return len(data)
+
+    def _put(self, item: Any) -> None:
+        self.out.append(item)
+        self.arrived.set()
+
+    def send(self, item: Any) -> bool:
+        if self._paced:
+            return self._writer.send(item)
+        self._put(item)
+        return True
+
+    def deliver(self, item: Any) -> None:
+        """Hand an item to the device."""
+        self._receive(item)
+
+    async def drain(self) -> None:
+        """Nothing waits here."""
+
+    async def close(self) -> None:
+        """Nothing to give back."""
+
+
+class SimulatedPort:
+    """The tester's end of a memory transport: the same calls as a live port."""
+
+    def __init__(self, unit: SimulatedUnit) -> None:
+        self._unit = unit
+
+    def send(self, item: Any) -> None:
+        self._unit.transport.deliver(item)
+
+    def receive(self, timeout_s: float) -> Any:
+        transport = self._unit.transport
+        if not transport.out and timeout_s > 0:
+            self._unit.loop.run_until_complete(self._wait(timeout_s))
+        else:
+            self._unit.loop.run_until_complete(asyncio.sleep(0))
+        return transport.out.popleft() if transport.out else None
+
+    async def _wait(self, timeout_s: float) -> None:
+        transport = self._unit.transport
+        transport.arrived.clear()
+        if transport.out:
+            return
+        try:
+            async with asyncio.timeout(timeout_s):
+                await transport.arrived.wait()
+        except TimeoutError:
+            return
+
+    def now(self) -> float:
+        return self._unit.loop.time()
+
+
+STARS = (MatchedStar(32349, 86.0, 824.6, -1.44, 900.0), MatchedStar(27989, 361.0, 282.7, 0.45, 600.0))
+
+
+class Picture:
+    """A pipeline that sees the truth without making pictures."""
+
+    def __init__(self) -> None:
+        self.last = -1
+
+    def handle(self, request: Asked) -> Answer:
+        if isinstance(request, ImageRequest):
+            edge = request.edge or 10
+            pixels = bytes(
+                (row * 7 + column * 3 + self.last) % 256 for row in range(edge) for column in range(edge)
+            )
+            return ImageResult(edge, edge, self.last, pixels if self.last >= 0 else b"")
+        self.last = request.index
+        if not request.solve:
+            return FrameResult(request.index, solved=False)
+        return FrameResult(
+            request.index, valid=True, reason="ok", tracked=request.predicted_xyzw is not None,
+            quaternion_xyzw=request.attitude_xyzw, sigma_cross_arcsec=1.5, sigma_roll_arcsec=6.0, detected=40,
+            refused=3, matched=35, stars=STARS, probability_false=1e-12, rms_px=0.1, background_dn=8.2, noise_dn=0.61,
+        )  # fmt: skip
+
+
+class SimulatedUnit:
+    """A device in simulated time, with one link and a probe on it; a context manager.
+
+    `damage` is called with the unit before the device is switched on: it is how mutants are made.
+    """
+
+    def __init__(
+        self, link: str, damage: Callable[[SimulatedUnit], None] | None = None, dialect: str = "b"
+    ) -> None:
+        self.loop = SimulatedLoop()
+        self.kind = link
+        self.dialect = dialect
+        self._damage = damage
+
+    def __enter__(self) -> Self:
+        asyncio.set_event_loop(self.loop)
+        self.loop.run_until_complete(self._start())
+        port = SimulatedPort(self)
+        times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
+        icd = load_icd()
+        self.probe = (
+            SerialProbe(port, icd, dialect=self.dialect, baud=BAUD, times=times)
+            if self.kind == "serial"
+            else CanProbe(port, icd, times=times)
+        )
+        self.probe.sleep(1.0)
+        return self
+
+    async def _start(self) -> None:
+        self.imager = DirectImager(Picture().handle)
+        attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+        links = {"serial": {"dialect": self.dialect}}
+        profile = Profile.model_validate({"links": links})
+        self.store = MemoryStore()
+        self.device = Device(
+            profile, load_icd(), LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
+        )
+        self.transport = MemoryTransport(self.loop, paced=self.kind == "serial")
+        self.link: SerialLink | CanLink
+        self.link = (SerialLink if self.kind == "serial" else CanLink)(self.device, self.transport)
+        if self._damage is not None:
+            self._damage(self)
+        self.device.power_on()
+        await self.link.start()
+        self.pump = ClockPump(self.device.scheduler, self.device.clock)
+        self.pump.start()
+        self.device.pipeline_ready({})
+
+    def __exit__(self, *error: object) -> None:
+        self.pump.stop()
+        self.loop.run_until_complete(self.link.close())
+        self.loop.close()
+        asyncio.set_event_loop(None)

@@ -1,0 +1,26 @@
+"""The healthy device passes every case, in simulated time, in each dialect."""
+
+from __future__ import annotations
+
+import pytest
+
+from hil_tests.conformance.runner import run_case
+from hil_tests.conformance.suites import can_suite, serial_suite
+from protocol.icd import load_icd
+from tests.conformance.simulated import SimulatedUnit
+
+ICD = load_icd()
+SUITES = {"serial": serial_suite(ICD), "can": can_suite(ICD)}
+
+
+@pytest.mark.parametrize(
+    ("link", "dialect"), [("serial", "b"), ("serial", "a"), ("serial", "c"), ("can", "b")]
+)
+def test_the_healthy_device_passes_every_case(link, dialect):
+    with SimulatedUnit(link, dialect=dialect) as unit:
+        outcomes = [run_case(unit.probe, case) for case in SUITES[link]]
+    failed = [(o.id, o.expected, o.seen, o.log[-6:]) for o in outcomes if o.status == "failed"]
+    assert failed == []
+    skipped = {o.id for o in outcomes if o.status == "skipped"}
+    assert len(skipped) <= 3
+    assert len(outcomes) > 150
