@@ -25,7 +25,7 @@ from starid.matched_filter import (
 from starid.measurement import AT_EDGE, SATURATED, TWICE, find_neighbours, measure
 from starid.spot_shape import SpotShape, moments_of, shape_from_moments
 from starid.trail_filter import smooth_along_trails, trail_noise_factor
-from starid.windows import COLUMNS, SEEN_BEFORE, WINDOW_COLUMNS, cut_windows, lay_windows
+from starid.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
 
 Grid: TypeAlias = npt.NDArray[np.float32]
 
@@ -328,7 +328,7 @@ def _measured(
     cut_windows(counts, windows, background.level, grid[2], float(saturation), pixels)
     first = np.empty(count + 1, dtype=np.int32)
     neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
-    find_neighbours(windows, first, neighbours)
+    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
     stars = np.zeros((count, FIT_COLUMNS))
     flags = np.zeros(count, dtype=np.uint8)
     ratio = _RELAX * settings.threshold_sigma

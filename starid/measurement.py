@@ -62,7 +62,10 @@ _LEAST_SIDE: Final = 11
 
 @compiled_loops
 def find_neighbours(
-    windows: npt.NDArray[np.float64], first: npt.NDArray[np.int32], neighbours: npt.NDArray[np.int32]
+    windows: npt.NDArray[np.float64],
+    order: npt.NDArray[np.int64],
+    first: npt.NDArray[np.int32],
+    neighbours: npt.NDArray[np.int32],
 ) -> int:
     """List for every window the others whose stars' light may reach into it.
 
@@ -70,6 +73,8 @@ def find_neighbours(
     ----------
     windows : ndarray (n, WINDOW_COLUMNS)
         From `lay_windows`.
+    order : ndarray (n,)
+        Their numbers in the order of START_Y.
     first : ndarray (n + 1,)
         Filled: the neighbours of k are ``neighbours[first[k]:first[k + 1]]``.
     neighbours : ndarray (m,)
@@ -81,7 +86,6 @@ def find_neighbours(
         How many there are; more than m says that there was no room for all.
     """
     count = 0
-    order = np.argsort(windows[:, START_Y])
     place = np.empty(order.size, np.int32)
     for rank in range(order.size):
         place[order[rank]] = rank
