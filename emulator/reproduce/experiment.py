@@ -238,7 +238,8 @@ def row(
     if at_most is not None and not isinstance(ours, str):
         bounds.append(f"≤ {at_most:g}{space}{unit}")
         passed = bool(ours <= at_most) and passed is not False
-    return Row(quantity, text(published), text(ours), target or ", ".join(bounds), passed, remark)
+    verdict = None if passed is None else bool(passed)
+    return Row(quantity, text(published), text(ours), target or ", ".join(bounds), verdict, remark)
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:

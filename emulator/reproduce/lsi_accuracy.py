@@ -26,18 +26,19 @@ from emulator.reproduce.plots import colours, figure, precision_curve, save
 _PUBLISHED: Final = {0.3: 100.0, 0.2: 92.24, 0.1: 71.43, 0.013: 59.20, 0.008: 58.67, 0.002: 57.79}
 _ON_TARGET: Final = {0.3: 99.9, 0.2: 92.0, 0.1: 71.0}
 _OFF_TARGET: Final = {0.3: 83.0, 0.2: 73.0, 0.1: 48.0}
+_FINE_TARGET: Final = {ON: {0.3: 99.9, 0.2: 99.0, 0.1: 97.0}, OFF: {0.3: 94.0, 0.2: 93.0, 0.1: 92.0}}
 _MAP_SCALES: Final = (0.1, 1.0)
 _GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 _BEST: Final = 99.5
-_SAME_DEG: Final = 1e-6
+_SAME: Final = 1e-6
 _AGREES: Final = 1e-4
 
 _NOTE: Final = """The thesis's frames have their lower-left corner at α = 2° + 5°·k, δ = −88° + 5°·m. With p = 99.5 % the
 grid's step is 0.2°, so that every one of these frames is a frame of the database: the search finds the observation
 itself, at distance zero, and what is left is only what the LASSO penalty adds by mixing neighbours in. Moved off the
 grid the same algorithm loses: the nearest cell often differs from the frame by a star at the rim, and no mixture of
-cells undoes that. The third line, "sub-cell", is ours: from the nearest cell and 16 more it solves for the boresight
-at which the features, computed from the stars, agree, and keeps the best place."""
+cells undoes that. The third line, "sub-cell", is ours: from the nearest cell, and from up to 16 more, it solves for the
+boresight at which the features, computed from the stars, agree, and keeps the first place that does, or the best."""
 
 _LIMIT_NOTE: Final = """What limits the sub-cell search: while no star crosses the rim, n, A and σ_A are constant, and only
 r and σ_r tell where in the cell the frame is — two equations for two unknowns, with more than one solution in places. In
@@ -146,7 +147,7 @@ def _precision_figure(
             axes[i, j].set_xlabel(f"threshold of {symbol} / °")
             if j:
                 axes[i, j].set_ylabel("")
-    axes[0, 0].legend(loc="lower right", ncols=2)
+    fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
     return save(fig, path)
 
 
@@ -188,16 +189,15 @@ def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
                 at_most=0.05 if grid == ON else 4.5,
             )
         )
-        for limit in (0.3, 0.2, 0.1, 0.013, 0.002):
-            rows.append(
-                row(
-                    f"sub-cell (ours), p = {_BEST:g} %, {_GRID_WORDS[grid]}: share with ε_f ≤ {limit:g}°",
-                    ours=share(results[key]["f_fine"], limit),
-                    unit="%",
-                    at_least=share(results[key]["f_mse"], limit) if grid == OFF else targets.get(limit),
-                    remark="Target: what LSI reaches on the same frames." if grid == OFF else "",
-                )
+        rows.extend(
+            row(
+                f"sub-cell (ours), p = {_BEST:g} %, {_GRID_WORDS[grid]}: share with ε_f ≤ {limit:g}°",
+                ours=share(results[key]["f_fine"], limit),
+                unit="%",
+                at_least=_FINE_TARGET[grid].get(limit),
             )
+            for limit in (0.3, 0.2, 0.1, 0.013, 0.002)
+        )
         for limit, words in ((0.2, "hardly over 60 %"), (1.0, "nearly 70 %")):
             value = share(results[key]["theta_mse"], limit)
             rows.append(
@@ -229,19 +229,37 @@ def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
 def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float]) -> list[Row]:
     rows = []
     for grid in (ON, OFF):
-        first = results[f"p{percent:g}-roll{rolls[0]:g}-{grid}"]["f_mse"]
-        others = [results[f"p{percent:g}-roll{roll:g}-{grid}"]["f_mse"] for roll in rolls[1:]]
-        different = max(int(np.sum(np.abs(other - first) > _SAME_DEG)) for other in others)
-        rows.append(
+        sets = [results[f"p{percent:g}-roll{roll:g}-{grid}"] for roll in rolls]
+        frames = sets[0]["f_mse"].size
+        where = f"p = {percent:g} %, {_GRID_WORDS[grid]}: frames of {frames}"
+
+        def changed(name: str, sets: list[Results] = sets) -> int:
+            return max(int(np.sum(np.abs(other[name] - sets[0][name]) > _SAME)) for other in sets[1:])
+
+        shares = [f"{share(one['f_mse'], 0.3):.2f}" for one in sets]
+        rows += [
             row(
-                f"p = {percent:g} %, {_GRID_WORDS[grid]}: frames of {first.size} whose ε_f changes when the camera is turned",
+                f"{where} whose ε_ψ changes when the camera is turned",
                 published="0",
-                ours=str(different),
-                passed=different <= first.size // 500,
-                target=f"≤ {first.size // 500}",
-                remark="" if different == 0 else "Two cells are equally near there, and rounding decides.",
-            )
-        )
+                ours=str(changed("psi_mse")),
+                passed=changed("psi_mse") <= frames // 500,
+                target=f"≤ {frames // 500}",
+            ),
+            row(
+                f"{where} whose ε_f changes when the camera is turned",
+                published="0",
+                ours=str(changed("f_mse")),
+                remark="Where the nine cells hold the same stars, several weights ω reconstruct the observation equally well, "
+                "and the last digit of the features decides between them.",
+            ),
+            row(
+                f"p = {percent:g} %, {_GRID_WORDS[grid]}: share with ε_f ≤ 0.3° at roll {', '.join(f'{r:g}' for r in rolls)}°",
+                published="equal",
+                ours=", ".join(shares) + " %",
+                passed=float(max(shares, key=float)) - float(min(shares, key=float)) <= 1.0,
+                target="within 1 %",
+            ),
+        ]
     return rows
 
 
@@ -267,8 +285,8 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     best = results[f"p{percents[-1 if _BEST not in percents else percents.index(_BEST)]:g}-{OFF}"]
     agree = best["residual"] < _AGREES
     limits = _LIMIT_NOTE.format(
-        ambiguous=100.0 * np.mean(agree & (best["f_fine"] > 0.01)),
-        lost=100.0 * np.mean(~agree),
+        ambiguous=100.0 * float(np.mean(agree & (best["f_fine"] > 0.01))),
+        lost=100.0 * float(np.mean(~agree)),
         agrees=_AGREES,
     )
     return Outcome(tuple(rows), tuple(files), (_NOTE, limits))

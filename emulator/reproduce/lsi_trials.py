@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 
 from emulator.reproduce.experiment import Context, Results
 from starid.features import extract_features
-from starid.subcell import SubcellSearch
+from starid.lsi import LsiEstimate
+from starid.subcell import FineEstimate, SubcellSearch
 from starid.thesis_simulation import NoiseModel, add_noise, turned
 
 COLUMNS: Final = 63
@@ -37,7 +39,9 @@ def centres(every: int = 1) -> NDArray[np.float64]:
     return np.asarray(grid[::every], dtype=np.float64)
 
 
-def test_frames(rng: np.random.Generator, grid: str, step_deg: float, every: int = 1) -> NDArray[np.float64]:
+def frames_under_test(
+    rng: np.random.Generator, grid: str, step_deg: float, every: int
+) -> NDArray[np.float64]:
     """Centres of the test frames; `grid` "off" moves each by its own random fraction of the grid step, both ways."""
     places = centres(every)
     if grid == OFF:
@@ -62,7 +66,7 @@ def solve_frames(
     grid: str,
     *,
     rng: np.random.Generator,
-    noise: NoiseModel | None = None,
+    noise: Callable[[np.random.Generator], NoiseModel] | None = None,
     roll_deg: float = 0.0,
     every: int = 1,
 ) -> Results:
@@ -78,8 +82,10 @@ def solve_frames(
         "on" or "off".
     rng
         Where frames are moved to, and their noise.
-    noise, roll_deg
-        Noise of the stars, and the camera's roll.
+    noise
+        Noise of a frame's stars; it is asked for each frame, so that it may draw a mean.
+    roll_deg
+        The camera's roll.
     every
         Use only every so-many-th frame.
 
@@ -93,7 +99,7 @@ def solve_frames(
     lsi = context.lost_in_space(overlap)
     fine = SubcellSearch(lsi)
     sky = context.sky()
-    frames = test_frames(rng, grid, lsi.database.grid.step_deg, every)
+    frames = frames_under_test(rng, grid, lsi.database.grid.step_deg, every)
     answers = np.empty((3, len(frames), 2))
     angles = np.empty((3, len(frames)))
     psi = np.empty((2, len(frames)))
@@ -101,13 +107,14 @@ def solve_frames(
     for i, (ra, dec) in enumerate(frames):
         brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
         if noise is not None:
-            brightness, places, _ = add_noise(rng, brightness, places, noise, sky.half_width)
+            brightness, places, _ = add_noise(rng, brightness, places, noise(rng), sky.half_width)
         if roll_deg != 0.0:
             places = turned(places, roll_deg)
         features = extract_features(brightness, places)
         solution = lsi.solve(features)
         better = fine.solve(features)
-        for j, estimate in enumerate((solution.mse, solution.one_se, better)):
+        estimates: tuple[LsiEstimate | FineEstimate, ...] = (solution.mse, solution.one_se, better)
+        for j, estimate in enumerate(estimates):
             answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
             angles[j, i] = angle_error(features.theta_rad - estimate.theta_rad, roll)
         psi[:, i] = solution.mse.error_psi, better.residual

@@ -28,8 +28,8 @@ def figure(
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    with mpl.rc_context(_STYLE):
-        return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
+    mpl.rcParams.update(_STYLE)
+    return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
 
 
 def save(fig: Any, path: Path) -> str:

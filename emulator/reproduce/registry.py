@@ -9,7 +9,13 @@ from typing import Final
 
 from emulator.reproduce.experiment import Experiment, ReproduceError
 
-MODULES: Final[tuple[str, ...]] = ("lsi_accuracy",)
+MODULES: Final[tuple[str, ...]] = (
+    "feature_maps",
+    "database_sizes",
+    "worked_example",
+    "lsi_accuracy",
+    "lsi_noise",
+)
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
 
 
