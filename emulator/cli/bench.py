@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+_TABLE_WIDTH = 118
+
 group = typer.Typer(help="Measure speed, latency and accuracy.", no_args_is_help=True)
 
 
@@ -178,3 +180,89 @@ def bus(
     else:
         print_figures(figures, good)
     raise typer.Exit(0 if good else 1)
+
+
+@group.command("identify")
+def identify(
+    peers: Annotated[
+        str, typer.Option(help="Programs of others to compare with: tetra3rs,ruststartracker.")
+    ] = "",
+    solvers: Annotated[str, typer.Option(help="Algorithms of our own: geometric,lsi,rsi.")] = "geometric",
+    frames: Annotated[int, typer.Option(min=1, help="Scenes a row.")] = 300,
+    seed: Annotated[int, typer.Option(help="Seed of the scenes.")] = 1,
+    row: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Row of the table; may be repeated. 'all' adds the hard ones to the standard ones."
+        ),
+    ] = None,
+    budget: Annotated[
+        float, typer.Option(help="Seconds after which a solver is left out of the rest of a row.")
+    ] = 120.0,
+    json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare identification programs on the same scenes, and with the bound (least squares of the true matches)."""
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from emulator.bench.identify import ROWS, STANDARD, run
+
+    rows = list(STANDARD if not row else ROWS if "all" in row else row)
+    progress = Console(stderr=True)
+    answer = run(
+        frames,
+        seed,
+        peers=_names(peers),
+        own=_names(solvers),
+        rows=rows,
+        budget_s=budget,
+        progress=lambda name: progress.print(f"row {name}"),
+    )
+    if json_out:
+        print(json.dumps(answer))
+        return
+    table = Table(
+        "σ px, false, missing",
+        "solver",
+        "frames",
+        "valid %",
+        "wrong",
+        "″",
+        "÷ floor",
+        "roll ÷",
+        "ms",
+        "p99 ms",
+    )
+    for entry in answer["rows"]:
+        figures = (
+            _shown(entry["boresight_median_arcsec"], 1),
+            _shown(entry["floor_ratio"], 3),
+            _shown(entry["roll_floor_ratio"], 3),
+            _shown(entry["median_ms"], 3),
+            _shown(entry["p99_ms"], 2),
+        )
+        table.add_row(
+            entry["row"],
+            entry["solver"],
+            str(entry["frames"]),
+            f"{entry['valid_pct']:.2f}",
+            str(entry["wrong"]),
+            *figures,
+        )
+    console = Console()
+    console.width = max(console.width, _TABLE_WIDTH)
+    console.print(table)
+    for name, why in answer["skipped"].items():
+        console.print(f"{name}: skipped, {why}")
+
+
+def _names(text: str) -> list[str]:
+    """Names of a list with commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _shown(value: float | None, digits: int) -> str:
+    """Figure for a table."""
+    return "–" if value is None else f"{value:.{digits}f}"
