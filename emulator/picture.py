@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from emulator.frames import (
     SolverSettings,
     Warm,
 )
+from emulator.precompile import picture_was_compiled, start_helper
 from emulator.sensor import Frame, Renderer
 from emulator.sensor_model import SensorModel
 from emulator.sky_objects import SkyObjects
@@ -91,17 +93,21 @@ class Picture:
             p2=p2,
         )
         here = (0.0, 0.0, 0.0, 1.0)
+        helper = start_helper() if picture_was_compiled() else None
+        request = FrameRequest(
+            index=0,
+            attitude_xyzw=here,
+            rate_rad_s=(1e-3, 0.0, 0.0),
+            exposure_s=0.1,
+            gain=self._sensor.gain,
+            settings=settings,
+        )
+        if helper is not None:
+            frame = self._renderer.render(Attitude.identity(), request.rate_rad_s)
+            detect(frame.image, detection_settings(self._sensor, settings))
+            helper.wait()  # what it has compiled is loaded below; what it could not is compiled there
         for predicted in (None, here):
-            request = FrameRequest(
-                index=0,
-                attitude_xyzw=here,
-                rate_rad_s=(1e-3, 0.0, 0.0),
-                exposure_s=0.1,
-                gain=self._sensor.gain,
-                predicted_xyzw=predicted,
-                settings=settings,
-            )
-            self._frame(request)
+            self._frame(replace(request, predicted_xyzw=predicted))
         self._last = None
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
@@ -168,10 +174,12 @@ class Picture:
         key = (camera, settings.error_margin, tuple(sorted(options.items())))
         if self._identifier is None or key != self._identifier_key:
             if self._setup.algorithm == "geometric":
-                from starid.identifier import TOLERANCE_PX, Effort
+                from starid.identifier import Effort
 
-                tolerance_px = TOLERANCE_PX * settings.error_margin / 100.0
-                options["effort"] = Effort(tolerance_px=tolerance_px)
+                nominal = Effort()
+                options["effort"] = replace(
+                    nominal, tolerance_px=nominal.tolerance_px * settings.error_margin / 100.0
+                )
             try:
                 self._identifier = make_identifier(self._setup.algorithm, camera, self.catalog, **options)
             except TypeError as error:

@@ -83,7 +83,9 @@ class TruthLog:
         try:
             self._file = path.open("w", encoding="utf-8", newline="")
         except OSError as error:
-            raise EmulatorError(f"truth log {path}: cannot be written ({error.strerror}); choose another file") from None
+            raise EmulatorError(
+                f"truth log {path}: cannot be written ({error.strerror}); choose another file"
+            ) from None
         self._writer = csv.writer(self._file)
         self._writer.writerow(COLUMNS)
         self._file.flush()
@@ -104,6 +106,10 @@ def _cell(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float):
-        exact = name.startswith(("true_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
+        exact = (
+            name.startswith(("true_q", "measured_q"))
+            or name.endswith("time_s")
+            or name == "time_of_exposure_s"
+        )
         return repr(value) if exact else f"{value:.6g}"
     return str(value)
