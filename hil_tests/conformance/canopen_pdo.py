@@ -115,9 +115,9 @@ def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
     probe.send(0x080, b"" if counter is None else bytes([counter]))
 
 
-def after_event(probe: CanopenProbe, identifier: int) -> bytes:
+def after_event(probe: CanopenProbe, identifier: int, timeout_s: float | None = None) -> bytes:
     """Return the TPDO that a write to a mapped object has caused; skip the case if such a write is no event here."""
-    data = probe.wait_for(identifier)
+    data = probe.wait_for(identifier, timeout_s)
     if data is None:
         raise CaseSkipped("a write to a mapped object is no event of this device")
     return data

@@ -69,5 +69,8 @@ def run_canopen_case(probe: CanopenProbe, case: Case[CanopenProbe]) -> CanopenOu
         status, seen = "skipped", str(reason)
     log = tuple(probe.log)
     if case.intrusive:
-        probe.begin_anew()
+        try:
+            probe.begin_anew()
+        except CaseFailed as failure:
+            status, expected, seen = "failed", failure.expected, failure.seen
     return CanopenOutcome(case, status, expected, seen, time.perf_counter() - begin, log)

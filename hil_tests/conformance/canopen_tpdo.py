@@ -10,6 +10,7 @@ from hil_tests.conformance.canopen_pdo import (
     FORBIDDEN,
     REFUSED,
     SYNCHRONOUS,
+    after_event,
     constant,
     entry,
     first,
@@ -152,7 +153,7 @@ def inhibit(probe: CanopenProbe) -> None:
     probe.wait_for(identifier, 0.3)
     probe.wait_for(0x7FF, 0.15)
     probe.set(item.index, item.subindex, low)
-    check_equal(after_event(probe, identifier), low, "data")
+    check_equal(after_event(probe, identifier, 3.0), low, "data")
     start = probe.bus.now()
     probe.set(item.index, item.subindex, low)
     probe.set(item.index, item.subindex, high)

@@ -51,13 +51,10 @@ def build_eds(dictionary: Dictionary, *, file_name: str = "star-sensor.eds", dat
         ("Comments", [("Lines", "1"), ("Line1", "Made from the interface definition; do not edit.")], ""),
     ]
     indices = sorted(dictionary.od.indices)
-    lists = {
-        "MandatoryObjects": [index for index in indices if index in MANDATORY],
-        "OptionalObjects": [
-            index for index in indices if index not in MANDATORY and index not in MANUFACTURER
-        ],
-        "ManufacturerObjects": [index for index in indices if index in MANUFACTURER],
-    }
+    lists: dict[str, list[int]] = {"MandatoryObjects": [], "OptionalObjects": [], "ManufacturerObjects": []}
+    for index in indices:
+        kind = "Mandatory" if index in MANDATORY else "Manufacturer" if index in MANUFACTURER else "Optional"
+        lists[f"{kind}Objects"].append(index)
     for name, members in lists.items():
         entries = [(str(position), f"0x{index:04X}") for position, index in enumerate(members, 1)]
         sections.append((name, [("SupportedObjects", str(len(members))), *entries], ""))

@@ -165,9 +165,7 @@ class LssSlave:
         if step == 0:
             self._identified = 0
         own = self._identity((0, 1, 2, 2, 3, 3)[step])
-        matches = (number == own, number == own, number <= own, number >= own, number <= own, number >= own)[
-            step
-        ]
+        matches = number == own if step < 2 else number <= own if step % 2 == 0 else number >= own
         if step != self._identified or not matches:
             self._identified = 0
             return

@@ -230,8 +230,6 @@ class PdoService:
     @property
     def next_deadline(self) -> float | None:
         """When the next timer of a PDO runs out."""
-        if self._context.state is not NmtState.OPERATIONAL:
-            return None
         times = [pdo.next_deadline for pdo in self._all]
         return min((time for time in times if time is not None), default=None)
 
@@ -263,8 +261,7 @@ class PdoService:
 
     def tick(self) -> None:
         """Act on the timers."""
-        if self._context.state is NmtState.OPERATIONAL:
-            for transmitting in self.transmitting:
-                transmitting.tick()
-            for receiving in self.receiving:
-                receiving.tick()
+        for transmitting in self.transmitting:
+            transmitting.tick()
+        for receiving in self.receiving:
+            receiving.tick()

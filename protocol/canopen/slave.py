@@ -133,7 +133,7 @@ class CanopenSlave:
             self.error_control.tick()
             counter = self.sync.tick()
             if counter is not None:
-                self._synchronise(counter)
+                self.pdos.synchronise(counter)
             self.pdos.tick()
             self.emergency.flush()
         return self._finish()
@@ -304,10 +304,6 @@ class CanopenSlave:
             return
         counter = self.sync.receive(frame.data)
         if counter is not None:
-            self._synchronise(counter)
-
-    def _synchronise(self, counter: int) -> None:
-        if self.state is NmtState.OPERATIONAL:
             self.pdos.synchronise(counter)
 
     def _on_time(self, frame: CanFrame) -> None:

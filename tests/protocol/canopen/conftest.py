@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
+import io
+import sys
+from collections import deque
 from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
 
 import canopen
 import pytest
 
+import protocol.canopen
+from hil_tests.conformance.canopen_probe import CanopenProbe
+from hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from hil_tests.conformance.case import CaseFailed
 from protocol.can_framing import CanFrame
 from protocol.canopen import CanopenSlave, DeviceDictionary, Picture, StandInApplication, build_dictionary
 from protocol.canopen.storage import ParameterStorage
@@ -127,6 +137,108 @@ class DirectNetwork(canopen.Network):
         for frame in answers:
             self.frames += 1
             self.notify(frame.id, bytearray(frame.data), self._bench.now)
+
+
+class SimulatedBus:
+    """A bus in simulated time with one slave on it, for the conformance cases: an hour passes in no time.
+
+    A slave that never comes to rest fails the case instead of hanging it.
+    """
+
+    MOST_FRAMES = 100_000
+    MOST_TICKS = 5_000
+
+    def __init__(self, slave) -> None:
+        self._slave = slave
+        self._now = 0.0
+        self._frames = deque(slave.start(0.0))
+        self.budget = self.MOST_FRAMES
+
+    def now(self) -> float:
+        return self._now
+
+    def send(self, frame: CanFrame) -> None:
+        self._frames.extend(self._slave.receive(frame, self._now))
+
+    def receive(self, timeout_s: float) -> CanFrame | None:
+        end = self._now + timeout_s
+        for _ in range(self.MOST_TICKS):
+            if self._frames:
+                self.budget -= 1
+                if self.budget < 0:
+                    raise CaseFailed("a node that comes to rest", "frames without end")
+                return self._frames.popleft()
+            deadline = self._slave.next_deadline()
+            if deadline is None or deadline > end:
+                self._now = end
+                return None
+            self._now = max(self._now, deadline)
+            self._frames.extend(self._slave.tick(self._now))
+        raise CaseFailed("a node that comes to rest", "a deadline without end")
+
+
+@lru_cache(maxsize=16)
+def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
+    """Read a data sheet with the library."""
+    with io.StringIO(text) as file:
+        file.name = "node.eds"
+        return canopen.import_od(file, node_id)
+
+
+def simulated_probe(package=protocol.canopen) -> CanopenProbe:
+    """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
+    dictionary = package.build_dictionary()
+
+    class RestlessApplication(package.StandInApplication):
+        """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""
+
+        looks = 0
+
+        def telemetry(self, row):
+            if row.name == "precise_attitude":
+                self.looks += 1
+                self.rows[row.name] = {"frame_counter": self.looks}
+            return super().telemetry(row)
+
+    dictionary.application = RestlessApplication(dictionary.icd)
+    slave = package.CanopenSlave(dictionary, NODE)
+    eds = package.build_eds(dictionary)
+    return CanopenProbe(SimulatedBus(slave), NODE, import_eds(eds, NODE), eds)
+
+
+@pytest.fixture(name="simulated_probe")
+def simulated_probe_fixture():
+    return simulated_probe
+
+
+@pytest.fixture(scope="session")
+def read_eds():
+    return lambda text: import_eds.__wrapped__(text, NODE)
+
+
+@pytest.fixture(scope="session")
+def run_conformance():
+    """Run all cases against the node on a bus; identifiers by what came of them."""
+
+    def run(bus, eds: str) -> dict[str, set[str]]:
+        probe = CanopenProbe(bus, NODE, import_eds(eds, NODE), eds)
+        outcomes: dict[str, set[str]] = {"passed": set(), "failed": set(), "skipped": set()}
+        for case in CANOPEN_CASES:
+            outcomes[run_canopen_case(probe, case).status].add(case.id)
+        return outcomes
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def mutants():
+    """The module beside this file with the mutants of the slave."""
+    path = Path(__file__).with_name("mutants.py")
+    spec = importlib.util.spec_from_file_location("canopen_mutants", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

@@ -1,0 +1,241 @@
+"""Mutants of the CANopen slave: one defect each, as a change of one place in one module.
+
+A mutant is the whole package loaded anew under another name with that place changed; the text to be changed must stand in
+the module exactly once, so that a mutant cannot silently become the original.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import protocol.canopen
+
+PACKAGE = "protocol.canopen"
+FOLDER = Path(protocol.canopen.__file__).parent
+ALIAS = "mutant_canopen"
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A defect: in `module` the text `old` is `new`. `area` is where the cases are that ought to find it."""
+
+    name: str
+    area: str
+    module: str
+    old: str
+    new: str
+
+
+MUTANTS = (
+    # SDO, expedited and segmented
+    Mutant("upload tells the wrong number of unused bytes", "sdo", "sdo", "bytes([0x43 | unused << 2])", "bytes([0x43])"),
+    Mutant("segmented upload tells no size", "sdo", "sdo", "bytes([0x41]) + multiplexer", "bytes([0x40]) + multiplexer"),
+    Mutant("segmented upload tells a wrong size", "sdo", "sdo", 'multiplexer + len(value).to_bytes(4, "little")]', 'multiplexer + (len(value) + 1).to_bytes(4, "little")]'),
+    Mutant("download answered without its multiplexer", "sdo", "sdo", "return [bytes([0x60]) + data[1:4] + bytes(4)]", "return [bytes([0x60]) + bytes(7)]"),
+    Mutant("upload toggle bit not checked", "sdo", "sdo_transfer", "if command >> 5 != 3:\n            return super().request(data)\n        if command & 0x10 != self._toggle:", "if command >> 5 != 3:\n            return super().request(data)\n        if False:"),
+    Mutant("download toggle bit not checked", "sdo", "sdo_transfer", "if command >> 5 != 0:\n            return super().request(data)\n        if command & 0x10 != self._toggle:", "if command >> 5 != 0:\n            return super().request(data)\n        if False:"),
+    Mutant("upload toggle bit not echoed", "sdo", "sdo_transfer", "bytes([self._toggle | unused << 1 | self.done])", "bytes([unused << 1 | self.done])"),
+    Mutant("download toggle bit not echoed", "sdo", "sdo_transfer", "bytes([0x20 | self._toggle])", "bytes([0x20])"),
+    Mutant("last upload segment not marked", "sdo", "sdo_transfer", "self._toggle | unused << 1 | self.done", "self._toggle | unused << 1"),
+    Mutant("unused bytes of download segments taken as data", "sdo", "sdo_transfer", "self._buffer.data += data[1 : 8 - unused]", "self._buffer.data += data[1:8]"),
+    Mutant("too many bytes of a download cut off", "sdo", "sdo_transfer", "        if len(self.data) > self.maximum:\n            raise", "        if len(self.data) > self.maximum:\n            del self.data[self.maximum :]\n        if False:\n            raise"),
+    Mutant("unknown command not answered", "sdo", "sdo", '            if self._transfer is None:\n                raise SdoAbortError(AbortCode.COMMAND, f"0x{command:02X} without a transfer")', "            if self._transfer is None:\n                return []"),
+    Mutant("abort of the client answered", "sdo", "sdo", "            self._transfer = self._waiting = None\n            return []", "            raise SdoAbortError(AbortCode.GENERAL)"),
+    Mutant("abort of the client not obeyed", "sdo", "sdo", "            self._transfer = self._waiting = None\n            return []", "            return []"),
+    Mutant("no time-out of transfers", "sdo", "sdo", "self.deadline = now + self._timeout_s if self.busy else None", "self.deadline = None"),
+    Mutant("time-out with the wrong code", "sdo", "sdo", "self._abort(AbortCode.TIMEOUT,", "self._abort(AbortCode.GENERAL,"),
+    Mutant("transfer goes on after its abort", "sdo", "sdo", "        self.reset()\n        return bytes([ABORT])", "        return bytes([ABORT])"),
+    Mutant("SDO answered in STOPPED", "sdo", "slave", "if frame.remote or not self._context.communicates:", "if frame.remote:"),
+    Mutant("short frames taken as SDO", "sdo", "sdo", "        if len(data) != LENGTH:\n            return []\n", '        data = data.ljust(LENGTH, b"\\0")\n'),
+    Mutant("extended frames answered", "sdo", "slave", "if frame.extended or handlers is None:", "if handlers is None:"),
+    Mutant("expedited download without a size refused", "sdo", "sdo", "else min(4, entry.size or 4)", "else 4"),
+    Mutant("abort names no object", "sdo", "sdo", 'return bytes([ABORT]) + index.to_bytes(2, "little") + bytes([subindex])', "return bytes([ABORT]) + bytes(3)"),
+    # SDO block transfer
+    Mutant("block upload numbers segments from 0", "sdo-block", "sdo_transfer", "bytes([number + 1]) + block", "bytes([number]) + block"),
+    Mutant("last segment of a block upload not marked", "sdo-block", "sdo_transfer", "if end >= len(self._data):", "if False:"),
+    Mutant("block upload with a wrong CRC", "sdo-block", "sdo_transfer", "crc_hqx(data, 0) if crc else 0", "crc_hqx(data, 0xFFFF) if crc else 0"),
+    Mutant("block upload ends with wrong unused bytes", "sdo-block", "sdo_transfer", "-len(self._data) % SEGMENT if self._data", "len(self._data) % SEGMENT if self._data"),
+    Mutant("block upload does not repeat", "sdo-block", "sdo_transfer", "self._position + good * SEGMENT", "self._position + self._sent * SEGMENT"),
+    Mutant("block upload takes any block size", "sdo-block", "sdo_transfer", "if not 1 <= size <= MAXIMUM_BLOCK:", "if size > 255:"),
+    Mutant("block upload ignores the client's block size", "sdo-block", "sdo_transfer", "self._block_size = valid_block_size(block_size)\n        self._position = 0", "valid_block_size(block_size)\n        self._block_size = 127\n        self._position = 0"),
+    Mutant("more confirmed than sent not noticed", "sdo-block", "sdo_transfer", "if good > self._sent:", "if good > 127:"),
+    Mutant("block upload confirmed before its start", "sdo-block", "sdo_transfer", "if subcommand == 2 and self._started and not", "if subcommand == 2 and not"),
+    Mutant("block upload ends at any time", "sdo-block", "sdo_transfer", "if subcommand == 1 and self._ending:", "if subcommand == 1:"),
+    Mutant("block download CRC not checked", "sdo-block", "sdo_transfer", "if self._crc and crc_hqx", "if False and crc_hqx"),
+    Mutant("block download confirms a gap", "sdo-block", "sdo_transfer", "bytes([0xA2, self._good, MAXIMUM_BLOCK])", "bytes([0xA2, number, MAXIMUM_BLOCK])"),
+    Mutant("block download takes segments after a gap", "sdo-block", "sdo_transfer", "expected = number == self._good + 1", "expected = True"),
+    Mutant("block download keeps unused bytes", "sdo-block", "sdo_transfer", "del self._buffer.data[-unused:]", "pass"),
+    Mutant("block download without its confirmation", "sdo-block", "sdo_transfer", "return [bytes([0xA1]) + bytes(7)]", "return []"),
+    Mutant("protocol switch threshold turned round", "sdo-block", "sdo", "if threshold and len(value) <= threshold:", "if threshold and len(value) >= threshold:"),
+    # Object dictionary
+    Mutant("missing object reported as missing sub-index", "od", "dictionary", "raise SdoAbortError(AbortCode.NO_OBJECT,", "raise SdoAbortError(AbortCode.NO_SUBINDEX,"),
+    Mutant("missing sub-index reported as missing object", "od", "dictionary", "raise SdoAbortError(AbortCode.NO_SUBINDEX,", "raise SdoAbortError(AbortCode.NO_OBJECT,"),
+    Mutant("read-only objects written", "od", "dictionary", "if not entry.variable.writable:", "if False:"),
+    Mutant("write-only objects read", "od", "dictionary", "if not entry.variable.readable:", "if False:"),
+    Mutant("too long values cut off", "od", "dictionary", "    if length > highest:\n        raise", "    if length > highest + 4:\n        raise"),
+    Mutant("too short values taken", "od", "dictionary", "    if length < lowest:\n        raise", "    if length < 1:\n        raise"),
+    Mutant("high limit not checked", "od", "dictionary", "if variable.max is not None and value > variable.max:", "if False:"),
+    Mutant("low limit off by one", "od", "dictionary", "value < variable.min:", "value < variable.min - 1:"),
+    Mutant("values not kept", "od", "dictionary", "        entry.value = data\n        self.changed", "        self.changed"),
+    Mutant("a default that is not the data sheet's", "od", "dictionary", "if index in indices and entry.reader is None:", "if index in indices and entry.reader is None and index != 0x1017:"),
+    Mutant("default identifiers without the node-ID", "od", "dictionary", "        default += node_id\n", "        default += 0\n"),
+    # NMT and error control
+    Mutant("state is left by an error in PRE-OPERATIONAL only", "error-control", "slave", "behaviour == 0 and self.state is NmtState.OPERATIONAL", "behaviour == 0 and self.state is NmtState.PRE_OPERATIONAL"),
+    Mutant("no boot-up message", "nmt", "slave", 'context.send(ERROR_CONTROL + context.node_id, b"\\0")', "pass"),
+    Mutant("boot-up message tells PRE-OPERATIONAL", "nmt", "slave", 'context.send(ERROR_CONTROL + context.node_id, b"\\0")', 'context.send(ERROR_CONTROL + context.node_id, b"\\x7f")'),
+    Mutant("starts by itself", "nmt", "slave", "        context.state = NmtState.PRE_OPERATIONAL\n", "        context.state = NmtState.OPERATIONAL\n"),
+    Mutant("commands to all nodes ignored", "nmt", "slave", "frame.data[1] not in {0, self.node_id}", "frame.data[1] != self.node_id"),
+    Mutant("commands to other nodes obeyed", "nmt", "slave", "or frame.data[1] not in {0, self.node_id}", ""),
+    Mutant("commands of wrong length obeyed", "nmt", "slave", "len(frame.data) != 2 or", "len(frame.data) < 2 or"),
+    Mutant("stop and PRE-OPERATIONAL exchanged", "nmt", "slave", "2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL", "128: NmtState.STOPPED, 2: NmtState.PRE_OPERATIONAL"),
+    Mutant("reset of communication ignored", "nmt", "slave", "elif command in {RESET_NODE, RESET_COMMUNICATION}:", "elif command == RESET_NODE:"),
+    Mutant("reset does not restore parameters", "nmt", "slave", "        self.store.load(COMMUNICATION)\n", ""),
+    Mutant("heartbeat tells PRE-OPERATIONAL always", "error-control", "error_control", "bytes([self._context.state]))\n            self._next", "bytes([0x7F]))\n            self._next"),
+    Mutant("heartbeat at a tenth of its period", "error-control", "error_control", "self._producer.number() * 1e-3, now)", "self._producer.number() * 1e-4, now)"),
+    Mutant("heartbeat not switched off", "error-control", "error_control", "period_ms * 1e-3 if period_ms else None\n\n    def _producer", "(period_ms or 50) * 1e-3\n\n    def _producer"),
+    Mutant("guarding does not toggle", "error-control", "error_control", "self._toggle ^= 0x80", "pass"),
+    Mutant("guarding toggle not reset", "error-control", "error_control", "        self._toggle = 0\n        self._life_deadline = None\n", "        self._life_deadline = None\n"),
+    Mutant("guarding answered beside the heartbeat", "error-control", "error_control", "if self._producer.number() or self._context.state", "if self._context.state"),
+    Mutant("no life guarding", "error-control", "error_control", "self._context.now + life_s if life_s else None", "None"),
+    Mutant("watch begins at once", "error-control", "error_control", "self._monitors[node_id] = Monitor(period_ms * 1e-3)", "self._monitors[node_id] = Monitor(period_ms * 1e-3, self._context.now + period_ms * 1e-3)"),
+    Mutant("watched node's silence not noticed", "error-control", "error_control", "monitor.deadline = self._context.now + monitor.period_s", "monitor.deadline = None"),
+    Mutant("watched node's return not noticed", "error-control", "error_control", "        if monitor.lost:\n", "        if False:\n"),
+    Mutant("error behaviour ignored", "error-control", "slave", "if behaviour == 0 and", "if behaviour != 2 and"),
+    Mutant("one node watched twice", "error-control", "error_control", "if value & 0xFFFF and any(", "if False and any("),
+    # SYNC, TIME, EMCY
+    Mutant("SYNC of wrong length taken", "sync", "sync", "if len(data) != (1 if self._overflow.number() else 0):", "if False:"),
+    Mutant("counter overflow of 1 taken", "sync", "sync", "if data[0] == 1 or data[0] > LARGEST_OVERFLOW:", "if data[0] > LARGEST_OVERFLOW:"),
+    Mutant("counter overflow changed while a period is set", "sync", "sync", "if self._period.number():", "if False:"),
+    Mutant("SYNC counter begins at 0", "sync", "sync", "self._counter = self._counter % overflow + 1", "self._counter = (self._counter + 1) % overflow"),
+    Mutant("SYNC produced in STOPPED", "sync", "sync", "        if not self._context.communicates:\n            return None\n        overflow", "        overflow"),
+    Mutant("restricted identifiers taken", "sync", "cob", "if any(first <= identifier <= last for first, last in RESTRICTED):", "if False:"),
+    Mutant("extended identifiers taken", "sync", "cob", "if cob_id & EXTENDED or identifier > 0x7FF:", "if False:"),
+    Mutant("TIME moved while it is consumed", "time", "timestamp", "lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES)", "lives_before=False, lives_after=False"),
+    Mutant("EMCY without the generic bit", "emcy", "emergency", "= bits | ErrorRegister.GENERIC", "= bits & ~ErrorRegister.GENERIC"),
+    Mutant("EMCY repeated", "emcy", "emergency", "        if (code, key) in self._active:\n            return False\n", ""),
+    Mutant("EMCY of 7 bytes", "emcy", "emergency", 'data[:5].ljust(5, b"\\0")', 'data[:4].ljust(4, b"\\0")'),
+    Mutant("error register stays", "emcy", "emergency", "if self._active.pop((code, key), None) is None:", "if (code, key) not in self._active:"),
+    Mutant("history oldest first", "emcy", "emergency", "self._history.insert(0, code |", "self._history.append(code |"),
+    Mutant("history without end", "emcy", "emergency", "        del self._history[self._capacity :]\n", ""),
+    Mutant("history cannot be cleared", "emcy", "emergency", "        self._history.clear()\n\n    def _check", "        self._history\n\n    def _check"),
+    Mutant("history takes any number", "emcy", "emergency", 'if data != b"\\0":', "if False:"),
+    Mutant("EMCY sent though it is off", "emcy", "emergency", "if not self._cob_id.number() & INVALID:", "if True:"),
+    Mutant("EMCY inhibit time ignored", "emcy", "emergency", "self._inhibit.number() * INHIBIT_UNIT_S", "0"),
+    Mutant("EMCY sent in STOPPED", "emcy", "emergency", "while self._queue and self._context.communicates and", "while self._queue and"),
+    # PDO
+    Mutant("TPDO sent in PRE-OPERATIONAL", "tpdo", "pdo", "bool(self._objects) and self._context.state is NmtState.OPERATIONAL", "bool(self._objects) and self._context.communicates"),
+    Mutant("cyclic TPDO one SYNC late", "tpdo", "pdo", "if self._syncs >= kind:", "if self._syncs > kind:"),
+    Mutant("cyclic TPDO at every SYNC", "tpdo", "pdo", "if self._syncs >= kind:", "if self._syncs >= 1:"),
+    Mutant("acyclic TPDO at every SYNC", "tpdo", "pdo", "            if self._event:\n                self._send()\n            return", "            self._send()\n            return"),
+    Mutant("SYNC start value ignored", "tpdo", "pdo", "if counter and counter != self.records.sync_start:", "if False:"),
+    Mutant("event-driven TPDO at SYNC", "tpdo", "pdo", "if not self.active or not self._synchronous:\n            return", "if not self.active:\n            return\n        if not self._synchronous:\n            self._send()\n            return"),
+    Mutant("event timer not started anew", "tpdo", "pdo", "        self._event = False\n        self._restart_timer()\n        try:", "        self._event = False\n        self._event_at = None\n        try:"),
+    Mutant("inhibit time ignored", "tpdo", "pdo", "self._free_at = self._context.now + self.records.inhibit_s", "self._free_at = self._context.now"),
+    Mutant("inhibit time in milliseconds", "tpdo", "pdo_mapping", "self._inhibit.number() * 1e-4", "self._inhibit.number() * 1e-3"),
+    Mutant("no event at a write", "design", "slave", "            self.pdos.trigger(changed)\n", ""),
+    Mutant("mapping changed while it counts", "tpdo", "pdo_mapping", "        if self._count.number():\n            raise", "        if False:\n            raise"),
+    Mutant("mapping changed while the PDO is in use", "tpdo", "pdo_mapping", "    def _require_disabled(self) -> None:\n        if self.valid:", "    def _require_disabled(self) -> None:\n        if False:"),
+    Mutant("more than 64 bits mapped", "tpdo", "pdo_mapping", "if size > LARGEST_PDO:", "if size > 64:"),
+    Mutant("unmappable objects mapped", "tpdo", "pdo_mapping", "if not variable.pdo_mappable or not usable", "if not usable"),
+    Mutant("wrong lengths mapped", "tpdo", "pdo_mapping", "if entry.size is None or bits != entry.size * 8:", "if entry.size is None:"),
+    Mutant("reserved transmission types taken", "tpdo", "pdo_mapping", "if data[0] > LAST_CYCLIC and data[0] not in EVENT_DRIVEN:", "if False:"),
+    Mutant("inhibit time of a PDO in use changed", "tpdo", "pdo_mapping", "for entry in (self._inhibit, self._sync_start):", "for entry in (self._sync_start,):"),
+    Mutant("identifier of a PDO in use changed", "tpdo", "pdo_mapping", "        check_replacement(old, new, lives_before=not old & INVALID, lives_after=not new & INVALID)\n", ""),
+    Mutant("changed PDO keeps its old configuration", "tpdo", "slave", "            self.pdos.configure()\n", ""),
+    Mutant("TPDOs of one SYNC from different samples", "design", "device_dictionary", "if self._cached_at != self.instant:", "if True:"),
+    Mutant("RPDO acts in PRE-OPERATIONAL", "rpdo", "slave", "if self.state is NmtState.OPERATIONAL and not frame.remote:\n                receive", "if self._context.communicates and not frame.remote:\n                receive"),
+    Mutant("synchronous RPDO acts at once", "rpdo", "pdo", "            self._pending = data\n", "            self._apply(data)\n"),
+    Mutant("short RPDO processed", "rpdo", "pdo", "if len(data) < self._size:", "if not data:"),
+    Mutant("short RPDO not reported", "rpdo", "pdo", "            self._emergency.raise_error(\n                ErrorCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key\n            )\n", ""),
+    Mutant("long RPDO not reported", "rpdo", "pdo", "        if len(data) > self._size:\n", "        if False:\n"),
+    Mutant("place holders do not count", "rpdo", "pdo", "                position += mapped.size\n", "                position += mapped.size if mapped.entry is not None else 0\n"),
+    Mutant("RPDO deadline ignored", "rpdo", "pdo", "self._context.now + self.records.event_s if self.records.event_s else None\n        if", "None\n        if"),
+    Mutant("RPDO with the type of a remote TPDO", "rpdo", "pdo_mapping", "EVENT_DRIVEN: Final = frozenset({254, 255})", "EVENT_DRIVEN: Final = frozenset({252, 253, 254, 255})"),
+    # Store, restore and LSS
+    Mutant("stored without the signature", "store", "store", "if data != SAVE:", "if False:"),
+    Mutant("restored without the signature", "store", "store", "if data != LOAD:", "if False:"),
+    Mutant("nothing is stored", "store", "store", "self._storage.save(group, values)", "self._storage.save(group, {})"),
+    Mutant("restore changes nothing", "store", "store", "self._storage.clear(group)", "self._storage.load(group)"),
+    Mutant("restore counts at once", "store", "store", "                    self._storage.clear(group)\n", "                    self._storage.clear(group)\n                    self.set_defaults(group)\n"),
+    Mutant("groups are not kept apart", "store", "store", "            if subindex in {ALL, number}:\n                self._save(group)", "            if True:\n                self._save(group)"),
+    Mutant("LSS selected by part of the identity", "lss", "lss", "if step != self._selected or number != self._identity(step):", "if step != self._selected:"),
+    Mutant("LSS obeys while it waits", "lss", "lss", "        elif self.configuring:\n            self._configuration", "        elif True:\n            self._configuration"),
+    Mutant("LSS takes any node-ID", "lss", "lss", "valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED", "valid = True"),
+    Mutant("LSS node-ID never used", "lss", "slave", "        context.node_id = self.lss.pending_node_id\n", ""),
+    Mutant("LSS tells the pending node-ID", "lss", "lss", "self._send(command, bytes([self._context.node_id]))", "self._send(command, bytes([self.pending_node_id ^ 1]))"),
+    Mutant("LSS takes reserved bit rates", "lss", "lss", "BIT_RATES.get(data[2]) if data[1] == 0 else None", "BIT_RATES.get(data[2], 125_000) if data[1] == 0 else None"),
+    Mutant("LSS identify ignores ranges", "lss", "lss", "number <= own if step % 2 == 0 else number >= own", "True"),
+    Mutant("LSS identify answered by another command", "lss", "lss", "    IDENTIFIED = 0x4F\n", "    IDENTIFIED = 0x47 + 1\n"),
+    Mutant("configured node answers fastscan", "lss", "lss", "if not self._unconfigured or self.configuring:", "if self.configuring:"),
+    Mutant("fastscan compares wrong bits", "lss", "lss", "if number >> bit != self._identity(part) >> bit:", "if number >> bit + 1 != self._identity(part) >> bit + 1:"),
+    Mutant("fastscan does not end in configuration", "lss", "lss", "self.configuring = following < part", "self.configuring = False"),
+    # Data sheet
+    Mutant("data sheet with wrong defaults", "od", "eds", 'number = f"0x{item.default:X}" if item.default >= 0 else str(item.default)', 'number = f"0x{item.default ^ 1:X}"'),
+    Mutant("data sheet leaves out an object", "eds", "eds", '        lists[f"{kind}Objects"].append(index)\n', '        if index != 0x1005:\n            lists[f"{kind}Objects"].append(index)\n'),
+    Mutant("data sheet with another number of PDOs", "eds", "eds", '("NrOfTXPDO", str(int(information.nr_of_TXPDO or 0)))', '("NrOfTXPDO", "4")'),
+    Mutant("data sheet with high limits too low", "eds", "eds", "(key, str(int(limit)))", "(key, str(int(limit) // 1000))"),
+    Mutant("data sheet calls everything mappable", "tpdo", "eds", '("PDOMapping", str(int(item.pdo_mappable)))', '("PDOMapping", "1")'),
+)  # fmt: skip
+
+
+@cache
+def _sources() -> dict[str, str]:
+    return {path.stem: path.read_text(encoding="utf-8") for path in sorted(FOLDER.glob("*.py"))}
+
+
+@cache
+def _code(module: str, text: str) -> types.CodeType:
+    return compile(text.replace(PACKAGE, ALIAS), f"<{ALIAS}.{module}>", "exec")
+
+
+class _Finder:
+    """Imports the modules of the mutant package from the changed sources."""
+
+    def __init__(self, texts: dict[str, str]) -> None:
+        self._texts = texts
+
+    def find_spec(self, name, _path=None, _target=None):
+        if name == ALIAS:
+            return importlib.util.spec_from_loader(name, self, is_package=True)
+        package, _, module = name.rpartition(".")
+        if package == ALIAS and module in self._texts:
+            return importlib.util.spec_from_loader(name, self)
+        return None
+
+    def create_module(self, _spec):
+        return None
+
+    def exec_module(self, module):
+        stem = "__init__" if module.__name__ == ALIAS else module.__name__.rpartition(".")[2]
+        exec(_code(stem, self._texts[stem]), module.__dict__)
+
+
+def load(mutant: Mutant | None) -> types.ModuleType:
+    """Return the package with a defect (or without one) under its other name.
+
+    Raises
+    ------
+    ValueError
+        The text to be changed does not stand in the module exactly once.
+    """
+    texts = dict(_sources())
+    if mutant is not None:
+        text = texts[mutant.module]
+        if text.count(mutant.old) != 1:
+            raise ValueError(
+                f"{mutant.name}: {mutant.module}.py has {text.count(mutant.old)} times {mutant.old!r}"
+            )
+        texts[mutant.module] = text.replace(mutant.old, mutant.new)
+    for name in [name for name in sys.modules if name == ALIAS or name.startswith(f"{ALIAS}.")]:
+        del sys.modules[name]
+    finder = _Finder(texts)
+    sys.meta_path.insert(0, finder)
+    try:
+        return importlib.import_module(ALIAS)
+    finally:
+        sys.meta_path.remove(finder)
