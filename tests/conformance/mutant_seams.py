@@ -1,0 +1,112 @@
+"""Mutants of the device: what a mutant is, and the seams at which a defect is put in.
+
+A defect is put at a seam of the healthy device, just before it is switched on: into what its links receive, what they
+send, how requests are handled, or into one of its parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from emulator.device import Device
+from protocol.messages import FaultKind, Reply, Request
+from tests.conformance.simulated import SimulatedUnit
+
+Damage = Callable[[SimulatedUnit], None]
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A defect on a link, and the case that has to fail because of it."""
+
+    name: str
+    link: str
+    caught_by: str
+    damage: Damage
+
+
+MUTANTS: list[Mutant] = []
+
+
+def mutant(name: str, link: str, caught_by: str) -> Callable[[Damage], Damage]:
+    """Enter a damage in the table; on `both` links it makes two mutants."""
+
+    def enter(damage: Damage) -> Damage:
+        links = ("serial", "can") if link == "both" else (link,)
+        MUTANTS.extend(Mutant(name, kind, f"{kind}.{caught_by}", damage) for kind in links)
+        return damage
+
+    return enter
+
+
+def outgoing(change: Callable[[Any], list[Any]]) -> Damage:
+    """Replace each item that the device sends by others."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        send = unit.link.wire.send
+
+        def changed(item: Any) -> None:
+            for other in change(item):
+                send(other)
+
+        unit.link.wire.send = changed
+
+    return damage
+
+
+def incoming(change: Callable[[Any], list[Any]]) -> Damage:
+    """Replace each item that the device receives by others."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        receive = unit.link._receive
+
+        def changed(item: Any) -> None:
+            for other in change(item):
+                receive(other)
+
+        unit.link._receive = changed
+
+    return damage
+
+
+def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]], list[Reply]]) -> Damage:
+    """Come between the links and the device: the change gets device, request and the healthy handler."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        device, handle = unit.device, unit.device.handle
+        device.handle = lambda request: change(device, request, handle)
+
+    return damage
+
+
+def events(change: Callable[[Any], list[Any]]) -> Damage:
+    """Replace each request or fault that the link's receiver finds."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        link = unit.link
+        take = link._take
+
+        def changed(event: Any) -> None:
+            for other in change(event):
+                take(other)
+
+        link._take = changed
+
+    return damage
+
+
+def enter(name: str, link: str, caught_by: str, damage: Damage) -> None:
+    """Enter a damage that is made by one of the seams."""
+    mutant(name, link, caught_by)(damage)
+
+
+def without_faults(*kinds: FaultKind) -> Damage:
+    """Let the device not hear of some kinds of fault."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        device, fault = unit.device, unit.device.fault
+        device.fault = lambda event: None if event.kind in kinds else fault(event)
+
+    return damage

@@ -1,0 +1,206 @@
+"""Mutants in the parts of the device: telemetry, images, parameters, unsolicited telemetry."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from protocol.messages import ErrorCode, Reply, ReplyKind
+from tests.conformance.mutant_seams import (
+    Damage,
+    enter,
+    handling,
+    mutant,
+)
+from tests.conformance.simulated import SimulatedUnit
+
+
+@mutant("boots are not counted", "both", "reset.acknowledged")
+def boots_not_counted(unit: SimulatedUnit) -> None:
+    unit.store.save = lambda _content: None
+
+
+@mutant("attitudes stay valid in standby", "both", "modes.standby")
+def stale_attitude(unit: SimulatedUnit) -> None:
+    original = unit.device.telemetry
+
+    def changed(name: str) -> bytes:
+        data = bytearray(original(name))
+        if name == "precise_attitude":
+            field = unit.device.icd.telemetry[name].named_fields["valid"]
+            data[field.offset] |= 1 << field.shift
+        return bytes(data)
+
+    unit.device.telemetry = changed
+
+
+def _reversed_tail(replies: list[Reply]) -> list[Reply]:
+    """Keep the first reply and turn the others round."""
+    return replies[:1] + replies[:0:-1]
+
+
+def _telemetry_bytes(name: str, field: str, change: Callable[[bytes], bytes]) -> Damage:
+    """Change the bytes of one field of a row."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        original = unit.device.telemetry
+        item = unit.device.icd.telemetry[name].named_fields[field]
+
+        def changed(asked: str) -> bytes:
+            data = original(asked)
+            if asked != name:
+                return data
+            end = item.offset + item.size
+            return data[: item.offset] + change(data[item.offset : end]) + data[end:]
+
+        unit.device.telemetry = changed
+
+    return damage
+
+
+def _number(size: int, change: Callable[[int], int]) -> Callable[[bytes], bytes]:
+    return lambda raw: (change(int.from_bytes(raw, "little")) % (1 << 8 * size)).to_bytes(size, "little")
+
+
+enter(
+    "frame checksums are wrong",
+    "both",
+    "images.frames",
+    _telemetry_bytes("image_frame_info", "checksum", _number(1, lambda v: v + 1)),
+)
+enter(
+    "frame numbers count from 1",
+    "both",
+    "images.frames",
+    _telemetry_bytes("image_frame_info", "frame", _number(2, lambda v: v + 1)),
+)
+enter(
+    "block checksums are wrong",
+    "both",
+    "bursts.block",
+    _telemetry_bytes("file_block", "checksum", _number(2, lambda v: v ^ 0x8000)),
+)
+enter(
+    "the attitude is not normalised",
+    "both",
+    "modes.attitude",
+    _telemetry_bytes("precise_attitude", "q_w", lambda raw: raw[:3] + bytes([raw[3] ^ 0x01])),
+)
+enter(
+    "the time of exposure is that of the request",
+    "both",
+    "modes.attitude",
+    _telemetry_bytes("precise_attitude", "time_of_exposure", lambda _raw: bytes(8)),
+)
+enter(
+    "parameters report no limits",
+    "both",
+    "parameters.exposure.limits",
+    _telemetry_bytes("parameter", "maximum", lambda _raw: bytes(8)),
+)
+enter(
+    "the runtime stands still",
+    "both",
+    "time.uptime",
+    _telemetry_bytes("device_status", "uptime", lambda _raw: bytes(4)),
+)
+enter(
+    "an image may be downloaded beyond its end",
+    "both",
+    "images.beyond",
+    handling(
+        lambda _d, r, h: (
+            [Reply(ReplyKind.ACK, 65, destination=r.source)] if r.id == 65 and r.data == b"\x20\x00" else h(r)
+        )
+    ),
+)
+enter(
+    "the hole map is not obeyed",
+    "both",
+    "bursts.holes",
+    handling(
+        lambda _d, r, h: h(
+            dataclasses.replace(r, data=b"\x14\x01") if r.id == 119 and len(r.data) == 2 else r
+        )
+    ),
+)
+enter(
+    "burst packets are in reverse order",
+    "both",
+    "bursts.block",
+    handling(lambda _d, r, h: _reversed_tail(h(r))),
+)
+enter(
+    "an other camera is taken for the star camera",
+    "both",
+    "images.other-camera",
+    handling(
+        lambda _d, r, h: h(
+            dataclasses.replace(r, data=b"\x02" + r.data[1:]) if r.id == 80 and len(r.data) == 2 else r
+        )
+    ),
+)
+enter(
+    "unsolicited telemetry comes at half its rate",
+    "can",
+    "unsolicited.rate",
+    handling(
+        lambda _d, r, h: h(
+            dataclasses.replace(r, data=r.data[:1] + b"\x00\x00\xa0\x40")
+            if r.id == 104 and r.data[1:] == b"\x00\x00\x20\x41"
+            else r
+        )
+    ),
+)
+enter(
+    "unsolicited telemetry does not stop",
+    "can",
+    "unsolicited.rate",
+    handling(
+        lambda _d, r, h: (
+            [Reply(ReplyKind.ACK, 104, destination=r.source)]
+            if r.id == 104 and r.data[1:] == bytes(4)
+            else h(r)
+        )
+    ),
+)
+enter(
+    "parameters are clipped instead of refused",
+    "both",
+    "parameters.exposure.refusals",
+    handling(
+        lambda _d, r, h: (
+            [dataclasses.replace(a, kind=ReplyKind.ACK, code=ErrorCode.OK) for a in h(r)]
+            if r.id == 98
+            else h(r)
+        )
+    ),
+)
+enter(
+    "the exposure cannot be set below 10 ms",
+    "both",
+    "parameters.exposure.values",
+    handling(
+        lambda _d, r, h: (
+            [Reply(ReplyKind.NACK, 98, code=ErrorCode.INVALID_PARAMETER, destination=r.source)]
+            if r.id == 98 and r.data[:1] == b"\x01" and r.data[1:] == b"\0\0\0\0\0\0\xf0\x3f"
+            else h(r)
+        )
+    ),
+)
+enter(
+    "set_star_config takes effect in part",
+    "both",
+    "store.config",
+    handling(
+        lambda d, r, h: [
+            (
+                d.parameters.set({"exposure": 161})
+                if a.code is ErrorCode.INVALID_PARAMETER and r.id == 37
+                else None,
+                a,
+            )[1]
+            for a in h(r)
+        ]
+    ),
+)
