@@ -50,7 +50,11 @@ _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
 _ZERO_POINT_STAR: Final = 25
 _WINDOW_PX: Final = 12.0
 _BLEND_PX: Final = 2.0
-_VOTE_SHARE: Final = 0.3
+_VOTE_SHARE: Final = 0.25
+_SPREAD: Final = 0.8
+_SPOTS_PER_BAND: Final = 100_000.0
+_STAGES: Final = (200, 3000)
+_OFFSET_SHARE: Final = 0.055
 _FEWEST_VOTES: Final = 6.0
 
 
@@ -109,7 +113,7 @@ class LsiIdentifier:
     overlap
         Overlap ratio of the database.
     neighbours
-        Neighbours tried.
+        Most neighbours tried, the nearest first.
     zero_point
         Magnitude V of one unit of flux, where it is known; found from the frame, and kept, where it is not.
     limiting_magnitude
@@ -132,7 +136,7 @@ class LsiIdentifier:
         *,
         feature_limit: float | None = None,
         overlap: float = 0.99,
-        neighbours: int = 1000,
+        neighbours: int = 30_000,
         zero_point: float | None = None,
         limiting_magnitude: float | None = None,
         database: str | Path | None = None,
@@ -149,8 +153,7 @@ class LsiIdentifier:
         seen = seen_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
         self.database = self._load(seen, parameters, database, cache=cache)
         self.lost_in_space = LostInSpace(self.database)
-        step = math.radians(self.database.grid.step_deg)
-        self._offset_px = self.database.parameters.focal_px * 0.8 * step
+        self._offset_px = _OFFSET_SHARE * self.database.parameters.half_width_px
         self._neighbours = neighbours
         self._zero_point = zero_point
         self._star_magnitude = self._magnitude_of_rank(share)
@@ -166,6 +169,11 @@ class LsiIdentifier:
     def catalog(self) -> StarCatalog:
         """The catalogue that `Solution.catalog_index` counts in."""
         return self._catalog
+
+    @property
+    def zero_point(self) -> float | None:
+        """Magnitude V of one unit of flux; None before it was given or found."""
+        return self._zero_point
 
     def _limit_for(self, share: float) -> float:
         v = np.sort(self._catalog.v)
@@ -245,16 +253,16 @@ class LsiIdentifier:
             if features is None:
                 continue
             enough = True
-            first, candidates = self._candidates(features)
+            first, place = self._coarse(features)
             coarse = coarse or first
-            for attitude, attempts in self.attitudes(field, candidates):
+            for attitude, attempts in self._attitudes_of(field, place, features):
                 tried += attempts
                 if attitude is None:
                     continue
                 verified += 1
                 solution = self.verifier.track(xy, brightness, attitude, xy_sigma_px, window_px=_WINDOW_PX)
                 if solution.valid:
-                    self._learn(solution, brightness)
+                    self.learn(solution, brightness)
                     self.last_report = LsiReport(coarse, tried, verified, zero_point)
                     return dataclasses.replace(
                         solution, mode="lost_in_space", elapsed=time.perf_counter() - begin
@@ -291,7 +299,7 @@ class LsiIdentifier:
         guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
         return [guess + step for step in _ZERO_POINT_STEPS]
 
-    def _learn(self, solution: Solution, flux: NDArray[np.float64]) -> None:
+    def learn(self, solution: Solution, flux: NDArray[np.float64]) -> None:
         """Keep the zero point that the matched stars show, where none was given."""
         if self._zero_point is None and solution.star_count >= _FEWEST_STARS:
             magnitudes = self._catalog.v[solution.catalog_index]
@@ -319,25 +327,44 @@ class LsiIdentifier:
             return None
         return extract_features(field.magnitude[bright], field.place[bright])
 
-    def _candidates(self, features: FeatureVector) -> tuple[Attitude, NDArray[np.float64]]:
-        """Coarse attitude of the thesis's form, and boresights (k, 2) in degrees: its own, then the cells' centres."""
-        observation = self.database.normalise(features)
-        solution = self.lost_in_space.solve_normalised(observation).mse
+    def _coarse(self, features: FeatureVector) -> tuple[Attitude, NDArray[np.float64]]:
+        """Attitude in the thesis's form, one neighbour and LASSO, and its boresight (1, 2) in degrees."""
+        solution = self.lost_in_space.solve(features).mse
         x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
         across = np.cross(solution.boresight, solution.pointer)
-        rows = np.stack(
-            [x * solution.pointer - y * across, y * solution.pointer + x * across, solution.boresight]
-        )
-        count = min(self._neighbours, self.database.cells)
-        distances, cells = np.empty(count), np.empty(count, dtype=np.int64)
-        stored_neighbours(self.lost_in_space.index, observation * 2.55, distances, cells)
-        cells = cells[np.lexsort((cells, distances))]
-        return Attitude.from_matrix(rows), np.concatenate(
-            [
-                [[solution.right_ascension_deg, solution.declination_deg]],
-                self.cell_centres(cells[cells >= 0]),
-            ]
-        )
+        rows = [x * solution.pointer - y * across, y * solution.pointer + x * across, solution.boresight]
+        place = np.array([[solution.right_ascension_deg, solution.declination_deg]])
+        return Attitude.from_matrix(np.stack(rows)), place
+
+    def _candidates(self, features: FeatureVector) -> Iterator[NDArray[np.float64]]:
+        """Boresights (k, 2) in degrees to try: centres of the nearest cells in growing numbers, none twice."""
+        observation = self.database.normalise(features)
+        most = min(self._neighbours, self.database.cells)
+        tried = np.empty(0)
+        for count in sorted({min(stage, most) for stage in (*_STAGES, most)}):
+            distances, cells = np.empty(count), np.empty(count, dtype=np.int64)
+            stored_neighbours(self.lost_in_space.index, observation * 2.55, distances, cells)
+            order = np.lexsort((cells, distances))
+            centres = self.cell_centres(cells[order][cells[order] >= 0])
+            spots = self._spots(centres)
+            first = np.sort(np.unique(spots, return_index=True)[1])
+            new = first[~np.isin(spots[first], tried)]
+            tried = np.concatenate([tried, spots[new]])
+            yield centres[new]
+
+    def _spots(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Number of the spot that each place (n, 2) lies in, on a grid just fine enough for the votes."""
+        step = math.degrees(_SPREAD * self._offset_px / self.database.parameters.focal_px)
+        band = np.floor((places[:, 1] + 90.0) / step)
+        columns = np.maximum(np.rint(360.0 * np.cos(np.radians((band + 0.5) * step - 90.0)) / step), 1.0)
+        return np.asarray(band * _SPOTS_PER_BAND + np.floor(places[:, 0] / 360.0 * columns), dtype=np.float64)
+
+    def _attitudes_of(
+        self, field: FieldStars, place: NDArray[np.float64], features: FeatureVector
+    ) -> Iterator[tuple[Attitude | None, int]]:
+        yield from self.attitudes(field, place)
+        for places in self._candidates(features):
+            yield from self.attitudes(field, places)
 
     def cell_centres(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Right ascension and declination of cells, degrees, (n, 2)."""
