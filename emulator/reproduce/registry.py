@@ -15,6 +15,7 @@ MODULES: Final[tuple[str, ...]] = (
     "worked_example",
     "lsi_accuracy",
     "lsi_noise",
+    "lsi_run_time",
 )
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
 
