@@ -98,7 +98,7 @@ class StarCatalog:
 
     @cached_property
     def absolute_v(self) -> NDArray[np.float64]:
-        """Absolute magnitude M_V (n,), eq. 2.1 of the thesis; NaN where the parallax is not positive."""
+        """Absolute magnitude M_V (n,), see `absolute_magnitude`; NaN where the parallax is not positive."""
         return absolute_magnitude(self.v, self.parallax_mas)
 
     def magnitude(self, band: Band) -> NDArray[np.float64]:

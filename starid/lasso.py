@@ -24,7 +24,7 @@ LAMBDAS.setflags(write=False)
 MAX_STEPS: Final = 96
 """Most breakpoints followed before coordinate descent takes over."""
 
-_MAX_SWEEPS: Final = 200_000
+_MAX_SWEEPS: Final = 2000
 _SINGULAR: Final = 1e-11
 _TIE: Final = 1e-10
 _OPTIMALITY: Final = 1e-6
@@ -216,7 +216,7 @@ def coordinate_descent(
             change = max(change, abs(value - omega[j]))
             omega[j] = value
             largest = max(largest, abs(value))
-        if change <= 1e-12 * max(largest, 1e-12):
+        if change <= 1e-10 * max(largest, 1e-12):
             return sweep + 1
     return _MAX_SWEEPS
 
