@@ -97,9 +97,12 @@ class CampaignStore:
                 raise EmulatorError(
                     f"campaign: {plan_file} holds another plan: give another folder, or the same options"
                 )
-        else:
+            return
+        try:
             folder.mkdir(parents=True, exist_ok=True)
             plan_file.write_text(text)
+        except OSError as error:
+            raise EmulatorError(f"campaign: {folder} cannot be written: {error.strerror}") from error
 
     def _file(self, chunk: int) -> Path:
         return self.folder / f"chunk-{chunk:06d}.npy"

@@ -21,6 +21,7 @@ COMMANDS: Final[dict[str, str]] = {
     "run": "run",
     "bench": "bench",
     "render": "render",
+    "identify": "identify",
     "campaign": "campaign",
     "catalog": "catalog",
     "calibrate": "calibrate",

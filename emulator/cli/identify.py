@@ -1,0 +1,186 @@
+"""`starhil identify`: which stars are on an image, and where it looks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from starid.camera import Camera
+    from starid.image_solver import ImageSolution
+
+_NUMBERED_TO_MAGNITUDE = 3.0
+_SHOWN_STARS = 12
+
+
+def command(
+    image: Annotated[Path, typer.Argument(help="PNG, TIFF or JPEG, grey, 8 or 16 bits.")],
+    profile: Annotated[
+        str | None, typer.Option(help="Take the camera from this profile (name or TOML file).")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Rough horizontal field of view, degrees, of any other camera.")
+    ] = None,
+    fov_tolerance: Annotated[
+        float, typer.Option(min=0.0, max=0.3, help="Relative uncertainty of --fov.")
+    ] = 0.1,
+    model: Annotated[str, typer.Option(help="With --fov: pinhole or equidistant.")] = "pinhole",
+    epoch: Annotated[float | None, typer.Option(help="Julian year of the image; default 2026.")] = None,
+    allow_colour: Annotated[
+        bool, typer.Option("--allow-colour", help="Turn a colour image into grey.")
+    ] = False,
+    annotate: Annotated[
+        Path | None, typer.Option(help="Write the image with its identified stars marked.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Identify the stars on an image, lost in space; exit status 1 if they cannot be.
+
+    Without --profile or --fov the camera is the emulator's own, 937×937 pixels and 42° wide.
+    """
+    from starid.catalog import DEFAULT_EPOCH, load_catalog
+    from starid.image_io import read_image, write_image
+    from starid.image_solver import solve_image
+
+    pixels = read_image(image, allow_colour=allow_colour)
+    camera = _camera(profile, fov, model, pixels.shape)
+    result = solve_image(
+        pixels,
+        camera,
+        load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch),
+        fov_tolerance=0.0 if fov is None else fov_tolerance,
+    )
+    report = _report(image, result)
+    if annotate is not None:
+        write_image(annotate, _marked(pixels, result))
+    if as_json:
+        typer.echo(json.dumps(report))
+    else:
+        _show(report)
+    if not result.solution.valid:
+        raise typer.Exit(1)
+
+
+def _camera(profile: str | None, fov: float | None, model: str, shape: tuple[int, ...]) -> Camera:
+    """The camera that the options name."""
+    from emulator.errors import EmulatorError
+    from starid.camera import Camera
+    from starid.camera_file import load_camera
+
+    if fov is not None:
+        if profile is not None:
+            raise EmulatorError("identify: --profile and --fov both name a camera: give one of them")
+        return Camera.from_dict({"fov_deg": fov, "width": shape[1], "height": shape[0], "model": model})
+    if profile is None:
+        return Camera.from_fov()
+    if Path(profile).suffix == ".toml":
+        return load_camera(profile)
+    from emulator.profile import load_profile
+
+    return Camera.from_dict(load_profile(profile).camera.values())
+
+
+def _report(image: Path, result: ImageSolution) -> dict[str, Any]:
+    """The answer as plain values; angles and quaternion are None where it is not valid."""
+    solution, found = result.solution, result.detections
+    report: dict[str, Any] = {
+        "image": str(image),
+        "valid": solution.valid,
+        "reason": solution.reason.value,
+        "ra_deg": None,
+        "dec_deg": None,
+        "roll_deg": None,
+        "quaternion_xyzw": None,
+        "stars": [],
+        "stars_detected": len(found.flux),
+        "rms_px": None,
+        "fov_deg": result.camera.fov_deg,
+        "sigma_cross_arcsec": None,
+        "sigma_roll_arcsec": None,
+        "probability_false": None,
+        "missing_stars": [],
+        "elapsed_s": solution.elapsed,
+    }
+    if not solution.valid:
+        return report
+    from starid.missing import missing_stars
+
+    attitude = solution.attitude
+    missing = missing_stars(solution, result.camera, result.stars, found.xy_px)
+    stars = [
+        {"hip": int(hip), "x_px": float(x), "y_px": float(y), "flux": float(flux)}
+        for hip, (x, y), flux in zip(
+            solution.hip,
+            found.xy_px[solution.detection_index],
+            found.flux[solution.detection_index],
+            strict=True,
+        )
+    ]
+    return report | {
+        "ra_deg": attitude.ra_deg,
+        "dec_deg": attitude.dec_deg,
+        "roll_deg": attitude.roll_deg,
+        "quaternion_xyzw": [float(value) for value in solution.quaternion_xyzw],
+        "stars": sorted(stars, key=lambda star: -star["flux"]),
+        "rms_px": solution.rms_px,
+        "sigma_cross_arcsec": solution.cross_boresight_sigma_arcsec,
+        "sigma_roll_arcsec": solution.roll_sigma_arcsec,
+        "probability_false": solution.probability_false,
+        "missing_stars": [
+            {"hip": int(hip), "x_px": float(x), "y_px": float(y), "v": float(v)}
+            for hip, (x, y), v in zip(missing.hip, missing.xy_px, missing.magnitude, strict=True)
+        ],
+    }
+
+
+def _marked(pixels: Any, result: ImageSolution) -> Any:
+    """The image with circles at identified stars, and other ones at detections without an identity."""
+    import numpy as np
+
+    from emulator.annotate import annotate, star_label
+    from starid.catalog import load_catalog
+
+    solution, found = result.solution, result.detections
+    v = load_catalog().v[solution.catalog_index]
+    labels = [
+        star_label(int(hip), float(magnitude), _NUMBERED_TO_MAGNITUDE)
+        for hip, magnitude in zip(solution.hip, v, strict=True)
+    ]
+    others = np.delete(found.xy_px, solution.detection_index, axis=0)
+    return annotate(pixels, found.xy_px[solution.detection_index], labels, missed_xy_px=others)
+
+
+def _show(report: dict[str, Any]) -> None:
+    """The answer for people."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(soft_wrap=True)
+    if not report["valid"]:
+        console.print(
+            f"{report['image']}: not identified ({report['reason']}); {report['stars_detected']} stars found"
+        )
+        return
+    console.print(
+        f"{report['image']}: RA {report['ra_deg']:.4f}°, Dec {report['dec_deg']:.4f}°, roll {report['roll_deg']:.3f}°, "
+        f"field {report['fov_deg']:.3f}° wide"
+    )
+    console.print(
+        f"{len(report['stars'])} of {report['stars_detected']} stars identified, rms {report['rms_px']:.3f} px, "
+        f"1σ {report['sigma_cross_arcsec']:.2f}″ across and {report['sigma_roll_arcsec']:.1f}″ about the boresight, "
+        f"false with probability < {max(report['probability_false'], 1e-300):.1g}"
+    )
+    if report["missing_stars"]:
+        brightest = min(report["missing_stars"], key=lambda star: star["v"])
+        console.print(
+            f"{len(report['missing_stars'])} stars that should be seen are not, the brightest HIP {brightest['hip']}, "
+            f"V {brightest['v']:.1f}"
+        )
+    table = Table("HIP", "x px", "y px", "flux", box=SIMPLE, title="brightest identified stars")
+    for star in report["stars"][:_SHOWN_STARS]:
+        table.add_row(str(star["hip"]), f"{star['x_px']:.2f}", f"{star['y_px']:.2f}", f"{star['flux']:.0f}")
+    console.print(table)
