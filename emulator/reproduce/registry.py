@@ -16,6 +16,7 @@ MODULES: Final[tuple[str, ...]] = (
     "lsi_accuracy",
     "lsi_noise",
     "lsi_run_time",
+    "fsf",
 )
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
 
