@@ -9,7 +9,8 @@ from typing import Final
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
-from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.canopen_sdo_block import upload_blocks
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
@@ -179,10 +180,17 @@ def bit_rates(probe: CanopenProbe) -> None:
 )
 def stored(probe: CanopenProbe) -> None:
     """1021h, if there is one, gives the text of the file."""
-    probe.require(0x1021)
+    item = probe.od.get_variable(0x1021)
+    if item is None:
+        raise CaseSkipped("the data sheet has no object 1021h")
     parser = _file(probe)
     served = configparser.RawConfigParser(inline_comment_prefixes=(";",))
-    served.read_string(probe.read(0x1021).decode("ascii", errors="replace"))
+    try:
+        data = upload_blocks(probe, item, 127)
+    except CaseFailed:
+        probe.abandon_transfer()
+        data = probe.read(0x1021)
+    served.read_string(data.decode("ascii", errors="replace"))
     for name in parser.sections():
         if name != "FileInfo":
             check(served.has_section(name), f"section {name} in 1021h", "none")

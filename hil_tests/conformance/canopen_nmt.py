@@ -6,9 +6,11 @@ from typing import Final
 
 from hil_tests.conformance.canopen_probe import (
     ABORT_INCOMPATIBLE,
+    NOBODY,
     PRE_OPERATIONAL,
     RESET_COMMUNICATION,
     RESET_NODE,
+    SETTLING_S,
     START,
     STOP,
     CanopenProbe,
@@ -28,7 +30,8 @@ def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
 
 
 def _state(probe: CanopenProbe) -> int:
-    """Return the state that the next heartbeat tells."""
+    """Return the state that the next heartbeat tells, once what was under way has come."""
+    probe.wait_for(NOBODY, SETTLING_S)
     probe.drain()
     return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]
 
@@ -347,7 +350,7 @@ def behaviour(probe: CanopenProbe) -> None:
         _prepare(probe)
         probe.command(START)
         probe.send(0x700 + OTHER_NODE, b"\x05")
-        probe.wait_for(0x7FF, 0.2)
+        probe.wait_for(NOBODY, 0.2)
         check_equal(_state(probe), state, f"state with 1029h:01h at {value}:")
 
 

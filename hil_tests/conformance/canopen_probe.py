@@ -22,6 +22,11 @@ PRE_OPERATIONAL: Final = 128
 RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
+NOBODY: Final = -1
+"""No identifier: waiting for it lets time pass."""
+SETTLING_S: Final = 0.05
+"""Time in which a node obeys an NMT command, and what was under way has come."""
+
 STATES: Final = {0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL", 0x00: "boot-up"}
 
 MOST_WAITING: Final = 20_000
@@ -275,6 +280,12 @@ class CanopenProbe:
     def command(self, specifier: int, node: int | None = None) -> None:
         """Send an NMT command."""
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
+
+    def command_and_settle(self, specifier: int) -> None:
+        """Send an NMT command, and let go of what the node had sent before it obeyed."""
+        self.command(specifier)
+        self.wait_for(NOBODY, SETTLING_S)
+        self.drain()
 
     def reset_communication(self) -> None:
         """Reset the communication and wait for the boot-up message, so that all is at its stored values."""

@@ -81,7 +81,7 @@ def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
     return found
 
 
-def _upload(probe: CanopenProbe, item: ODVariable, block: int, *, crc: bool = True) -> bytes:
+def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: bool = True) -> bytes:
     """Upload an object in blocks, checking every part of the protocol."""
     answer = _begin(probe, item, block, crc=crc)
     check(answer[0] & 0xF9 == 0xC0, "answer C0h to C6h", answer)
@@ -113,7 +113,7 @@ def _upload(probe: CanopenProbe, item: ODVariable, block: int, *, crc: bool = Tr
 def upload_with_crc(probe: CanopenProbe) -> None:
     """Numbers from 1, last bit, unused bytes, size and CRC; the same data as by segments."""
     item, value = long_text(probe)
-    check_equal(_upload(probe, item, 127), value, "value")
+    check_equal(upload_blocks(probe, item, 127), value, "value")
     expect_no_transfer(probe)
 
 
@@ -124,24 +124,24 @@ def upload_sizes(probe: CanopenProbe) -> None:
     """The block size is the client's."""
     item, value = long_text(probe)
     for block in (1, 2, 5):
-        check_equal(_upload(probe, item, block), value, "value")
+        check_equal(upload_blocks(probe, item, block), value, "value")
 
 
 @case(_CASES, "canopen.sdo-block.upload-without-crc", "block upload without CRC", f"{CLAUSE}.13")
 def upload_without_crc(probe: CanopenProbe) -> None:
     """A client that does not support the CRC is served."""
     item, value = long_text(probe)
-    check_equal(_upload(probe, item, 127, crc=False), value, "value")
+    check_equal(upload_blocks(probe, item, 127, crc=False), value, "value")
 
 
 @case(_CASES, "canopen.sdo-block.upload-big", "block upload of many blocks", f"{CLAUSE}.13")
 def upload_big(probe: CanopenProbe) -> None:
     """The longest object up to 200 kB, twice: the same data, with CRC."""
     item, _ = _big(probe)
-    first = _upload(probe, item, 127)
+    first = upload_blocks(probe, item, 127)
     if len(first) <= SEGMENT * 127:
         raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
-    check_equal(len(_upload(probe, item, 100)), len(first), "bytes")
+    check_equal(len(upload_blocks(probe, item, 100)), len(first), "bytes")
 
 
 @case(

@@ -103,8 +103,7 @@ def sync_producer(probe: CanopenProbe) -> None:
     if 0x1019 in probe.od:
         check_equal([data[0] for _, data in found[:5]], [1, 2, 3, 1, 2], "counters")
     probe.expect_refusal(0x1005, 0, NO_RTR | 0x81, 4, ABORT_VALUE)
-    probe.command(STOP)
-    probe.drain()
+    probe.command_and_settle(STOP)
     probe.expect_silence(0x080, "SYNC in STOPPED")
 
 

@@ -24,6 +24,7 @@ from hil_tests.conformance.canopen_probe import (
     ABORT_NOT_MAPPABLE,
     ABORT_PDO_LENGTH,
     NO_RTR,
+    NOBODY,
     PDO_OFF,
     PRE_OPERATIONAL,
     START,
@@ -151,7 +152,7 @@ def inhibit(probe: CanopenProbe) -> None:
     low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
     probe.command(START)
     probe.wait_for(identifier, 0.3)
-    probe.wait_for(0x7FF, 0.15)
+    probe.wait_for(NOBODY, 0.15)
     probe.set(item.index, item.subindex, low)
     check_equal(after_event(probe, identifier, 3.0), low, "data")
     start = probe.bus.now()
@@ -172,8 +173,7 @@ def gate(probe: CanopenProbe) -> None:
             probe.command(START)
             send_sync(probe)
             probe.expect(identifier, "TPDO in OPERATIONAL")
-            probe.command(command)
-            probe.drain()
+            probe.command_and_settle(command)
             send_sync(probe)
             probe.expect_silence(identifier, f"TPDO after command {command}")
         probe.command(PRE_OPERATIONAL)
