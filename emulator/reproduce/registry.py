@@ -17,6 +17,7 @@ MODULES: Final[tuple[str, ...]] = (
     "lsi_noise",
     "lsi_run_time",
     "fsf",
+    "rsi",
 )
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
 
