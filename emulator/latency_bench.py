@@ -171,8 +171,8 @@ class EchoProbe:
 
 
 @contextmanager
-def running_emulator(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, str], float]]:
-    """Start an emulator; give process, words of its ready line, and seconds that it took.
+def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, str], float]]:
+    """Start `starhil` with arguments; give process, words of its ready line, and seconds that it took.
 
     Raises
     ------
@@ -180,14 +180,16 @@ def running_emulator(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], d
         It did not become ready.
     """
     begin = time.perf_counter()
-    command = [sys.executable, "-c", STARHIL, "run", *arguments]
+    command = [sys.executable, "-c", STARHIL, *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603
     try:
         if process.stdout is None or not select.select([process.stdout], [], [], READY_WITHIN_S)[0]:
-            raise EmulatorError(f"emulator: not ready within {READY_WITHIN_S:g} s")
+            raise EmulatorError(f"starhil {arguments[0]}: not ready within {READY_WITHIN_S:g} s")
         line = process.stdout.readline()
         if not line.startswith("ready "):
-            raise EmulatorError(f"emulator: did not start: {line.strip() or 'its reason stands above'}")
+            raise EmulatorError(
+                f"starhil {arguments[0]}: did not start: {line.strip() or 'its reason stands above'}"
+            )
         ready = dict(word.split("=", 1) for word in line.split()[1:])
         yield process, ready, time.perf_counter() - begin
     finally:
@@ -229,9 +231,12 @@ def measure(
     rows: list[LatencyRow] = []
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
     with ExitStack() as stack:
-        options = ("demo", "--serial", "auto", "--can", "auto", "--set", f"run.worker={worker}")
+        _, hub_ready, _ = stack.enter_context(running("hub", "--port", "0"))  # a bus of its own
         process, ready, ready_s = stack.enter_context(
-            running_emulator(*options, "--set", f"links.serial.baud={BAUD}")
+            running(
+                *("run", "demo", "--serial", "auto", "--can", hub_ready["can"]),
+                *("--set", f"run.worker={worker}", "--set", f"links.serial.baud={BAUD}"),
+            )
         )
         with ObcClient.open(serial=ready["serial"], dialect="b", baud=BAUD) as client:
             client.command("set_mode", mode="standby")
