@@ -168,6 +168,8 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
         (11, "false", "false stars"),
     )
     for number, kind, label in cases:
+        if f"{kind}-1-{ON}" not in results:
+            continue
         columns: dict[str, list[Any]] = {"level": [], "grid": [], "method": [], "rate_percent": []}
         fig, axis = figure(width=6.0, height=4.0)
         for grid, style in ((ON, "-"), (OFF, "--")):
