@@ -8,6 +8,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("starhil.canopen")
 
+MILLISECOND_NS: Final = NANOSECONDS // 1000
 STORAGE_FILE: Final = "canopen.json"
 DEVICE_ERROR: Final = 0xFF00
 """EMCY error code of the device's error mode: plus the number of `device_error`."""
@@ -277,18 +279,21 @@ class CanopenLink:
         reconnects = self._transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
-            self._do(lambda now: self._raise(now, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION))
-            self._do(lambda now: self.slave.clear_emergency(ErrorCode.BUS_OFF_RECOVERED, now=now))
+            self._do(partial(self._raise, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION))
+            self._do(partial(self._clear, ErrorCode.BUS_OFF_RECOVERED))
         self._do(self.slave.tick)
 
-    def _raise(self, now: float, code: int, bits: int) -> list[CanFrame]:
+    def _raise(self, code: int, bits: int, now: float) -> list[CanFrame]:
         return self.slave.raise_emergency(code, bits, now=now)
+
+    def _clear(self, code: int, now: float) -> list[CanFrame]:
+        return self.slave.clear_emergency(code, now=now)
 
     def _take(self, event: SlaveEvent) -> None:
         """Act on what the slave reports."""
         match event.kind:
             case EventKind.TIME:
-                self._device.time.set_unix_ns(round(event.value * NANOSECONDS))
+                self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)
             case EventKind.STORAGE_ERROR | EventKind.FAULT:
                 log.warning("%s: %s", event.kind, event.detail)
             case _:
@@ -319,15 +324,20 @@ class CanopenLink:
 
     def _mode_changed(self, transition: Transition) -> None:
         if transition.after is Mode.ERROR:
-            code = DEVICE_ERROR + self._device.icd.enums["device_error"].values.get(
-                self._device.modes.error, 0
-            )
-            self._do(lambda now: self._raise(now, code, ErrorRegister.MANUFACTURER))
-        elif transition.before is Mode.ERROR:
+            # The cause of the error stands only when the change is done.
+            self._device.scheduler.at(self._device.clock.now_ns(), self._device_failed)
+            return
+        if transition.before is Mode.ERROR:
             for number in self._device.icd.enums["device_error"].names:
-                code = DEVICE_ERROR + number
-                self._do(lambda now, code=code: self.slave.clear_emergency(code, now=now))  # type: ignore[misc]
+                self._do(partial(self._clear, DEVICE_ERROR + number))
         self._notify([STATUS_ROW])
+
+    def _device_failed(self, _due_ns: int) -> None:
+        numbers = self._device.icd.enums["device_error"].values
+        code = DEVICE_ERROR + numbers.get(self._device.modes.error, 0)
+        if self._device.modes.mode is Mode.ERROR:
+            self._do(partial(self._raise, code, ErrorRegister.MANUFACTURER))
+            self._notify([STATUS_ROW])
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:
