@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,11 +101,11 @@ def _load_part(path: Path) -> tuple[Results, float]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             results = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError) as error:
+            seconds = float(results.pop("seconds_"))
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise ReproduceError(
             f"reproduce: {path} cannot be read ({error}); remove it to have it made again"
         ) from error
-    seconds = float(results.pop("seconds_"))
     return results, seconds
 
 
