@@ -34,7 +34,7 @@ from emulator.reproduce.lsi_trials import (
 )
 from starid.frame_grid import make_grid
 
-WORKED_EXAMPLE_CHECKS = 7
+WORKED_EXAMPLE_CHECKS = 8
 
 
 def _parts(parameters: Parameters) -> list[Part]:
