@@ -29,22 +29,26 @@ BRIGHTEST_LIMIT: Final = 6.0
 FAINTEST_LIMIT: Final = 9.0
 """The default limiting magnitude stays between these: Hipparcos thins out beyond the second."""
 
-QUOTA: Final = 10
-"""Pattern stars in half the field's area."""
+LARGEST_QUOTA: Final = 20
+SMALLEST_QUOTA: Final = 6
+"""Pattern stars in half the field's area: many stand against false stars, few keep the index small."""
 
-MOST_PATTERNS: Final = 800_000
+MIDDLE_SIDE: Final = 0.5
+"""Where it comes to the choice, triangles may be up to this share of the field's width rather than more."""
+
+MOST_PATTERNS: Final = 700_000
 """Triangles at most, about; narrow fields get them by keeping only the smaller ones."""
 
 WIDEST_SIDE: Final = 0.95
 NARROWEST_SIDE: Final = 0.12
 """Sides of a triangle as shares of the field's width."""
 
-SIDE_BINS: Final = 72
-_STARS_PER_NEIGHBOURHOOD: Final = 1.37
-"""Pattern stars in the neighbourhood over the quota, found by building."""
+SIDE_BINS: Final = 56
+_STARS_PER_QUOTA: Final = 30.0
+"""Pattern stars of the whole sky, times the field's solid angle, over the quota; found by building."""
 
-_TRIANGLES_OF_WIDEST: Final = 490.0
-"""Triangles a pattern star where the widest sides are allowed, found by building."""
+_TRIANGLES_PER_QUOTA2: Final = 6.0
+"""Triangles a pattern star over (quota² · (longest side / width)⁴); found by building."""
 
 
 def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> float:
@@ -84,9 +88,11 @@ def index_settings(
     least = pixels_per_radian(camera)
     window = window_px / least
     spacing = math.sqrt(4.0 * math.pi / max(len(catalog.brighter_than(limiting_magnitude)), 1))
-    pattern_stars = _STARS_PER_NEIGHBOURHOOD * QUOTA * 8.0 * math.pi / area
-    share = (MOST_PATTERNS / pattern_stars / _TRIANGLES_OF_WIDEST) ** 0.25
-    longest = WIDEST_SIDE * min(share, 1.0) * width
+    cube = MOST_PATTERNS * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
+    quota = min(max(int(cube ** (1.0 / 3.0)), SMALLEST_QUOTA), LARGEST_QUOTA)
+    triangles = MOST_PATTERNS * area / (_STARS_PER_QUOTA * quota)
+    share = (triangles / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25
+    longest = min(share, WIDEST_SIDE) * width
     return IndexSettings(
         limiting_magnitude=limiting_magnitude,
         blend_rad=blend_px / least,
@@ -94,7 +100,7 @@ def index_settings(
         field_area_sr=area,
         longest_side_rad=min(longest, 0.9 * math.pi),
         shortest_side_rad=NARROWEST_SIDE * width,
-        quota=QUOTA,
+        quota=quota,
         cells_per_edge=max(int(0.5 * math.pi / max(window, 0.7 * spacing)), 1),
         side_bins=SIDE_BINS,
     )

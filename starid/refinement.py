@@ -44,9 +44,6 @@ from starid.settings import MAGNITUDE_GATE, PX_PER_RAD, SCALE_TOLERANCE, WINDOW
 MAX_ROUNDS: Final = 12
 """Rounds of matching and solving."""
 
-FIRST_MATCHED: Final = 40
-"""Detections used in the first round, the brightest, while the attitude is still coarse."""
-
 MAGNITUDE_FLOOR: Final = 0.1
 MAGNITUDE_CEILING: Final = 1.0
 _RAYLEIGH_MEDIAN: Final = 1.17741
@@ -278,17 +275,16 @@ def refine(
         rescale(given, numbers[SCALE], seen)
     gate, numbers[SCATTER] = settings[MAGNITUDE_GATE], settings[MAGNITUDE_GATE]
     reach, sigma = settings[WINDOW], 1.0
-    count = min(FIRST_MATCHED, n)
     matched = 0
     for number in range(MAX_ROUNDS):
         matched = match_detections(
-            index, seen, rotation, count, (reach, sigma, gate, settings[PX_PER_RAD]),
+            index, seen, rotation, n, (reach, sigma, gate, settings[PX_PER_RAD]),
             numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
         )  # fmt: skip
         if matched < least_matched:
             return 0
         stable = _same(stars, previous) and number > 0
-        chi2 = normal_equations(star_table, seen, rotation, count, stars, normal, right)
+        chi2 = normal_equations(star_table, seen, rotation, n, stars, normal, right)
         if not solve_symmetric(normal, right, unknowns, step):
             return 0
         for k in range(unknowns):
@@ -304,12 +300,11 @@ def refine(
         sigma = math.sqrt(numbers[VARIANCE])
         if number == 0:
             # wrong pairs may be among the first matches: robust estimates
-            sigma, _ = distances(star_table, seen, rotation, count, stars, scratch)
+            sigma, _ = distances(star_table, seen, rotation, n, stars, scratch)
             sigma *= math.sqrt(2.0 * matched / freedom)
-            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, count, stars, scratch)
+            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, n, stars, scratch)
             gate = min(gate, max(5.0 * numbers[SCATTER], 0.75))
             reach = BY_NOISE
-        count = n
     _, numbers[RMS] = distances(star_table, seen, rotation, n, stars, scratch)
     numbers[SCALE_VARIANCE] = _marginalise(normal, scratch) if free_scale else 0.0
     return matched

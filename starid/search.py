@@ -51,7 +51,7 @@ from starid.verification import ROTATIONS, hit_odds, test_order
 SYSTEMATIC: Final = 14
 """Brightest detections of which every triangle is tried first."""
 
-DRAWN_FROM: Final = 60
+DRAWN_FROM: Final = 120
 """Brightest detections from which further triangles are drawn."""
 
 DRAWN_TOLERANCE: Final = 0.5
