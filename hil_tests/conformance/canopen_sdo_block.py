@@ -136,12 +136,10 @@ def upload_without_crc(probe: CanopenProbe) -> None:
 
 @case(_CASES, "canopen.sdo-block.upload-big", "block upload of many blocks", f"{CLAUSE}.13")
 def upload_big(probe: CanopenProbe) -> None:
-    """The longest object up to 200 kB, twice: the same data, with CRC."""
+    """The longest object up to 200 kB, with size and CRC."""
     item, _ = _big(probe)
-    first = upload_blocks(probe, item, 127)
-    if len(first) <= SEGMENT * 127:
+    if len(upload_blocks(probe, item, 100)) <= SEGMENT * 100:
         raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
-    check_equal(len(upload_blocks(probe, item, 100)), len(first), "bytes")
 
 
 @case(
