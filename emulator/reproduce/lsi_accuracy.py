@@ -30,6 +30,7 @@ _FINE_TARGET: Final = {ON: {0.3: 99.9, 0.2: 99.0, 0.1: 97.0}, OFF: {0.3: 94.0, 0
 _MAP_SCALES: Final = (0.1, 1.0)
 _GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 _BEST: Final = 99.5
+_FINER: Final = 99.6
 _SAME: Final = 1e-6
 _AGREES: Final = 1e-4
 
@@ -211,6 +212,8 @@ def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
                     remark="Published as a curve; ours averages the angle on the circle.",
                 )
             )
+    if {_BEST, _FINER} <= set(percents):
+        rows += [_order_row(results, grid) for grid in (ON, OFF)]
     means = [share(results[f"p{percent:g}-{OFF}"]["f_mse"], 0.3) for percent in percents]
     listed = ", ".join(f"{value:.1f}" for value in means)
     order = ", ".join(f"{percent:g}" for percent in percents)
@@ -224,6 +227,22 @@ def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
         )
     )
     return rows
+
+
+def _order_row(results: Mapping[str, Results], grid: str) -> Row:
+    coarse, fine = (share(results[f"p{percent:g}-{grid}"]["f_mse"], 0.3) for percent in (_BEST, _FINER))
+    on = grid == ON
+    return row(
+        f"LSI (MSE), {_GRID_WORDS[grid]}: share with ε_f ≤ 0.3° for p = {_BEST:g} and {_FINER:g} %",
+        published=f"{_BEST:g} % is best" if on else None,
+        ours=f"{coarse:.2f}, {fine:.2f} %",
+        passed=coarse > fine if on else fine > coarse,
+        target=f"{_BEST:g} % better" if on else f"{_FINER:g} % better",
+        remark="The finer database does worse because the test frames are not on its grid: that the thesis, too, finds 99.5 % best "
+        "shows that its figure is owed to the grid."
+        if on
+        else "The finer database is the better one, as it should be.",
+    )
 
 
 def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float]) -> list[Row]:
@@ -327,6 +346,7 @@ EXPERIMENTS: Final = (
             "roll_percent": 98.0,
             "rolls": [0.0, 80.0, 160.0, 240.0, 320.0],
         },
-        quick={"percent": [96.0, 99.0, 99.5], "roll_percent": 98.0, "rolls": [0.0, 80.0]},
+        quick={"percent": [96.0, 99.5, 99.6], "roll_percent": 98.0, "rolls": [0.0, 80.0]},
+        revision=2,
     ),
 )

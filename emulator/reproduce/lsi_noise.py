@@ -199,7 +199,7 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
         if published:
             axis.plot(list(published), list(published.values()), "rx", ms=8, label="published (on the grid)")
         axis.set(xlabel=label, ylabel=f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %", xticks=range(4))
-        axis.set_ylim((0, 102) if kind == "false" else (min(50.0, *columns["rate_percent"]), 101))
+        axis.set_ylim((0, 102) if kind == "false" else (min(50.0, min(columns["rate_percent"]) - 3.0), 101))
         axis.legend()
         files.append(save(fig, context.folder / f"figure_6_{number}.png"))
         name = f"figure_6_{number}.csv"
