@@ -141,8 +141,8 @@ class Picture:
 
     def _solve(self, found: Detections, request: FrameRequest) -> Solution:
         settings = request.settings
-        chosen = slice(0, settings.max_stars_matched)
-        xy, flux = found.xy_px[chosen], found.flux[chosen]
+        chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
+        xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
         sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
         identifier = self._identifier_for(settings)
         if request.predicted_xyzw is None:
@@ -169,8 +169,11 @@ class Picture:
         """Return the identifier for the device's own idea of its camera, made anew when that changes."""
         camera = own_camera(self.camera, settings)
         options: dict[str, Any] = dict(self._setup.identifier)
-        if self._setup.algorithm == "geometric":
-            options.setdefault("limiting_magnitude", settings.limiting_magnitude)
+        options.setdefault("limiting_magnitude", settings.limiting_magnitude)
+        if (
+            self._setup.algorithm != "geometric"
+        ):  # these count the stars of a field, and so need their magnitudes
+            options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
         key = (camera, settings.error_margin, tuple(sorted(options.items())))
         if self._identifier is None or key != self._identifier_key:
             if self._setup.algorithm == "geometric":

@@ -172,6 +172,20 @@ def test_two_runs_of_one_seed_give_the_same_bytes():
     assert first == run_bytes()
 
 
+@pytest.mark.parametrize("algorithm", ["lsi", "rsi"])
+def test_the_algorithms_of_the_thesis_run_in_the_device(algorithm):
+    emulator = Emulator(
+        "--clock", "stepped", "--set", f"run.algorithm={algorithm}", "--set", "links.serial.dialect=a"
+    )
+    emulator.do("step", seconds=1.0)
+    assert emulator.command("set_mode", mode="lost_in_space") == 0
+    emulator.do("step", seconds=4.0)
+    frames = emulator.do("frames", count=3)["frames"]
+    assert [frame["valid"] for frame in frames] == [True] * 3
+    assert max(frame["total_arcsec"] for frame in frames) < ACCURACY_ARCSEC
+    assert emulator.end()[0] == 0
+
+
 def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
     log = tmp_path / "truth.csv"
     emulator = Emulator(
