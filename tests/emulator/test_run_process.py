@@ -154,6 +154,26 @@ def test_a_new_focal_length_ruins_the_attitude_until_it_is_right_again(stepped):
     assert stepped.read("precise_attitude")["valid"]
 
 
+def test_a_covered_field_clears_the_validity_and_false_stars_do_not(stepped):
+    stepped.command("set_mode", mode="lost_in_space")
+    stepped.do("set_truth", truth={"kind": "fixed"})
+    stepped.do("fault", optical={"blocked_share": 1.0})
+    stepped.do("step", seconds=2.0)
+    values = stepped.read("precise_attitude")
+    assert not values["valid"]
+    assert values["reason"] in {"detection_failed", "too_few_stars", "no_match", "prediction_lost"}
+    stepped.do("fault", optical={"false_stars": 15, "blocked_share": 0.3})
+    stepped.do("step", seconds=4.0)
+    values = stepped.read("precise_attitude")
+    measured = Attitude(np.array([values[f"q_{axis}"] for axis in "xyzw"]))
+    truth = Attitude(np.array(stepped.do("truth")["quaternion_xyzw"]))
+    assert values["valid"]
+    assert measured.error_to(truth).total_arcsec < ACCURACY_ARCSEC
+    stepped.do("clear_faults")
+    stepped.do("step", seconds=2.0)
+    assert stepped.read("precise_attitude")["valid"]
+
+
 def run_bytes() -> bytes:
     emulator = Emulator("--clock", "stepped", "--seed", "5", "--set", "links.serial.dialect=a")
     emulator.do("step", seconds=1.0)
