@@ -1,0 +1,18 @@
+"""The emulator with the thesis's recursive algorithm tracks a slew over a bus."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.process.test_sessions import starhil
+
+pytestmark = pytest.mark.process
+
+
+def test_a_session_with_the_recursive_algorithm_passes(tmp_path):
+    done = starhil("session", "recursive", "--start", "--can", "auto", "--log", tmp_path, "--json")
+    result = json.loads(done.stdout)
+    failed = [(item["step"], item["detail"]) for item in result["results"] if item["status"] == "failed"]
+    assert (done.returncode, failed) == (0, [])
