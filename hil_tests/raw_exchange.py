@@ -63,7 +63,7 @@ def matches(expected: str, seen: str) -> bool:
 
 
 def send_and_listen(client: ObcClient, data: tuple[str, ...], listen_s: float) -> tuple[str, ...]:
-    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames."""
+    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames of the device."""
     return client.run(_send_and_listen(client, data, listen_s))
 
 
@@ -85,4 +85,6 @@ async def _send_and_listen(client: ObcClient, data: tuple[str, ...], listen_s: f
         link.on_raw = before
     if isinstance(link, SerialLink):
         return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
-    return tuple(format_frame(item) for item in seen if isinstance(item, CanFrame))
+    device = link.device_address
+    frames = [item for item in seen if isinstance(item, CanFrame) and item.extended]
+    return tuple(format_frame(frame) for frame in frames if frame.id >> 8 & 0xFF == device)

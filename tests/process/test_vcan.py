@@ -18,6 +18,7 @@ from hil_tests.client import ObcClient
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.raw_exchange import format_frame
 from protocol.candump import parse_candump, read_candump
+from tests.process.test_conformance import conform
 from tests.process.test_sessions import starhil
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan]
@@ -38,7 +39,12 @@ def unit(tmp_path_factory):
     """An emulator on vcan0."""
     state = tmp_path_factory.mktemp("state")
     command = emulator_command(
-        serial="off", can="auto", seed=1, settings=["truth.attitude.roll_deg=30"], state_dir=state
+        serial="off",
+        can="auto",
+        seed=1,
+        settings=["truth.attitude.roll_deg=30"],
+        state_dir=state,
+        extra=["--canopen", "44"],
     )
     with EmulatorProcess(command, ready_within_s=READY_WITHIN_S) as process:
         yield process
@@ -53,7 +59,7 @@ def obc(unit):
 
 @pytest.fixture
 def dump():
-    """A candump process; call it to get what it has seen since."""
+    """A candump process; call it to get what it has seen since, heartbeats of the CANopen node left out."""
     process = subprocess.Popen(
         [shutil.which("candump"), "-L", "vcan0"], stdout=subprocess.PIPE, text=True, bufsize=1
     )
@@ -62,11 +68,15 @@ def dump():
     reader.start()
     time.sleep(0.3)
 
+    def _frames() -> list[str]:
+        frames = [parse_candump(line)[1] for line in list(lines)]
+        return [format_frame(frame) for frame in frames if frame.extended]
+
     def _seen(count: int, within_s: float = 5.0) -> list[str]:
         deadline = time.monotonic() + within_s
-        while len(lines) < count and time.monotonic() < deadline:
+        while len(_frames()) < count and time.monotonic() < deadline:
             time.sleep(0.02)
-        return [format_frame(parse_candump(line)[1]) for line in lines]
+        return _frames()
 
     yield _seen
     process.terminate()
@@ -112,7 +122,7 @@ def test_candump_and_the_bench_log_the_same_frames(unit, dump, tmp_path):
     )
     done = starhil("session", script, "--can", "vcan0", "--log", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    logged = [format_frame(frame) for _, frame in read_candump(tmp_path / "can.log")]
+    logged = [format_frame(frame) for _, frame in read_candump(tmp_path / "can.log") if frame.extended]
     assert len(logged) == 2 * 20 + 1 + 8
     assert dump(len(logged)) == logged
 
@@ -121,6 +131,19 @@ def test_candump_and_the_bench_log_the_same_frames(unit, dump, tmp_path):
 def test_a_session_passes_on_the_kernel_bus(name, tmp_path, unit):
     done = starhil("session", name, "--can", "auto", "--log", tmp_path)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
+
+
+def test_conformance_cases_pass_on_the_kernel_bus(unit):
+    chosen = [
+        "can.frames",
+        "can.segments",
+        "can.data",
+        "can.errors",
+        "canopen.nmt",
+        "canopen.sdo",
+        "canopen.tpdo",
+    ]
+    assert len(conform(*chosen, "--can", "vcan0", "--canopen", "44")) > 80
 
 
 def test_commands_are_answered_while_cangen_floods_the_bus(obc):
