@@ -1,14 +1,15 @@
-# make demo   set up and run the product end to end; results in out/demo
-# make test   set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
-# make lint   ruff and mypy --strict
-# make fuzz   every decoder of the wire against a million mutated inputs (minutes; for the night)
+# make demo        set up and run the product end to end; results in out/demo
+# make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
+# make lint        ruff and mypy --strict
+# make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
+# make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint fuzz clean
+.PHONY: help demo test lint reproduce fuzz clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -33,6 +34,9 @@ lint: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+reproduce: $(VENV)/.product
+	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
 	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py
