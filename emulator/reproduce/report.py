@@ -15,17 +15,18 @@ REPORT_FILE: Final = "report.md"
 
 _HEAD: Final = """# The thesis's experiments, made again
 
-Every experiment of E. O. Özyurt, *A Feedback Star Identification Algorithm via Regularized Pattern Recognition Using a
-Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University), is computed here from the Hipparcos
-catalogue (new reduction), beside the published value. "—" in the column "published" means that the thesis gives no
-number, only a curve or nothing at all.
+Experiments of E. O. Özyurt, *A Feedback Star Identification Algorithm via Regularized Pattern Recognition Using a
+Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University), computed here from the Hipparcos catalogue (new
+reduction) and put beside the published values. "—" in the column "published" means that the thesis gives no number, only a curve
+or nothing at all. A row with a target is a check; the others inform. Where a published value is not reached, or cannot be recovered
+from the text, the remark or the paragraph above the table says so.
 
-Two facts are behind all accuracy figures of the LSI algorithm:
+How to read the accuracy figures of the LSI algorithm:
 
 * **On the grid**: the thesis tests on 1 701 frames, and with p = 99.5 % every one of them *is* a frame of the database.
   The nearest neighbour is then the frame itself, and the figure says little about frames in between.
 * **Off the grid**: the same frames, each moved by an irrational fraction of the grid step (drawn from a seeded
-  generator), which is what a real sensor sees. Every accuracy figure is given for both.
+  generator), which is what a real sensor sees. Every accuracy figure of the LSI algorithm is given for both.
 """
 
 
