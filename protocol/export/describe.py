@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 from protocol.codec import Field, Row
@@ -12,15 +13,32 @@ from protocol.values import EnumDefinition, Parameter
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
 PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
 
-_SOURCE: Final = (
-    "Source: confirmed (public flight software or manual, named), proxy (public for another unit of the same family) "
-    "or ours (no public source; chosen here)."
-)
-
 INTRODUCTION: Final = (
     "Multi-byte fields are little-endian. Identifiers below 128 are telecommands, from 128 on telemetry.",
-    _SOURCE,
+    (
+        "Source of a row or field: confirmed (public flight software or a manual has it, named at the row), proxy (public for "
+        "another unit of the same family) or ours (no public source; chosen here)."
+    ),
+    (
+        "The confirmed rows are those by which the CubeComputer takes commands and re-publishes star-tracker data. The stand-alone "
+        "unit's own table of identifiers is not public, so a confirmed row need not be one that such a unit answers."
+    ),
+    (
+        "Sources by name: AlbertaSat ex2_adcs is github.com/AlbertaSat/ex2_adcs_software, CTS is "
+        "github.com/CalgaryToSpace/CTS-SAT-1-OBC-Firmware, RADSAT-SK is github.com/USST-RADSAT-SK/software-and-command."
+    ),
 )
+"""Paragraphs that stand before the tables."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the text beside the rows: heading, paragraphs, a table."""
+
+    heading: str
+    paragraphs: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
 
 
 def number(value: float) -> str:
@@ -35,7 +53,7 @@ def title(row: Row) -> str:
 
 def facts(row: Row) -> str:
     """Size and source of a row."""
-    size = f"{row.size} byte{'' if row.size == 1 else 's'}"
+    size = f"{row.size} byte{'' if row.size == 1 else 's'}" if row.size else "No data"
     return f"{size}, {row.provenance}{f': {row.source}' if row.source else ''}"
 
 
@@ -52,7 +70,7 @@ def field_cells(field: Field) -> tuple[str, ...]:
         _value(field),
         _range(field),
         field.provenance if field.name else "",
-        meaning or "Unused, sent as 0.",
+        meaning if field.name else "Unused, sent as 0.",
     )
 
 

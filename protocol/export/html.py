@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import Final
 
-from protocol.export import describe
+from protocol.export import describe, wire
 from protocol.icd import InterfaceDefinition
 
 _STYLE: Final = """
@@ -33,7 +33,9 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.INTRODUCTION)
     yield (
         '<nav><a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>'
-        '<a href="#parameters">Parameters</a><a href="#enumerations">Enumerations</a></nav>'
+        '<a href="#parameters">Parameters</a><a href="#enumerations">Enumerations</a>'
+        + "".join(f'<a href="#{_anchor(section)}">{section.heading}</a>' for section in wire.sections())
+        + "</nav>"
     )
     for title, rows in describe.sections(icd):
         yield f'<h2 id="{title.lower()}">{title}</h2>'
@@ -62,7 +64,15 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         ("Name", "Numbers", "Meaning"),
         (("confirmed", (enum.name, describe.enum_text(enum), enum.doc)) for enum in icd.enums.values()),
     )
+    for section in wire.sections():
+        yield f'<h2 id="{_anchor(section)}">{section.heading}</h2>'
+        yield from (f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs)
+        yield from _table(section.columns, (("confirmed", row) for row in section.rows))
     yield "</body></html>"
+
+
+def _anchor(section: describe.Section) -> str:
+    return section.heading.lower().replace(" ", "-")
 
 
 def _table(columns: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> Iterator[str]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from protocol.export import describe
+from protocol.codec import Row
+from protocol.export import describe, wire
 from protocol.icd import InterfaceDefinition
 
 
 def render(icd: InterfaceDefinition) -> str:
-    """Return the definition as Markdown: rows, parameters, enumerations."""
+    """Return the definition as Markdown: rows, parameters, enumerations, links."""
     return "\n".join(_lines(icd)) + "\n"
 
 
@@ -20,11 +21,13 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     for paragraph in describe.INTRODUCTION:
         yield ""
         yield paragraph
+    yield ""
+    yield from _contents()
     for heading, rows in describe.sections(icd):
         yield from ("", f"## {heading}", "")
         yield from _table(
             ("Id", "Name", "Bytes", "Source", "Meaning"),
-            ((str(row.id), row.name, str(row.size), row.provenance, row.doc) for row in rows),
+            ((str(row.id), _link(row), str(row.size), row.provenance, row.doc) for row in rows),
         )
         for row in rows:
             yield from ("", f"### {describe.title(row)}", "", row.doc, "", f"{describe.facts(row)}.")
@@ -43,6 +46,25 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         ("Name", "Numbers", "Meaning"),
         ((enum.name, describe.enum_text(enum), enum.doc) for enum in icd.enums.values()),
     )
+
+    for section in wire.sections():
+        yield from ("", f"## {section.heading}")
+        for paragraph in section.paragraphs:
+            yield from ("", paragraph)
+        yield ""
+        yield from _table(section.columns, section.rows)
+
+
+def _contents() -> Iterator[str]:
+    headings = ["Telecommands", "Telemetry", "Parameters", "Enumerations"]
+    for heading in [*headings, *(section.heading for section in wire.sections())]:
+        yield f"- [{heading}](#{heading.lower().replace(' ', '-')})"
+
+
+def _link(row: Row) -> str:
+    """Link to a row's heading, by the anchor that GitHub and others make of it."""
+    anchor = "".join(letter for letter in describe.title(row).lower() if letter.isalnum() or letter in " -_")
+    return f"[{row.name}](#{anchor.replace(' ', '-')})"
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
