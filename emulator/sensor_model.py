@@ -24,7 +24,7 @@ _RANGES: Final[dict[str, tuple[float, float, str]]] = {
     "quantum_efficiency": (1e-3, 1.0, "a share"),
     "zero_point_photons_s_m2": (1e6, 1e13, "photons/s/m²"),
     "colour_term": (-2.0, 2.0, "magnitudes a magnitude of B−V"),
-    "psf_sigma_px": (0.2, 20.0, "pixels"),
+    "psf_sigma_px": (0.3, 12.0, "pixels"),
     "psf_growth": (0.0, 5.0, "a share"),
     "gain": (0.01, 1000.0, "times"),
     "adc_range_e": (1.0, 1e7, "electrons"),
@@ -190,6 +190,10 @@ class SensorModel:
         return Digitizer(self.read_noise_e, self.full_well_e, self.gain_e_per_dn, self.offset_dn, self.max_dn)
 
     def detection_settings(self, **changes: Any) -> DetectionSettings:
-        """Detection settings that know this sensor's gain and saturation."""
-        known = DetectionSettings(gain_e_per_dn=self.gain_e_per_dn, saturation_dn=self.saturation_dn)
+        """Detection settings that know this sensor's gain, saturation and, where it is the same everywhere, spot."""
+        known = DetectionSettings(
+            psf_sigma_px=self.psf_sigma_px if self.psf_growth == 0.0 else None,
+            gain_e_per_dn=self.gain_e_per_dn,
+            saturation_dn=self.saturation_dn,
+        )
         return dataclasses.replace(known, **changes)

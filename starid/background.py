@@ -20,7 +20,8 @@ _ROW_STEP: Final = 4
 _FIRST_SAMPLES: Final = 32
 _CLIP_SIGMA: Final = 3.5
 _QUARTILE_SIGMA: Final = 1.349
-_ROUNDS: Final = 3
+_ROUNDS: Final = 2
+_LEAST_SAMPLES: Final = 8.0
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Background:
     Attributes
     ----------
     level, noise : ndarray (rows, columns), float32
-        Counts; mean and standard deviation of the pixels of a block without its stars.
+        Counts; value in the middle of a block and standard deviation about the plane through its pixels, both
+        without its stars.
     block_px : float
         Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
     """
@@ -51,64 +53,98 @@ class Background:
 
 
 @compiled_sums
+def _refine(
+    values: npt.NDArray[np.float32], columns: int, start: tuple[float, float], plane: npt.NDArray[np.float32]
+) -> None:
+    """Plane through the samples of a block without its stars: (level, slope along, slope across rows, noise).
+
+    `values` are whole rows of `columns` pixels; samples farther than 3.5 sigmas from the plane are left out, half a
+    count more being allowed, so that rounding to counts does not make the interval lopsided.
+    """
+    rows = values.size // columns
+    level, sigma = np.float32(start[0]), np.float32(start[1])
+    along = across = np.float32(0.0)
+    middle = np.float32(0.5 * (columns - 1))
+    half = np.float32(0.5 * (rows - 1))
+    for _ in range(_ROUNDS):
+        reach = np.float32(_CLIP_SIGMA) * sigma + np.float32(0.5)
+        kept = total = squares = tilt = tilt2 = lean = lean2 = np.float32(0.0)
+        for row in range(rows):
+            dy = np.float32(row) - half
+            base = level + across * dy
+            line = values[row * columns : (row + 1) * columns]
+            row_kept = row_total = np.float32(0.0)
+            for k in range(columns):
+                dx = np.float32(k) - middle
+                off = line[k] - base - along * dx
+                inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
+                off *= inside
+                row_kept += inside
+                row_total += off
+                squares += off * off
+                tilt += off * dx
+                tilt2 += inside * dx * dx
+            kept += row_kept
+            total += row_total
+            lean += row_total * dy
+            lean2 += row_kept * dy * dy
+        if kept < np.float32(_LEAST_SAMPLES):
+            break
+        mean = total / kept
+        explained = mean * mean
+        level += mean
+        if tilt2 > np.float32(0.0):
+            along += tilt / tilt2
+            explained += tilt * tilt / (tilt2 * kept)
+        if lean2 > np.float32(0.0):
+            across += lean / lean2
+            explained += lean * lean / (lean2 * kept)
+        sigma = np.sqrt(max(squares / kept - explained, np.float32(LEAST_NOISE_DN**2)))
+    plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
+
+
+@compiled_loops
 def _block_statistics(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     block: int,
     level: npt.NDArray[np.float32],
     noise: npt.NDArray[np.float32],
 ) -> None:
-    """Median and quartiles of a few pixels first, then the mean and spread of all within 3.5 of those sigmas.
-
-    The interval is widened by half a count, so that rounding to counts does not make it lopsided.
-    """
+    """Median and quartiles of a few pixels of every block first, then a plane through every fourth row of it."""
     height, width = image.shape
     first = np.empty(_FIRST_SAMPLES, np.int32)
     values = np.empty(block * block, np.float32)
+    plane = np.empty(4, np.float32)
     for row in range(level.shape[0]):
         for column in range(level.shape[1]):
             top = min(row * block, max(height - block, 0))
             left = min(column * block, max(width - block, 0))
             bottom = min(top + block, height)
-            right = min(left + block, width)
+            columns = min(left + block, width) - left
             count = 0
             for y in range(top + column % _ROW_STEP, bottom, _ROW_STEP):
-                line = image[y, left:right]
-                for x in range(line.size):
+                line = image[y, left : left + columns]
+                for x in range(columns):
                     values[count + x] = np.float32(line[x])
-                count += line.size
+                count += columns
             step = max(count // _FIRST_SAMPLES, 1)
             chosen = min(count // step, _FIRST_SAMPLES)
             for k in range(chosen):
-                first[k] = np.int32(values[k * step])
-            ordered = first[:chosen]
-            for k in range(1, chosen):
-                key = ordered[k]
+                key = np.int32(values[k * step])
                 j = k - 1
-                while j >= 0 and ordered[j] > key:
-                    ordered[j + 1] = ordered[j]
+                while j >= 0 and first[j] > key:
+                    first[j + 1] = first[j]
                     j -= 1
-                ordered[j + 1] = key
-            centre = np.float32(ordered[chosen // 2])
-            sigma = np.float32(ordered[(3 * chosen) // 4] - ordered[chosen // 4]) / np.float32(
-                _QUARTILE_SIGMA
-            )
-            sigma = max(sigma, np.float32(0.5))
-            for _ in range(_ROUNDS):
-                reach = np.float32(_CLIP_SIGMA) * sigma + np.float32(0.5)
-                kept = np.float32(0.0)
-                total = np.float32(0.0)
-                squares = np.float32(0.0)
-                for k in range(count):
-                    off = values[k] - centre
-                    inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
-                    kept += inside
-                    total += inside * off
-                    squares += inside * off * off
-                mean = total / kept
-                sigma = np.sqrt(max(squares / kept - mean * mean, np.float32(LEAST_NOISE_DN**2)))
-                centre += mean
-            level[row, column] = centre
-            noise[row, column] = sigma
+                first[j + 1] = key
+            spread = (first[(3 * chosen) // 4] - first[chosen // 4]) / _QUARTILE_SIGMA
+            _refine(values[:count], columns, (float(first[chosen // 2]), max(spread, 0.5)), plane)
+            # from the middle of the sampled pixels to the middle of the block's place on the grid
+            first_row = top + column % _ROW_STEP
+            last_row = first_row + _ROW_STEP * (count // columns - 1)
+            off_y = (row + 0.5) * block - 0.5 - 0.5 * (first_row + last_row)
+            off_x = (column + 0.5) * block - 0.5 - (left + 0.5 * (columns - 1))
+            level[row, column] = plane[0] + plane[1] * off_x + plane[2] * off_y / _ROW_STEP
+            noise[row, column] = plane[3]
 
 
 def estimate_background(

@@ -22,22 +22,36 @@ from starid.matched_filter import (
     noise_factor,
     spot_taps,
 )
-from starid.measurement import AT_EDGE, SATURATED, TWICE, find_neighbours, measure
+from starid.measurement import (
+    AGAIN,
+    AT_EDGE,
+    BAD_FIT,
+    FIT_PARAMETERS,
+    FRESH,
+    SATURATED,
+    TWICE,
+    find_neighbours,
+    measure,
+)
+from starid.pairs import split_pairs
 from starid.spot_shape import SpotShape, moments_of, shape_from_moments
+from starid.spot_width import spot_widths
 from starid.trail_filter import smooth_along_trails, trail_noise_factor
 from starid.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
 
 Grid: TypeAlias = npt.NDArray[np.float32]
+Table: TypeAlias = npt.NDArray[np.float64]
 
 LEAST_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
 _MOST_PEAKS: Final = 8192
 _HIGHER: Final = 1.5
-_STARS_FOR_SHAPE: Final = 40
+_STARS_FOR_SHAPE: Final = 30
 _SHAPE_WINDOW_PX: Final = 40
+_STARS_FOR_WIDTH: Final = 15
+_LEAST_FOR_WIDTH: Final = 3
 _TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
-_FIT_PARAMETERS: Final = 3
 _MISFIT_SIGMA: Final = 3.0
 _RELAX: Final = 0.8
 _MOST_NEIGHBOURS: Final = 64
@@ -65,6 +79,8 @@ class DetectionSettings:
         Side of the blocks in which the background is estimated.
     follow_trails : bool
         Whether trails of a turning sensor are looked for.
+    blend_px : float
+        Stars closer to each other than this count as one, at their common centre of light.
     pixel_sigma : float
         Excess over the sky, in sigmas of the noise, from which a pixel counts as lit by a star.
     min_star_pixels, max_star_pixels : int
@@ -79,6 +95,7 @@ class DetectionSettings:
     max_stars: int = 500
     block_px: int = 32
     follow_trails: bool = True
+    blend_px: float = 2.0
     pixel_sigma: float = 3.0
     min_star_pixels: int = 1
     max_star_pixels: int = 10000
@@ -92,6 +109,7 @@ class DetectionSettings:
             "model_error": (0.0, 1.0),
             "max_stars": (1, 5000),
             "block_px": (8, 1024),
+            "blend_px": (0.0, 100.0),
             "pixel_sigma": (0.0, 1000.0),
             "min_star_pixels": (0, 1000000),
             "max_star_pixels": (1, 1000000),
@@ -301,9 +319,50 @@ def _shape(
         table,
     )
     shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
+    if settings.psf_sigma_px is None and shape.trail_px == 0.0:
+        widths = np.empty(_STARS_FOR_WIDTH)
+        grid = (background.level, background.noise, float(background.block_px))
+        fitted = spot_widths(counts, tries, *grid, start, float(saturation), widths)
+        if fitted >= _LEAST_FOR_WIDTH:
+            shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
     if settings.follow_trails:
         return shape
     return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
+
+
+def _fitted(
+    windows: Table,
+    pixels: Grid,
+    sensor: tuple[float, float, float, float, float],
+    lit: tuple[float, float, float],
+    size: tuple[int, int],
+    blend_px: float,
+) -> tuple[Table, Table, npt.NDArray[np.uint8]]:
+    """Windows, fits and flags of the candidates, and of the companions that bad fits betray."""
+    count = len(windows)
+    stars, flags = np.zeros((count, FIT_COLUMNS)), np.zeros(count, dtype=np.uint8)
+    first = np.empty(count + 1, dtype=np.int32)
+    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
+    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
+    measure(
+        windows, pixels, first, neighbours, sensor, lit, size, np.ones(count, dtype=bool), FRESH, stars, flags
+    )
+    bad = (stars[:, STATE] == GOOD) & (stars[:, CHI2] > BAD_FIT * (stars[:, PIXELS] - FIT_PARAMETERS))
+    if not bad.any():
+        return windows, stars, flags
+    suspects = np.flatnonzero(bad & ((flags & SATURATED) == 0))
+    partners, owners = np.empty((len(suspects), FIT_COLUMNS)), np.empty(len(suspects), dtype=np.int64)
+    found = split_pairs(
+        windows, pixels, first, neighbours, sensor[:3], stars, suspects, blend_px, partners, owners, bad
+    )
+    owners = owners[:found]
+    measure(windows, pixels, first, neighbours, sensor, lit, size, bad, AGAIN, stars, flags)
+    return (
+        np.concatenate([windows, windows[owners]]),
+        np.concatenate([stars, partners[:found]]),
+        np.concatenate([flags, flags[owners]]),
+    )
+    return windows, stars, flags
 
 
 def _measured(
@@ -326,25 +385,19 @@ def _measured(
     windows = np.zeros((count, WINDOW_COLUMNS))
     pixels = np.empty(lay_windows(counts, peaks, flux, *grid, spot, shape.flow, windows), dtype=np.float32)
     cut_windows(counts, windows, background.level, grid[2], float(saturation), pixels)
-    first = np.empty(count + 1, dtype=np.int32)
-    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
-    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
-    stars = np.zeros((count, FIT_COLUMNS))
-    flags = np.zeros(count, dtype=np.uint8)
     ratio = _RELAX * settings.threshold_sigma
-    core_dn = saturation - background.median_level
-    sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, core_dn)
+    sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, saturation - background.median_level)
     lit = (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels))
     size = (counts.shape[1], counts.shape[0])
-    measure(windows, pixels, first, neighbours, sensor, lit, size, stars, flags)
+    windows, stars, flags = _fitted(windows, pixels, sensor, lit, size, settings.blend_px)
     good = np.flatnonzero(stars[:, STATE] == GOOD)
     if good.size == 0:
         return _nothing(background, "nothing on the image has the shape of a star", count)
     again = (stars[:, STATE] == TWICE) | (windows[:, COLUMNS] == SEEN_BEFORE)
-    refused = count - good.size - int(np.count_nonzero(again))
+    refused = len(stars) - good.size - int(np.count_nonzero(again))
     good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
     fits, marks = stars[good], flags[good]
-    freedom = np.maximum(fits[:, PIXELS] - _FIT_PARAMETERS, 1.0)
+    freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
     misfit = fits[:, CHI2] / freedom
     inflation = np.sqrt(np.where(misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom), misfit, 1.0))
     unit = 1.0 if gain is None else gain

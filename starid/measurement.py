@@ -44,19 +44,24 @@ from starid.windows import (
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
 
+FRESH: Final = (0, 3)
+AGAIN: Final = (1, 4)
+"""First and last round of `measure`: from the candidates, and on from fits that are there."""
+
 FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
 """Further reasons, beside those of `starid.centroid`, for which a candidate is no star."""
 
-_ROUNDS: Final = 3
 _LEAST_EXPLAINED: Final = 0.55
 _SHARP_SIGMA_PX: Final = 0.5
 _WANDER_PX: Final = 1.5
 _WING_SHARE: Final = 0.6
 _EDGE_SIGMA: Final = 2.5
-_BAD_FIT: Final = 4.0
+BAD_FIT: Final = 4.0
+"""Sum of weighted squares, per degree of freedom, from which a fit is bad."""
+
 _STRAY_SIGMA: Final = 7.0
 _STRAY_DISTANCE_SIGMA: Final = 2.0
-_FIT_PARAMETERS: Final = 3
+FIT_PARAMETERS: Final = 3
 _LEAST_SIDE: Final = 11
 
 
@@ -225,6 +230,23 @@ def _flags(
 
 
 @compiled_loops
+def _take_away(
+    star: npt.NDArray[np.float64],
+    shape: tuple[float, float, float],
+    place: tuple[int, int, int, int],
+    lights: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+    target: npt.NDArray[np.float32],
+) -> None:
+    """Take the light of a star, if it is one, out of a window."""
+    if star[STATE] != GOOD:
+        return
+    star_model(star[X], star[Y], shape, place, lights, work)
+    for i in range(target.size):
+        target[i] -= np.float32(star[FLUX] * lights[0, i])
+
+
+@compiled_loops
 def measure(
     windows: npt.NDArray[np.float64],
     pixels: npt.NDArray[np.float32],
@@ -233,10 +255,12 @@ def measure(
     sensor: tuple[float, float, float, float, float],
     lit: tuple[float, float, float],
     size: tuple[int, int],
+    todo: npt.NDArray[np.bool_],
+    turns: tuple[int, int],
     stars: npt.NDArray[np.float64],
     flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Fit and judge all candidates.
+    """Fit and judge candidates.
 
     The brightest come first, and each is fitted after the light of its brighter neighbours is taken away; those
     with neighbours are then fitted again without the light of all of them.
@@ -254,6 +278,11 @@ def measure(
         Sigmas from which a pixel is lit; fewest and most lit pixels of a star.
     size : (int, int)
         Columns and rows of the image.
+    todo : ndarray (n,) of bool
+        Which candidates to fit; the others' fits count as they are.
+    turns : (int, int)
+        `FRESH`, or `AGAIN` to go on from fits that are there already: more rounds, in which neighbours yield to each
+        other, and in the last of which a fit that stays bad is made again without the pixel that contradicts it most.
     stars : ndarray (n, FIT_COLUMNS)
         Filled with the fits.
     flags : ndarray (n,)
@@ -262,8 +291,9 @@ def measure(
     sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
     largest, side = 1, _LEAST_SIDE
     for k in range(windows.shape[0]):
-        stars[k, STATE] = NO_FIT
-        flags[k] = 0
+        if todo[k] and turns[0] == 0:
+            stars[k, STATE] = NO_FIT
+            flags[k] = 0
         if windows[k, COLUMNS] > 0.0:
             largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
             side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
@@ -271,11 +301,14 @@ def measure(
     lights = np.empty((3, largest))
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
-    for turn in range(_ROUNDS):
+    for turn in range(turns[0], turns[1]):
+        last = turns[0] > 0 and turn == turns[1] - 1
         for k in range(windows.shape[0]):
             window, star = windows[k], stars[k]
             alone = first[k] == first[k + 1]
-            if window[COLUMNS] <= 0.0 or (turn > 0 and (alone or star[STATE] != GOOD)):
+            if not todo[k] or window[COLUMNS] <= 0.0:
+                continue
+            if turn > 0 and (star[STATE] != GOOD or (alone and not last)):
                 continue
             place = (int(window[LEFT]), int(window[TOP]), int(window[COLUMNS]), int(window[ROWS]))
             count = place[2] * place[3]
@@ -288,18 +321,14 @@ def measure(
                 target = cleaned[:count]
                 target[:] = own
                 for entry in range(first[k], first[k + 1]):
-                    other = stars[neighbours[entry]]
-                    if other[STATE] != GOOD:
-                        continue
-                    star_model(other[X], other[Y], shape, place, lights, work)
-                    for i in range(count):
-                        target[i] -= np.float32(other[FLUX] * lights[0, i])
+                    _take_away(stars[neighbours[entry]], shape, place, lights, work, target)
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
-            guess = (window[START_X], window[START_Y]) if turn == 0 else (star[X], star[Y])
+            guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
             fit_star(target, place, guess, shape, noise, model, work, star)
             if (
-                star[STATE] == GOOD
-                and star[CHI2] > _BAD_FIT * (star[PIXELS] - _FIT_PARAMETERS)
+                last
+                and star[STATE] == GOOD
+                and star[CHI2] > BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
                 and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
             ):
                 fit_star(target, place, (star[X], star[Y]), shape, noise, model, work, star)

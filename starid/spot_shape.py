@@ -26,9 +26,9 @@ _ITERATIONS: Final = 30
 _SETTLED: Final = 1e-2
 _WEIGHT_END: Final = 12.0
 _LEAST_FOR_SPOT: Final = 3
-_ROUND_BELOW_PX: Final = 0.7
+_ROUND_BELOW_PX: Final = 1.0
 _LEAST_SIGMA_PX: Final = 0.3
-_UNEXPLAINED: Final = 0.5
+_UNEXPLAINED: Final = 0.4
 
 
 @dataclass(frozen=True)
