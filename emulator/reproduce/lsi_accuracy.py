@@ -26,7 +26,7 @@ from emulator.reproduce.plots import colours, figure, precision_curve, save
 _PUBLISHED: Final = {0.3: 100.0, 0.2: 92.24, 0.1: 71.43, 0.013: 59.20, 0.008: 58.67, 0.002: 57.79}
 _ON_TARGET: Final = {0.3: 99.9, 0.2: 92.0, 0.1: 71.0}
 _OFF_TARGET: Final = {0.3: 83.0, 0.2: 73.0, 0.1: 48.0}
-_FINE_TARGET: Final = {ON: {0.3: 99.9, 0.2: 99.0, 0.1: 97.0}, OFF: {0.3: 94.0, 0.2: 93.0, 0.1: 92.0}}
+_FINE_TARGET: Final = {ON: {0.3: 99.9, 0.2: 99.0, 0.1: 97.0}, OFF: {0.3: 93.5, 0.2: 92.5, 0.1: 91.0}}
 _MAP_SCALES: Final = (0.1, 1.0)
 _GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 _BEST: Final = 99.5
