@@ -55,7 +55,8 @@ class TrackFilterSettings:
     history
         Frames that a star may be missing before it is forgotten.
     confirm
-        Sightings that make an object a true star, once that many frames have been seen.
+        Sightings that make an object a true star, once that many frames have been seen. Two are enough where all
+        false stars are transient and positions are good; slow ones need three to be told.
     """
 
     position_sigma_deg: float = 0.02
@@ -70,7 +71,7 @@ class TrackFilterSettings:
     def __post_init__(self) -> None:
         if not (self.position_sigma_deg > 0.0 and self.brightness_sigma > 0.0 and self.gate > 0.0):
             raise FilterError("filter: the errors of position and brightness and the gate must be positive")
-        if self.history < 1 or self.confirm < 2:
+        if self.history < 1 or self.confirm < _LEAST_OBJECTS:
             raise FilterError(
                 "filter: a star is remembered for one frame at least and confirmed by two at least"
             )

@@ -17,7 +17,9 @@ MODULES: Final[tuple[str, ...]] = (
     "lsi_noise",
     "lsi_run_time",
     "fsf",
+    "fsf_studies",
     "rsi",
+    "spherical",
 )
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
 
