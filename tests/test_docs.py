@@ -1,0 +1,260 @@
+"""What the documents show is what happens: their code runs, their frames are answered, their tables are up to date."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import can
+import pytest
+
+from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.own_hub import OwnBus
+from hil_tests.raw_exchange import format_frame
+from protocol.can_framing import CanFrame, MessageType
+from protocol.export import export
+from protocol.icd import load_icd
+
+DOCS = Path(__file__).parents[1] / "docs"
+PATIENCE_S = 20.0
+_FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_NUMBER = re.compile(r"-?(?:(?<!\.)\b[0-9A-F]{2}\b(?!\.)|\d+(?:\.\d+)?)")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its language, its text, the heading that it stands under."""
+
+    language: str
+    text: str
+    heading: str
+
+
+def blocks(name: str) -> list[Block]:
+    text = (DOCS / name).read_text(encoding="utf-8")
+    return [
+        Block(match[1], match[2], re.findall(r"^##+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
+        for match in _FENCE.finditer(text)
+    ]
+
+
+def programs(name: str) -> list[tuple[Block, str]]:
+    """Python blocks, each with the text block that shows what it prints."""
+    found = blocks(name)
+    return [
+        (block, after.text)
+        for block, after in pairwise(found)
+        if (block.language, after.language) == ("python", "text")
+    ]
+
+
+def run(block: Block, namespace: dict[str, object]) -> str:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(block.text, block.heading, "exec"), namespace)
+    return printed.getvalue()
+
+
+def without_numbers(text: str) -> str:
+    return _NUMBER.sub("#", text)
+
+
+def numbers(text: str) -> list[float]:
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
+
+
+def test_icd_is_the_present_export():
+    remedy = "docs/icd.md is out of date; run: starhil icd export markdown -o docs/icd.md"
+    assert (DOCS / "icd.md").read_text(encoding="utf-8") == export(load_icd(), "markdown"), remedy
+
+
+def test_library(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, object] = {}
+    for block, shown in programs("library.md"):
+        printed = run(block, namespace)
+        assert without_numbers(printed) == without_numbers(shown), block.heading
+        assert numbers(printed) == pytest.approx(numbers(shown), rel=0.05, abs=0.35), block.heading
+
+
+@pytest.fixture(scope="module")
+def bus():
+    with OwnBus() as channel:
+        yield channel
+
+
+@pytest.fixture(scope="module")
+def unit(bus, tmp_path_factory):
+    """An emulator on every link that the walk-through uses: its ready line, by key."""
+    command = emulator_command(
+        serial="auto",
+        can=bus,
+        seed=1,
+        settings=["truth.kind=live", "parameters.start_mode=lost_in_space"],
+        state_dir=tmp_path_factory.mktemp("state"),
+        extra=["--canopen", "5", "--control", "auto"],
+    )
+    with EmulatorProcess(command) as process:
+        yield process.ready
+
+
+def python_can(channel: str) -> dict[str, str | int]:
+    """Keywords with which python-can opens a bus that the bench names."""
+    match = re.fullmatch(r"socketcand:(.*):(\d+)/(.*)", channel)
+    if match is None:
+        return {"interface": "socketcan", "channel": channel.removeprefix("socketcan:")}
+    return {"interface": "socketcand", "host": match[1], "port": int(match[2]), "channel": match[3]}
+
+
+def here(text: str, ready: dict[str, str]) -> str:
+    """Put the addresses of this run's emulator in place of those of the walk-through."""
+    keywords = ", ".join(f"{key}={value!r}" for key, value in python_can(ready.get("can", "")).items())
+    addresses = {
+        'interface="socketcan", channel="vcan0"': keywords,
+        "/tmp/startracker": ready["serial"],
+        "7700": ready["control"].rpartition(":")[2],
+        "5500": ready.get("truth", "").rpartition(":")[2],
+    }
+    for shown, actual in addresses.items():
+        text = text.replace(shown, actual)
+    return text
+
+
+def program_under(heading: str) -> tuple[Block, str]:
+    (found,) = [(block, shown) for block, shown in programs("walkthrough.md") if block.heading == heading]
+    return found
+
+
+def check_program(heading: str, ready: dict[str, str], folder: Path) -> None:
+    """Run a program of the walk-through as a process, and compare the words that it prints."""
+    block, shown = program_under(heading)
+    (folder / "starhil.eds").write_text(export(load_icd(), "eds"), encoding="ascii")
+    done = subprocess.run(
+        [sys.executable, "-c", here(block.text, ready)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert without_numbers(done.stdout) == without_numbers(shown)
+
+
+def test_walkthrough_decodes_the_attitude():
+    block, shown = program_under("Mode and attitude")
+    assert run(block, {}) == shown
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "heading",
+    ["With the `canopen` library as master", "3. A serial line, byte by byte", "Live truth and faults"],
+)
+def test_walkthrough_program(heading, unit, tmp_path):
+    check_program(heading, unit, tmp_path)
+
+
+@pytest.mark.process
+def test_walkthrough_by_steps(tmp_path):
+    command = emulator_command(
+        settings=["parameters.start_mode=lost_in_space", "parameters.update_rate=2"],
+        extra=["--clock", "stepped", "--control", "auto"],
+    )
+    with EmulatorProcess(command) as process:
+        check_program("Time by steps", process.ready, tmp_path)
+
+
+@pytest.mark.process
+def test_walkthrough_pytest(unit, tmp_path):
+    (block,) = [
+        block
+        for block in blocks("walkthrough.md")
+        if block.language == "python" and block.heading == "4. Tests of an OBC team"
+    ]
+    file = tmp_path / "test_star_tracker.py"
+    file.write_text(block.text, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={tmp_path}", str(file),
+         "--starhil-can", unit["can"]],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert f"{block.text.count('def test_')} passed" in done.stdout
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """A frame that the walk-through sends with cansend, and the frames that it shows as the answer."""
+
+    sent: CanFrame
+    answers: list[CanFrame]
+
+
+def exchanges(headings: set[str]) -> list[Exchange]:
+    found = []
+    for block in blocks("walkthrough.md"):
+        if block.language != "console" or block.heading not in headings:
+            continue
+        for part in block.text.split("$ cansend vcan0 ")[1:]:
+            typed, *dump = part.splitlines()
+            seen = [_dumped(line) for line in dump]
+            assert format_frame(seen[0]) == typed, "candump shows another frame than cansend sent"
+            found.append(Exchange(seen[0], seen[1:]))
+    return found
+
+
+def _dumped(line: str) -> CanFrame:
+    channel, identifier, size, *data = line.split()
+    frame = CanFrame(int(identifier, 16), bytes.fromhex("".join(data)), extended=len(identifier) == 8)
+    assert (channel, size) == ("vcan0", f"[{len(frame.data)}]")
+    return frame
+
+
+def _fixed(frame: CanFrame) -> bytes:
+    """Return the part of a frame that does not depend on time and noise."""
+    if frame.extended:
+        kind = MessageType(frame.id >> 24)
+        measured = kind not in (MessageType.TELECOMMAND_NACK, MessageType.TELEMETRY_NACK)
+        acknowledge = frame.id >> 16 & 0xFF == 240
+        return b"" if measured and not acknowledge else frame.data
+    if frame.id == 0x585:
+        read = frame.data[0] & 0xE0 == 0x40
+        return frame.data[:4] if read else frame.data
+    return b""
+
+
+def check_exchanges(found: list[Exchange], ready: dict[str, str], ours: Callable[[int], bool]) -> None:
+    """Send each frame and compare identifiers, lengths and fixed bytes of the answers."""
+    with can.Bus(**python_can(ready["can"])) as own:
+        for exchange in found:
+            sent = exchange.sent
+            own.send(can.Message(arbitration_id=sent.id, data=sent.data, is_extended_id=sent.extended))
+            for answer in exchange.answers:
+                got = own.recv(PATIENCE_S)
+                while got is not None and not ours(got.arbitration_id):
+                    got = own.recv(PATIENCE_S)
+                assert got is not None, f"no answer to {format_frame(sent)}"
+                frame = CanFrame(got.arbitration_id, bytes(got.data), extended=got.is_extended_id)
+                assert (hex(frame.id), len(frame.data)) == (hex(answer.id), len(answer.data))
+                assert _fixed(frame) == _fixed(answer)
+
+
+@pytest.mark.process
+def test_walkthrough_can_frames(unit):
+    found = exchanges({"Identification", "Mode and attitude", "Unsolicited telemetry", "Refusals"})
+    assert len(found) == 10
+    check_exchanges(found, unit, lambda identifier: identifier > 0x7FF)
+
+
+@pytest.mark.process
+def test_walkthrough_canopen_frames(unit):
+    found = exchanges({"With cansend"})
+    assert len(found) == 10
+    check_exchanges(found, unit, lambda identifier: identifier <= 0x7FF and identifier != 0x705)
