@@ -34,7 +34,7 @@ from starid.measurement import (
     measure,
 )
 from starid.pairs import split_pairs
-from starid.spot_shape import SpotShape, moments_of, shape_from_moments
+from starid.spot_shape import MOMENT_COLUMNS, SpotShape, moments_of, shape_from_moments
 from starid.spot_width import spot_widths
 from starid.trail_filter import smooth_along_trails, trail_noise_factor
 from starid.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
@@ -46,6 +46,7 @@ LEAST_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
 _MOST_PEAKS: Final = 8192
 _HIGHER: Final = 1.5
+_STARS_FOR_A_GLANCE: Final = 12
 _STARS_FOR_SHAPE: Final = 30
 _SHAPE_WINDOW_PX: Final = 40
 _STARS_FOR_WIDTH: Final = 15
@@ -305,24 +306,20 @@ def _shape(
 ) -> SpotShape:
     """Spot and trail from the brightest stars that are not saturated."""
     height, width = counts.shape
-    table = np.empty((_STARS_FOR_SHAPE, 5))
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
     tries = peaks[: 4 * _STARS_FOR_SHAPE]
-    count = moments_of(
-        counts,
-        tries,
-        background.level,
-        background.block_px,
-        start,
-        _SHAPE_WINDOW_PX,
-        saturation,
-        table,
-    )
-    shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
+    grid = (background.level, float(background.block_px))
+    # a few stars tell whether there are trails at all; more are needed only to follow them
+    for wanted in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
+        table = np.empty((wanted, MOMENT_COLUMNS))
+        count = moments_of(counts, tries, *grid, start, _SHAPE_WINDOW_PX, float(saturation), table)
+        shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
+        if shape.trail_px == 0.0 or count < wanted:
+            break
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
-        grid = (background.level, background.noise, float(background.block_px))
-        fitted = spot_widths(counts, tries, *grid, start, float(saturation), widths)
+        levels = (background.level, background.noise, float(background.block_px))
+        fitted = spot_widths(counts, tries, *levels, start, float(saturation), widths)
         if fitted >= _LEAST_FOR_WIDTH:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
     if settings.follow_trails:
