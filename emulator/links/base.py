@@ -14,7 +14,7 @@ from protocol.messages import LinkFault, Reply, Request
 from protocol.transports.base import Transport
 
 Item = TypeVar("Item")
-Arriving = TypeVar("Arriving", contravariant=True)
+Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
 Style = TypeVar("Style")
 
 log = logging.getLogger("starhil.link")
@@ -23,7 +23,7 @@ FLUSH_S: Final = 0.51
 """Time after which a message that has begun is looked at: a little more than the receivers' time-out of 0.5 s."""
 
 
-class Receiver(Protocol[Arriving]):
+class Receiver(Protocol[Arriving_contra]):
     """The device's end of a framing."""
 
     @property
@@ -31,7 +31,7 @@ class Receiver(Protocol[Arriving]):
         """Whether a message has begun and not ended."""
         ...
 
-    def feed(self, item: Arriving, now: float, /) -> list[Request | LinkFault]:
+    def feed(self, item: Arriving_contra, now: float, /) -> list[Request | LinkFault]:
         """Take what arrived and return what it completes."""
         ...
 
