@@ -14,7 +14,9 @@ from protocol.messages import ErrorCode
 from protocol.serial_framing import Dialect
 from tests.hil_tests.fake_device import EDGE, FakeDevice
 
+PATIENCE_S = 5.0
 TIMEOUT_S = 0.15
+"""For requests that the device leaves unanswered."""
 LINKS = ["serial-a", "serial-b", "serial-c", "can"]
 
 
@@ -27,7 +29,7 @@ def pair(request, hub):
         else:
             device.dialect = Dialect(request.param[-1])
             options = {"serial": device.open_serial(), "dialect": request.param[-1]}
-        with ObcClient.open(**options, timeout_s=TIMEOUT_S) as client:
+        with ObcClient.open(**options, timeout_s=PATIENCE_S) as client:
             yield device, client
 
 
@@ -38,7 +40,7 @@ def test_telemetry_comes_in_physical_units(pair):
     assert client.telemetry("rates") == pytest.approx({"rate_x": 0.3, "rate_y": -0.0001, "rate_z": 0.0})
     reading = client.read("precise_attitude")
     assert (reading["valid"], reading["mode"], reading["q_w"]) == (True, "tracking", 1.0)
-    assert 0.0 < reading.latency_s < TIMEOUT_S
+    assert 0.0 < reading.latency_s < PATIENCE_S
 
 
 def test_a_telecommand_reaches_the_device_as_it_was_given(pair):
@@ -82,12 +84,12 @@ def test_no_reply_is_an_error_after_the_time_out_and_is_tried_again_only_if_aske
     device, client = pair
     device.mute = 1
     with pytest.raises(NoReplyError, match=r"rates: no reply within 0\.15 s"):
-        client.read("rates")
+        client.read("rates", timeout_s=TIMEOUT_S)
     device.mute = 2
-    assert client.read("rates", retries=2).latency_s < TIMEOUT_S
+    assert client.read("rates", retries=2, timeout_s=4 * TIMEOUT_S)["rate_x"] == 0.0
     device.mute = 2
     with pytest.raises(NoReplyError, match="2 attempts"):
-        client.read("rates", retries=1)
+        client.read("rates", retries=1, timeout_s=TIMEOUT_S)
     client.read("rates")
     assert [item.outcome for item in client.transactions] == ["no_reply"] * 3 + ["ok"] + ["no_reply"] * 2 + [
         "ok"
@@ -100,7 +102,7 @@ def test_a_late_reply_is_not_taken_for_that_of_the_next_request(pair):
     device.telemetry["quaternion"] = {"q_x": 0.5}
     device.mute, device.late_s = 1, TIMEOUT_S + 0.02
     with pytest.raises(NoReplyError):
-        client.read("rates")
+        client.read("rates", timeout_s=TIMEOUT_S)
     time.sleep(0.05)
     assert client.telemetry("quaternion")["q_x"] == 0.5
 
@@ -163,7 +165,7 @@ def test_an_image_is_downloaded_by_bursts_and_lost_packets_are_asked_for_again(p
 
 
 def test_unsolicited_telemetry_is_a_stream_of_its_own(hub):
-    with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=TIMEOUT_S) as client:
+    with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
         client.read("rates")
         for count in range(3):
             device.say("precise_attitude", {"frame_counter": count, "valid": True})
@@ -201,8 +203,8 @@ def test_ports_that_cannot_be_had_are_refused_in_one_line():
 
 def test_a_vanished_port_is_told_from_a_silent_device():
     device = FakeDevice()
-    with device, ObcClient.open(serial=device.open_serial(), timeout_s=TIMEOUT_S) as client:
+    with device, ObcClient.open(serial=device.open_serial(), timeout_s=PATIENCE_S) as client:
         client.read("rates")
         device.close_links()
         with pytest.raises(LinkLostError, match="/dev/pts"):
-            client.read("rates")
+            client.read("rates", timeout_s=TIMEOUT_S)

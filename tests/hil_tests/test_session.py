@@ -36,7 +36,7 @@ def play(device, tmp_path):
 
     def _play(text: str, can: str | None = None):
         path = tmp_path / "trial.toml"
-        path.write_text("[defaults]\ntimeout_s = 0.2\nkeep_going = true\n" + text, encoding="utf-8")
+        path.write_text("[defaults]\ntimeout_s = 5\nkeep_going = true\n" + text, encoding="utf-8")
         script = load_script(path, ICD)
         options = LinkOptions(serial=port, can=can, timeout_s=script.timeout_s)
         with Bench(options, ICD, log_folder=tmp_path) as bench:
@@ -168,7 +168,7 @@ def test_an_invalid_attitude_never_passes(play, device):
 def test_a_step_is_tried_until_it_holds_or_its_time_is_over(play, device):
     device.mute = 2
     result = play(
-        "[[step]]\nread = 'rates'\nwithin_s = 5\nevery_s = 0.01\n"
+        "[[step]]\nread = 'rates'\nwithin_s = 10\nevery_s = 0.01\ntimeout_s = 0.3\n"
         "[[step]]\nread = 'rates'\nexpect = { rate_x = 1 }\nwithin_s = 0.1\nevery_s = 0.01"
     )
     assert [item.status for item in result.results] == ["passed", "failed"]
@@ -180,7 +180,7 @@ def test_repeats_must_all_hold(play, device):
     result = play("[[step]]\nread = 'rates'\nrepeat = 4\nevery_s = 0.0")
     assert result.passed
     device.mute = 1
-    result = play("[[step]]\nread = 'rates'\nrepeat = 4\nevery_s = 0.0")
+    result = play("[[step]]\nread = 'rates'\nrepeat = 4\nevery_s = 0.0\ntimeout_s = 0.2")
     assert "time 1 of 4" in result.results[0].detail
 
 
