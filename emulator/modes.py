@@ -113,8 +113,7 @@ class Modes:
 
     def fail(self, why: str) -> None:
         """Enter the error mode."""
-        self._enter(Mode.ERROR, Cause.FAULT)
-        self.error = why
+        self._enter(Mode.ERROR, Cause.FAULT, why)
 
     def solved(self, *, valid: bool, tracked: bool, tracking_enabled: bool) -> None:
         """Change the mode by the result of a frame.
@@ -135,8 +134,8 @@ class Modes:
         elif self.mode is Mode.TRACKING and not tracking_enabled:
             self._enter(Mode.LOST_IN_SPACE, Cause.TRACKING_DISABLED)
 
-    def _enter(self, after: Mode, cause: Cause) -> None:
+    def _enter(self, after: Mode, cause: Cause, error: str = "") -> None:
         before, self.mode = self.mode, after
-        self.error = ""
+        self.error = error
         if self._on_change is not None and before is not after:
             self._on_change(Transition(before, after, cause))

@@ -72,6 +72,13 @@ def test_changes_are_told_with_their_cause():
     ]
 
 
+def test_who_is_told_of_an_error_sees_why():
+    seen = []
+    modes = Modes(lambda _transition: seen.append(modes.error))
+    modes.fail("sensor")
+    assert seen == ["sensor"]
+
+
 def test_boot_ends_only_from_boot():
     modes = modes_in(Mode.ERROR)
     modes.booted()
