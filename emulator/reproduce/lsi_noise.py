@@ -19,6 +19,7 @@ from emulator.reproduce.experiment import (
     row,
     write_csv,
 )
+from emulator.reproduce.lsi_patterns import complete, pattern_files, pattern_rows
 from emulator.reproduce.lsi_trials import OFF, ON, share, solve_frames
 from emulator.reproduce.plots import colours, figure, precision_curve, save
 from starid.thesis_simulation import NoiseModel
@@ -303,6 +304,9 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 files.append(name)
     files.append(_false_figure(context, results))
     files += _rate_figures(context, results)
+    if complete(results):
+        files += pattern_files(context, results)
+        rows += pattern_rows(results)
     limits = (0.002, 0.008, 0.013, 0.1, 0.2, 0.283, 0.3, 1.0)
     table: dict[str, list[Any]] = {"case": list(results)}
     for method in ("mse", "1se", "fine"):
@@ -328,7 +332,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
 EXPERIMENTS: Final = (
     Experiment(
         "lsi-noise",
-        "LSI with noise, false and missing stars: figures 6.6–6.11",
+        "LSI with noise, false and missing stars: figures 6.6–6.11, 6.20–6.30, B, C",
         _parts,
         _work,
         _finish,
