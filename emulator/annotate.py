@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-MARK_BGR: Final = (80, 220, 120)
+from starid.background import estimate_background
+
+MARK_BGR: Final = (70, 190, 105)
 MISS_BGR: Final = (70, 90, 240)
 _TEXT_BGR: Final = (235, 215, 160)
 _SHADOW_BGR: Final = (20, 16, 12)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _SUB_PIXEL_BITS: Final = 4
+_DARK: Final = 0.06
 
 STAR_NAMES: Final[dict[int, str]] = {
     677: "Alpheratz",
@@ -119,11 +122,19 @@ STAR_NAMES: Final[dict[int, str]] = {
 
 
 def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
-    """Bring an image (h, w) to 8 bits so that faint stars are seen: black a little below the sky, gamma 2.5."""
-    sky, high = np.percentile(image, (50.0, 99.98))
-    low = sky - 0.1 * max(high - sky, 1.0)
-    scaled = np.clip((image.astype(np.float32) - low) / max(high - low, 1.0), 0.0, 1.0)
-    return np.asarray(255.0 * scaled**0.4 + 0.5, dtype=np.uint8)
+    """Bring an image (h, w) to 8 bits so that faint stars are seen: uneven sky taken off, dark, gamma 2.2.
+
+    Where the image is brighter than its sky on the whole (a limb, glare) that stays visible as grey.
+    """
+    background = estimate_background(image)
+    height, width = image.shape
+    sky = cv2.resize(background.level, (width, height), interpolation=cv2.INTER_LINEAR)
+    typical, noise = background.median_level, background.median_noise
+    above = image.astype(np.float32) - sky
+    high = max(float(np.percentile(above, 99.97)), 20.0 * noise)
+    stars = np.clip((above - noise) / high, 0.0, 1.0) ** 0.45
+    veil = np.clip((sky - typical) / max(float(image.max()) - typical, 1.0), 0.0, 1.0) ** 0.6
+    return np.asarray(255.0 * np.clip(_DARK + stars + 0.7 * veil, 0.0, 1.0) + 0.5, dtype=np.uint8)
 
 
 def star_label(hip: int, magnitude: float, numbers_to: float) -> str:
@@ -165,15 +176,18 @@ def annotate(
     height, width = image.shape
     size = max(0.32, min(width, height) / 2600.0)
     taken: list[tuple[int, int, int, int]] = []
-    for (x, y), label in zip(xy_px, labels, strict=True):
+    for x, y in xy_px:
         _circle(canvas, x, y, radius_px, MARK_BGR)
+        taken.append((round(x - radius_px), round(y - radius_px), round(x + radius_px), round(y + radius_px)))
+    for (x, y), label in zip(xy_px, labels, strict=True):
         if not label:
             continue
         (text_width, text_height), _ = cv2.getTextSize(label, _FONT, size, 1)
-        for left, base in _places(x, y, radius_px, text_width, text_height):
+        places = _places(x, y, radius_px, text_width, text_height)
+        for forced, (left, base) in [*((False, place) for place in places), (True, places[0])]:
             box = (left, base - text_height, left + text_width, base + 2)
             inside = box[0] >= 0 and box[1] >= 0 and box[2] < width and box[3] < height
-            if inside and not any(_overlap(box, other) for other in taken):
+            if inside and (forced or not any(_overlap(box, other) for other in taken)):
                 taken.append(box)
                 cv2.putText(canvas, label, (left, base), _FONT, size, _SHADOW_BGR, 3, cv2.LINE_AA)
                 cv2.putText(canvas, label, (left, base), _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
@@ -199,6 +213,8 @@ def _places(x: float, y: float, radius: float, width: int, height: int) -> list[
     return [
         (round(x + gap), middle),
         (round(x - gap - width), middle),
+        (round(x + 0.7 * gap), round(y - 0.7 * gap)),
+        (round(x + 0.7 * gap), round(y + 0.7 * gap + height)),
         (round(x - width / 2.0), round(y + gap + height)),
         (round(x - width / 2.0), round(y - gap)),
     ]
