@@ -125,10 +125,10 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     ]
     if not lines:
         raise EmulatorError(f"truth file {path}: empty; the first line names the columns, e.g. t,qx,qy,qz,qw")
-    columns = [name.strip() for name in next(csv.reader([lines[0][1]]))]
+    columns = [name.strip() for name in _cells(f"truth file {path} line {lines[0][0]}", lines[0][1])]
     if "run_time_s" in columns and "true_qx" in columns:
         columns = [LOG_COLUMNS.get(name, "") for name in columns]
-    needed = _attitude_columns(path, columns)
+    needed = _attitude_columns(f"truth file {path} line {lines[0][0]}", columns)
     has_rates = all(name in columns for name in RATE_COLUMNS)
     times: list[float] = []
     attitudes: list[Attitude] = []
@@ -148,23 +148,34 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     return FileTruth(np.array(times), attitudes, rate_array, start_s=start_s, repeat=repeat)
 
 
-def _attitude_columns(path: Path, columns: list[str]) -> tuple[str, ...]:
+def _cells(where: str, line: str) -> list[str]:
+    try:
+        return next(csv.reader([line]))
+    except csv.Error as error:
+        raise EmulatorError(f"{where}: not CSV ({error})") from None
+
+
+def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS}
     unknown = [name for name in columns if name not in known | {""}]
     if unknown:
+        raise EmulatorError(f"{where}: unknown column {unknown[0]!r}; known: {', '.join(sorted(known))}")
+    twice = [name for name in columns if name and columns.count(name) > 1]
+    if twice:
+        raise EmulatorError(f"{where}: column {twice[0]} stands there twice; leave one out")
+    missing = [name for name in RATE_COLUMNS if name not in columns]
+    if 0 < len(missing) < len(RATE_COLUMNS):
         raise EmulatorError(
-            f"truth file {path} line 1: unknown column {unknown[0]!r}; known: {', '.join(sorted(known))}"
+            f"{where}: column {missing[0]} is missing; give {', '.join(RATE_COLUMNS)} or none"
         )
     for needed in (QUATERNION_COLUMNS, ANGLE_COLUMNS):
         if "t" in columns and all(name in columns for name in needed):
             return needed
-    raise EmulatorError(
-        f"truth file {path} line 1: columns t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg needed"
-    )
+    raise EmulatorError(f"{where}: columns t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg needed")
 
 
 def _row(where: str, columns: list[str], line: str) -> dict[str, float]:
-    cells = next(csv.reader([line]))
+    cells = _cells(where, line)
     if len(cells) != len(columns):
         raise EmulatorError(f"{where}: {len(cells)} values for {len(columns)} columns")
     row: dict[str, float] = {}

@@ -56,12 +56,22 @@ def build_app() -> typer.Typer:
     return app
 
 
+def describe_os_error(error: OSError) -> str:
+    """One line, `path: reason`, for what the operating system refused and no command has put into its own words."""
+    reason = error.strerror or str(error) or type(error).__name__
+    paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
+    return " ".join(": ".join([" -> ".join(paths), reason] if paths else [reason]).split())
+
+
 def main() -> None:
     """Run the command line; refused input ends in one line on stderr and exit status 2."""
     try:
         build_app()()
     except (StaridError, ProtocolError, EmulatorError, BenchError) as error:
         print(f"starhil: {error}", file=sys.stderr)
+        raise SystemExit(EXIT_BAD_INPUT) from None
+    except OSError as error:
+        print(f"starhil: {describe_os_error(error)}", file=sys.stderr)
         raise SystemExit(EXIT_BAD_INPUT) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None

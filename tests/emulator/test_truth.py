@@ -146,6 +146,9 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,qx,qy,qz,qw\n0,0,0,0,2\n", "line 2: quaternion of length 2"),
         ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw = nan is not finite"),
         ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg = 91 is outside"),
+        ("# c\nt,t,qx,qy,qz,qw\n0,1,0,0,0,1\n", "line 2: column t stands there twice"),
+        ("t,qx,qy,qz,qw,wx_deg_s,wz_deg_s\n0,0,0,0,1,3,3\n", "line 1: column wy_deg_s is missing"),
+        ("t,qx,qy,qz,qw\n0,0,0,0," + "1" * 200_000 + "\n", "line 2: not CSV"),
     ],
 )
 def test_bad_files_are_named_by_line(tmp_path, text, said):
