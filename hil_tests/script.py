@@ -75,6 +75,9 @@ from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
 from protocol.values import Parameter, Value
 
+LISTED: Final = "; `starhil icd list` lists all"
+"""Where names are found that nothing known is near."""
+
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 
 
@@ -232,7 +235,10 @@ class _Checker:
 
     def _check_field(self, reader: TableReader, row: Row | None, name: str) -> None:
         if row is not None and name not in row.named_fields:
-            reader.fail(f"row '{row.name}' has no field '{name}'{near_matches(name, row.named_fields)}")
+            known = f"; its fields: {', '.join(row.named_fields)}" if row.named_fields else "; it has none"
+            reader.fail(
+                f"row '{row.name}' has no field '{name}'{near_matches(name, row.named_fields) or known}"
+            )
 
     def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> None:
         """Refuse an expectation that can never hold: another type, or no name of the enumeration."""
@@ -244,7 +250,8 @@ class _Checker:
                 continue
             if item.enum is not None:
                 if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
-                    near = near_matches(show(value), item.enum.values)
+                    known = f"; one of: {', '.join(item.enum.values)}"
+                    near = near_matches(show(value), item.enum.values) or known
                     reader.fail(f"'{item.name}' is never '{show(value)}'{near}")
             elif (item.kind == "flag") != isinstance(value, bool):
                 kind = "true or false" if item.kind == "flag" else "not true or false"
@@ -259,13 +266,15 @@ class _Checker:
             other = self._icd.telemetry if telecommand else self._icd.telecommands
             kind = "telecommand" if telecommand else "telemetry row"
             remedy = "; it is telemetry: use read" if telecommand else "; it is a telecommand: use command"
-            reader.fail(f"unknown {kind} '{name}'{remedy if name in other else near_matches(name, rows)}")
+            reader.fail(
+                f"unknown {kind} '{name}'{remedy if name in other else near_matches(name, rows) or LISTED}"
+            )
         return rows[name]
 
     def _parameter(self, reader: TableReader, key: str) -> Parameter:
         name = reader.text(key)
         if name not in self._icd.parameters:
-            reader.fail(f"unknown parameter '{name}'{near_matches(name, self._icd.parameters)}")
+            reader.fail(f"unknown parameter '{name}'{near_matches(name, self._icd.parameters) or LISTED}")
         return self._icd.parameters[name]
 
     def _refused(self, reader: TableReader) -> str | None:

@@ -148,6 +148,11 @@ def test_a_full_script_is_read_as_it_stands(load):
         ("[[step]]\nrestart = 'gently'", ["gently", "kill"]),
         ("[[step]]\nsample = 'rates'\nevery_s = 1\nfor_s = 1\nat_least = 2", ["from 0 to 1"]),
         ("[[step]\n", ["not valid TOML"]),
+        ("[[step]]\ncommand = 'xyzzy'", ["unknown telecommand 'xyzzy'", "`starhil icd list` lists all"]),
+        ("[[step]]\nread = 'xyzzy'", ["unknown telemetry row 'xyzzy'", "`starhil icd list` lists all"]),
+        ("[[step]]\nset_parameter = 'xyzzy'\nvalue = 1", ["'xyzzy'", "`starhil icd list` lists all"]),
+        ("[[step]]\nread = 'rates'\nexpect = { xyzzy = 1 }", ["'xyzzy'; its fields: rate_x, rate_y"]),
+        ("[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'xyzzy' }", ["; one of: boot, standby,"]),
     ],
 )
 def test_a_mistake_is_answered_with_file_step_name_and_near_matches(load, text, words):
