@@ -13,6 +13,7 @@ from starid.observation import SIGMA_U, SIGMA_V, SOURCE, Table, rescale
 from starid.pattern_index import IndexArrays
 from starid.refinement import (
     NUMBERS,
+    PRIOR_FREEDOM,
     RMS,
     SCALE,
     VARIANCE,
@@ -31,9 +32,6 @@ from starid.verification import log_false_probability, worth_refining
 
 LEAST_MATCHED: Final = 4
 """Matches that an answer needs."""
-
-PRIOR_FREEDOM: Final = 10.0
-"""Weight of the errors that the caller gives, in degrees of freedom, against what the residuals say."""
 
 
 class Answer(NamedTuple):

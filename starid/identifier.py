@@ -85,7 +85,7 @@ class Effort:
     window_px: float = 12.0
     test_window_px: float = 10.0
     magnitude_gate: float = 1.5
-    max_triangles: int = 3000
+    max_triangles: int = 2400
     max_false_probability: float = 1e-5
     max_false_probability_tracking: float = 1e-5
 

@@ -29,21 +29,23 @@ BRIGHTEST_LIMIT: Final = 6.0
 FAINTEST_LIMIT: Final = 9.0
 """The default limiting magnitude stays between these: Hipparcos thins out beyond the second."""
 
+BRIGHT_QUOTA: Final = 5
 LARGEST_QUOTA: Final = 20
 SMALLEST_QUOTA: Final = 6
-"""Pattern stars in half the field's area: many stand against false stars, few keep the index small."""
+"""Pattern stars in half the field's area: a few bright ones, and deep ones, many where the index allows."""
+
+MOST_BRIGHT: Final = 120_000
+MOST_DEEP: Final = 420_000
+"""Triangles at most, about, of bright and of deep pattern stars."""
+
+BRIGHT_SIDES: Final = (0.04, 1.3)
+DEEP_SIDES: Final = (0.12, 0.95)
+"""Shortest and longest side as shares of the field's width; narrow fields stop short of the longest."""
 
 MIDDLE_SIDE: Final = 0.5
-"""Where it comes to the choice, triangles may be up to this share of the field's width rather than more."""
+"""Rather fewer deep pattern stars than triangles that must be smaller than this share."""
 
-MOST_PATTERNS: Final = 700_000
-"""Triangles at most, about; narrow fields get them by keeping only the smaller ones."""
-
-WIDEST_SIDE: Final = 0.95
-NARROWEST_SIDE: Final = 0.12
-"""Sides of a triangle as shares of the field's width."""
-
-SIDE_BINS: Final = 56
+SIDE_BINS: Final = 68
 _STARS_PER_QUOTA: Final = 30.0
 """Pattern stars of the whole sky, times the field's solid angle, over the quota; found by building."""
 
@@ -88,22 +90,28 @@ def index_settings(
     least = pixels_per_radian(camera)
     window = window_px / least
     spacing = math.sqrt(4.0 * math.pi / max(len(catalog.brighter_than(limiting_magnitude)), 1))
-    cube = MOST_PATTERNS * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
+    cube = MOST_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
     quota = min(max(int(cube ** (1.0 / 3.0)), SMALLEST_QUOTA), LARGEST_QUOTA)
-    triangles = MOST_PATTERNS * area / (_STARS_PER_QUOTA * quota)
-    share = (triangles / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25
-    longest = min(share, WIDEST_SIDE) * width
+    deep = min(_longest_share(MOST_DEEP, quota, area), DEEP_SIDES[1])
+    bright = max(min(_longest_share(MOST_BRIGHT, BRIGHT_QUOTA, area), BRIGHT_SIDES[1]), deep)
     return IndexSettings(
         limiting_magnitude=limiting_magnitude,
         blend_rad=blend_px / least,
         window_rad=window,
         field_area_sr=area,
-        longest_side_rad=min(longest, 0.9 * math.pi),
-        shortest_side_rad=NARROWEST_SIDE * width,
-        quota=quota,
+        bright_sides_rad=(BRIGHT_SIDES[0] * width, min(bright * width, 0.9 * math.pi)),
+        deep_sides_rad=(DEEP_SIDES[0] * width, min(deep * width, 0.9 * math.pi)),
+        bright_quota=BRIGHT_QUOTA,
+        deep_quota=quota,
         cells_per_edge=max(int(0.5 * math.pi / max(window, 0.7 * spacing)), 1),
         side_bins=SIDE_BINS,
     )
+
+
+def _longest_share(triangles: int, quota: int, area: float) -> float:
+    """Longest side, as a share of the field's width, that gives about so many triangles."""
+    per_star = triangles * area / (_STARS_PER_QUOTA * quota)
+    return float((per_star / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25)
 
 
 def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str | Path) -> IndexArrays:

@@ -134,7 +134,7 @@ def match_detections(
     index: IndexArrays,
     seen: Table,
     rotation: NDArray[np.float64],
-    count: int,
+    refused: NDArray[np.bool_],
     windows: tuple[float, float, float, float],
     zero_point: float,
     scatter: float,
@@ -142,12 +142,14 @@ def match_detections(
     costs: NDArray[np.float64],
     owners: NDArray[np.int64],
 ) -> int:
-    """Match each of the first `count` detections to the likeliest star in its window; return how many.
+    """Match each detection to the likeliest star in its window; return how many.
 
     The likeliest has the least ``(r/σ)² + (Δm/s)²``. A star claimed twice stays with the cheaper claim.
 
     Parameters
     ----------
+    refused : ndarray (n,) of bool
+        Detections that are not to be matched.
     windows : (reach, sigma, gate, px_per_rad)
         Window in pixels, the same for all, or `BY_NOISE`; noise of a detection of unit error, pixels;
         largest deviation from the expected magnitude; least pixels per radian in the field, for the first
@@ -156,7 +158,7 @@ def match_detections(
         Catalogue minus instrumental magnitude, and its scatter s.
     stars, costs : ndarray (n,)
         Filled: index star or −1, and its cost.
-    owners : ndarray of a power of two, > 2·count
+    owners : ndarray of a power of two, > 2·n
         Workspace: an open hash of star → detection.
     """
     mask = owners.shape[0] - 1
@@ -165,7 +167,9 @@ def match_detections(
     for i in range(stars.shape[0]):
         stars[i] = -1
     matched = 0
-    for i in range(count):
+    for i in range(stars.shape[0]):
+        if refused[i]:
+            continue
         best, best_cost = _best_star(index, seen, rotation, i, windows, zero_point, scatter)
         if best < 0:
             continue

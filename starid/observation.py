@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 from starid.jit_kernels import inner
 from starid.projection import (
+    CX,
+    CY,
     FX,
     FY,
+    K1,
+    K3,
     MODEL,
+    PINHOLE,
     back_project_one,
     distort_slopes,
     plane_slopes,
@@ -65,6 +70,26 @@ def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @inner
+def _look_plainly(params: NDArray[np.float64], column: float, row: float, table: Table, n: int) -> None:
+    """Fill in direction and gradients of a position for a pinhole without distortion."""
+    fx, fy = params[FX], params[FY]
+    a, b = (column - params[CX]) / fx, (row - params[CY]) / fy
+    norm = math.sqrt(1.0 + a * a + b * b)
+    z = 1.0 / norm
+    table[n, X], table[n, Y], table[n, Z] = a * z, b * z, z
+    table[n, U_X], table[n, U_Y], table[n, U_Z] = fx * norm, 0.0, -fx * a * norm
+    table[n, V_X], table[n, V_Y], table[n, V_Z] = 0.0, fy * norm, -fy * b * norm
+
+
+@inner
+def _describe(row: int, flux: float, sigmas: NDArray[np.float64], table: Table, n: int) -> None:
+    """Fill in what is not geometry."""
+    table[n, MAGNITUDE] = -2.5 * math.log10(flux) if flux > 0.0 else FAINTEST
+    table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
+    table[n, SOURCE] = row
+
+
+@inner
 def observe(
     params: NDArray[np.float64],
     xy: NDArray[np.float64],
@@ -76,7 +101,15 @@ def observe(
     table = np.empty((flux.shape[0], COLUMNS))
     n = 0
     fx, fy, model = params[FX], params[FY], params[MODEL]
+    plain = model == PINHOLE
+    for term in range(K1, K3 + 1):
+        plain = plain and params[term] == 0.0
     for row in order:
+        if plain:
+            _look_plainly(params, xy[row, 0], xy[row, 1], table, n)
+            _describe(row, flux[row], sigmas, table, n)
+            n += 1
+            continue
         x, y, z, seen = back_project_one(params, xy[row, 0], xy[row, 1])
         a, b, mapped = to_plane(model, x, y, z)
         if not (seen and mapped):
@@ -90,9 +123,7 @@ def observe(
         table[n, V_X] = fy * (j12 * ax + j22 * bx)
         table[n, V_Y] = fy * (j12 * ay + j22 * by)
         table[n, V_Z] = fy * (j12 * az + j22 * bz)
-        table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
-        table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
-        table[n, SOURCE] = row
+        _describe(row, flux[row], sigmas, table, n)
         n += 1
     return table[:n]
 

@@ -1,9 +1,11 @@
 """The identification index: blended catalogue stars, sky grid, star counts and triangles of bright stars.
 
-A triangle is kept for every three *pattern stars* that fit into the field together. Pattern stars are picked
-by falling brightness, a star being taken while fewer than a quota of taken ones lie within a neighbourhood
-of half the field's area: so every part of the sky, rich or poor, offers about as many, and a half-blocked
-field still holds some.
+Triangles are made of *pattern stars*, picked by falling brightness, a star being taken while fewer than a
+quota of taken ones lie within a neighbourhood of half the field's area: so every part of the sky, rich or
+poor, offers about as many, and a half-blocked field still holds some. With a small quota come the *bright*
+pattern stars: any three of them that can be in the field together make a triangle, for fields that show
+little else. With a large quota come the *deep* ones: triangles of middling size, for fields full of false
+stars. A narrow field has more sky to cover, and gets by with smaller triangles.
 
 Sides are chords of the unit sphere (2·sin(angle/2)), sorted longest first; corner k lies opposite side k.
 Triangles are binned by handedness and all three sides, so that a query reads a few short runs.
@@ -24,7 +26,7 @@ from starid.errors import StaridError
 from starid.jit_kernels import entry, inner
 from starid.sky_grid import FACES, build_sky_grid, cell_of
 
-INDEX_VERSION: Final = 3
+INDEX_VERSION: Final = 4
 """Raised whenever the same catalogue and settings would give another index."""
 
 SIDE_STEPS: Final = 65535
@@ -58,9 +60,9 @@ class IndexArrays(NamedTuple):
         Longest, middle and shortest chord in steps, and the pattern star opposite each.
     pattern_stars : ndarray int32
         Row of `stars` for each pattern star.
-    numbers : ndarray (6,) float64
-        cells per edge of the grid, its margin (rad), bins per side, chord of one step, shortest indexed side
-        (chord), stars a field on the average.
+    numbers : ndarray (7,) float64
+        cells per edge of the grid, its margin (rad), bins per side, chord of one step, shortest side of all,
+        shortest and longest side of the deep triangles (chords).
     """
 
     stars: NDArray[np.float64]
@@ -81,7 +83,8 @@ GRID_MARGIN: Final = 1
 SIDE_BINS: Final = 2
 SIDE_STEP: Final = 3
 SHORTEST_SIDE: Final = 4
-FIELD_STARS: Final = 5
+DEEP_SHORTEST: Final = 5
+DEEP_LONGEST: Final = 6
 
 
 @dataclass(frozen=True)
@@ -98,9 +101,10 @@ class IndexSettings:
         Largest distance at which a detection is looked up: the margin of the sky grid.
     field_area_sr : float
         Solid angle of the field.
-    longest_side_rad, shortest_side_rad : float
-        Limits of a triangle's sides.
-    quota : int
+    bright_sides_rad, deep_sides_rad : (float, float)
+        Shortest and longest side of a triangle of bright pattern stars, and of any; the first range holds
+        the second.
+    bright_quota, deep_quota : int
         Pattern stars within a neighbourhood of half the field's area.
     cells_per_edge : int
         Fineness of the sky grid.
@@ -112,19 +116,23 @@ class IndexSettings:
     blend_rad: float
     window_rad: float
     field_area_sr: float
-    longest_side_rad: float
-    shortest_side_rad: float
-    quota: int
+    bright_sides_rad: tuple[float, float]
+    deep_sides_rad: tuple[float, float]
+    bright_quota: int
+    deep_quota: int
     cells_per_edge: int
     side_bins: int
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.shortest_side_rad < self.longest_side_rad < math.pi:
+        (bright_low, bright_high), (deep_low, deep_high) = self.bright_sides_rad, self.deep_sides_rad
+        if not 0.0 < bright_low <= deep_low < deep_high <= bright_high < math.pi:
             raise StaridError(
-                f"index sides: {self.shortest_side_rad}…{self.longest_side_rad} rad given; "
-                "0 < shortest < longest < π needed"
+                f"index sides: bright {self.bright_sides_rad}, deep {self.deep_sides_rad} rad given; "
+                "0 < shortest < longest < π needed, the deep range within the bright one"
             )
-        if not (self.quota >= 3 and self.cells_per_edge >= 1 and self.side_bins >= 1):
+        if not (
+            self.deep_quota >= self.bright_quota >= 3 and self.cells_per_edge >= 1 and self.side_bins >= 1
+        ):
             raise StaridError("index: quota must be 3 or more, cells and bins 1 or more")
 
 
@@ -214,11 +222,13 @@ def _triangles(
     vectors: NDArray[np.float64],
     start: NDArray[np.int64],
     neighbours: NDArray[np.int64],
-    shortest: float,
-    longest: float,
+    bright: NDArray[np.bool_],
+    bright_sides: tuple[float, float],
+    deep_sides: tuple[float, float],
     bins: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
-    """All triangles i < j < k with sides between the limits: patterns and bins (see `IndexArrays`)."""
+    """All triangles i < j < k with sides within their limits: patterns and bins (see `IndexArrays`)."""
+    longest = bright_sides[1]
     step = longest / SIDE_STEPS
     count = 0
     patterns = np.empty((0, 6), dtype=np.uint16)
@@ -234,15 +244,20 @@ def _triangles(
                 if j <= i:
                     continue
                 c2 = chord(vectors, i, j)
-                if c2 < shortest:
+                both = bright[i] and bright[j]
+                if not both and not deep_sides[0] <= c2 <= deep_sides[1]:
                     continue
                 for q in range(p + 1, start[i + 1]):
                     k = neighbours[q]
-                    c0, c1 = chord(vectors, j, k), chord(vectors, i, k)
-                    if c0 > longest or c0 < shortest or c1 < shortest:
+                    if not (both and bright[k]) and not deep_sides[0] <= c2 <= deep_sides[1]:
+                        continue
+                    s0, s1, s2, a, b, c = sorted_triangle(
+                        chord(vectors, j, k), chord(vectors, i, k), c2, i, j, k
+                    )
+                    shortest, limit = bright_sides if both and bright[k] else deep_sides
+                    if s2 < shortest or s0 > limit:
                         continue
                     if fill == 1:
-                        s0, s1, s2, a, b, c = sorted_triangle(c0, c1, c2, i, j, k)
                         patterns[count, 0] = round(s0 / step)
                         patterns[count, 1] = round(s1 / step)
                         patterns[count, 2] = round(s2 / step)
@@ -300,17 +315,19 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
     """
     vectors, magnitudes = stars.vectors.copy(), stars.v.copy()
     grid_start, grid_stars = build_sky_grid(vectors, settings.cells_per_edge, settings.window_rad)
-    pattern_stars = pick_pattern_stars(vectors, 0.5 * settings.field_area_sr, settings.quota)
+    half_field = 0.5 * settings.field_area_sr
+    bright_stars = pick_pattern_stars(vectors, half_field, settings.bright_quota)
+    pattern_stars = np.union1d(bright_stars, pick_pattern_stars(vectors, half_field, settings.deep_quota))
     if pattern_stars.size > SIDE_STEPS:
         raise StaridError(
             f"index: {pattern_stars.size} pattern stars, at most {SIDE_STEPS} fit; the field is too narrow"
         )
     chosen = np.ascontiguousarray(vectors[pattern_stars])
-    start, neighbours = _adjacency(chosen, settings.longest_side_rad)
-    longest = 2.0 * math.sin(0.5 * settings.longest_side_rad)
-    shortest = 2.0 * math.sin(0.5 * settings.shortest_side_rad)
+    start, neighbours = _adjacency(chosen, settings.bright_sides_rad[1])
+    bright_sides, deep_sides = _chords(settings.bright_sides_rad), _chords(settings.deep_sides_rad)
     bins = settings.side_bins
-    patterns, binned = _triangles(chosen, start, neighbours, shortest, longest, bins)
+    bright = np.isin(pattern_stars, bright_stars)
+    patterns, binned = _triangles(chosen, start, neighbours, bright, bright_sides, deep_sides, bins)
     if binned.size == 0:
         raise StaridError(
             f"index: no triangle of stars to V {settings.limiting_magnitude:g} fits the field; "
@@ -327,9 +344,10 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
             settings.cells_per_edge,
             settings.window_rad,
             bins,
-            longest / SIDE_STEPS,
-            shortest,
-            vectors.shape[0] * settings.field_area_sr / (4.0 * math.pi),
+            bright_sides[1] / SIDE_STEPS,
+            bright_sides[0],
+            deep_sides[0],
+            deep_sides[1],
         ]
     )
     return IndexArrays(
@@ -342,6 +360,11 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
         pattern_stars=pattern_stars.astype(np.int32),
         numbers=numbers,
     )
+
+
+def _chords(angles: tuple[float, float]) -> tuple[float, float]:
+    """Chords of the unit sphere under two angles."""
+    return 2.0 * math.sin(0.5 * angles[0]), 2.0 * math.sin(0.5 * angles[1])
 
 
 def field_solid_angle(camera: Camera) -> float:

@@ -39,10 +39,28 @@ from starid.observation import (
     rescale,
 )
 from starid.pattern_index import STAR_MAGNITUDE, IndexArrays
-from starid.settings import MAGNITUDE_GATE, PX_PER_RAD, SCALE_TOLERANCE, WINDOW
+from starid.settings import (
+    MAGNITUDE_GATE,
+    PX_PER_RAD,
+    SCALE_TOLERANCE,
+    SIGMAS_KNOWN,
+    WINDOW,
+)
 
 MAX_ROUNDS: Final = 12
 """Rounds of matching and solving."""
+
+FEW_MATCHED: Final = 30
+"""Up to so many matches each is tested against the others: one outlier moves all the rest."""
+
+OUTLIER_CHANCE: Final = 3.3e-4
+"""Chance that the test takes a good star for an outlier: that of the window of 4 sigma."""
+
+LEAST_GATE: Final = 0.5
+"""Deviation from the expected magnitude that is always borne."""
+
+PRIOR_FREEDOM: Final = 10.0
+"""Weight of the errors that the caller gives, in degrees of freedom, against what the residuals say."""
 
 MAGNITUDE_FLOOR: Final = 0.1
 MAGNITUDE_CEILING: Final = 1.0
@@ -112,18 +130,90 @@ def solve_symmetric(
 
 
 @inner
+def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: NDArray[np.float64]) -> None:
+    """Fill (2, 4) with how the predicted position of detection i moves with turn and scale.
+
+    For a turn v it moves by G (c × v), c = (x, y, z) being the star in the sensor; for the logarithm of the
+    scale by −G du/dln(scale).
+    """
+    ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
+    vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
+    dx, dy, dz = seen[i, X], seen[i, Y], seen[i, Z]
+    lateral2 = dx * dx + dy * dy
+    slopes[0, 0], slopes[0, 1], slopes[0, 2] = uy * z - uz * y, uz * x - ux * z, ux * y - uy * x
+    slopes[1, 0], slopes[1, 1], slopes[1, 2] = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
+    slopes[0, 3] = uz * dz * lateral2 - (ux * dx + uy * dy) * (1.0 - lateral2)
+    slopes[1, 3] = vz * dz * lateral2 - (vx * dx + vy * dy) * (1.0 - lateral2)
+
+
+@inner
+def _outlier(
+    star_table: NDArray[np.float64],
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    normal: NDArray[np.float64],
+    chi2: float,
+    freedom: int,
+    settings: NDArray[np.float64],
+) -> int:
+    """Match that the others speak against most, if by more than chance would have it; else −1.
+
+    Leaving match i out lowers χ² by ``r' (1 − H)⁻¹ r``, H its own block of the hat matrix; the drop over
+    what remains follows an F distribution with 2 and ν − 2 degrees of freedom, whose tail is
+    ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
+    """
+    rest = float(freedom - 2)
+    known = PRIOR_FREEDOM if settings[SIGMAS_KNOWN] > 0.0 else 0.0
+    if rest + known < 1.0:
+        return -1
+    unknowns = 4 if settings[SCALE_TOLERANCE] > 0.0 else 3
+    slopes, unit, column = np.empty((2, 4)), np.empty(4), np.empty(4)
+    worst, least = -1, OUTLIER_CHANCE
+    for i in range(stars.shape[0]):
+        if stars[i] < 0:
+            continue
+        r0, r1, x, y, z = residual(star_table, seen, rotation, i, stars[i])
+        _slopes(seen, i, x, y, z, slopes)
+        su, sv = seen[i, SIGMA_U], seen[i, SIGMA_V]
+        r0, r1 = r0 / su, r1 / sv
+        for k in range(4):
+            slopes[0, k] /= su
+            slopes[1, k] /= sv
+        block = np.zeros((2, 2))
+        for a in range(2):
+            for k in range(unknowns):
+                unit[k] = slopes[a, k]
+            solve_symmetric(normal, unit, unknowns, column)
+            for b in range(2):
+                for k in range(unknowns):
+                    block[a, b] += slopes[b, k] * column[k]
+        h00, h01, h11 = 1.0 - block[0, 0], -block[0, 1], 1.0 - block[1, 1]
+        determinant = h00 * h11 - h01 * h01
+        if not determinant > 1e-9:
+            continue
+        drop = (h11 * r0 * r0 - 2.0 * h01 * r0 * r1 + h00 * r1 * r1) / determinant
+        others = max(chi2 - drop, 0.0) + known
+        tail = (1.0 + drop / max(others, 1e-12)) ** (-0.5 * (rest + known))
+        if tail < least:
+            worst, least = i, tail
+    return worst
+
+
+@inner
 def normal_equations(
     star_table: NDArray[np.float64],
     seen: Table,
     rotation: NDArray[np.float64],
-    count: int,
     stars: NDArray[np.int64],
+    unknowns: int,
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> float:
     """Fill the normal matrix (4, 4) and right side (4,) over the matches; return Σ (r/σ)².
 
-    Unknowns: turn of the sensor v (3), then the change of the logarithm of the scale.
+    The unknowns are the turn of the sensor v (3) and, where there are 4, the change of the logarithm of the
+    scale.
     """
     for a in range(4):
         right[a] = 0.0
@@ -131,22 +221,14 @@ def normal_equations(
             normal[a, b] = 0.0
     chi2 = 0.0
     slopes = np.empty((2, 4))
-    for i in range(count):
+    for i in range(stars.shape[0]):
         if stars[i] < 0:
             continue
         r0, r1, x, y, z = residual(star_table, seen, rotation, i, stars[i])
-        ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
-        vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
-        dx, dy, dz = seen[i, X], seen[i, Y], seen[i, Z]
-        lateral2 = dx * dx + dy * dy
-        # the predicted position moves by G (c × v) for a turn v, by −G du/dln(scale) for the scale
-        slopes[0, 0], slopes[0, 1], slopes[0, 2] = uy * z - uz * y, uz * x - ux * z, ux * y - uy * x
-        slopes[1, 0], slopes[1, 1], slopes[1, 2] = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
-        slopes[0, 3] = uz * dz * lateral2 - (ux * dx + uy * dy) * (1.0 - lateral2)
-        slopes[1, 3] = vz * dz * lateral2 - (vx * dx + vy * dy) * (1.0 - lateral2)
+        _slopes(seen, i, x, y, z, slopes)
         weight_u, weight_v = 1.0 / seen[i, SIGMA_U] ** 2, 1.0 / seen[i, SIGMA_V] ** 2
         chi2 += weight_u * r0 * r0 + weight_v * r1 * r1
-        for a in range(4):
+        for a in range(unknowns):
             at_u, at_v = weight_u * slopes[0, a], weight_v * slopes[1, a]
             right[a] += at_u * r0 + at_v * r1
             for b in range(a + 1):
@@ -161,13 +243,12 @@ def normal_equations(
 def photometry(
     star_table: NDArray[np.float64],
     seen: Table,
-    count: int,
     stars: NDArray[np.int64],
     scratch: NDArray[np.float64],
 ) -> tuple[float, float]:
     """Zero point (catalogue minus instrumental magnitude) and its scatter, robust, over the matches."""
     m = 0
-    for i in range(count):
+    for i in range(stars.shape[0]):
         if stars[i] >= 0:
             scratch[m] = star_table[stars[i], STAR_MAGNITUDE] - seen[i, MAGNITUDE]
             m += 1
@@ -183,14 +264,13 @@ def distances(
     star_table: NDArray[np.float64],
     seen: Table,
     rotation: NDArray[np.float64],
-    count: int,
     stars: NDArray[np.int64],
     scratch: NDArray[np.float64],
 ) -> tuple[float, float]:
     """Noise of a star of unit error from the median distance of the matches (Rayleigh), and their rms, px."""
     m = 0
     total = 0.0
-    for i in range(count):
+    for i in range(stars.shape[0]):
         if stars[i] >= 0:
             r0, r1, _, _, _ = residual(star_table, seen, rotation, i, stars[i])
             scratch[m] = math.sqrt((r0 / seen[i, SIGMA_U]) ** 2 + (r1 / seen[i, SIGMA_V]) ** 2)
@@ -265,7 +345,7 @@ def refine(
     size = 16
     while size < 4 * n:
         size *= 2
-    owners = np.empty(size, dtype=np.int64)
+    owners, refused = np.empty(size, dtype=np.int64), np.zeros(n, dtype=np.bool_)
     right, step = np.empty(4), np.zeros(4)
     free_scale = settings[SCALE_TOLERANCE] > 0.0
     unknowns = 4 if free_scale else 3
@@ -278,13 +358,13 @@ def refine(
     matched = 0
     for number in range(MAX_ROUNDS):
         matched = match_detections(
-            index, seen, rotation, n, (reach, sigma, gate, settings[PX_PER_RAD]),
+            index, seen, rotation, refused, (reach, sigma, gate, settings[PX_PER_RAD]),
             numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
         )  # fmt: skip
         if matched < least_matched:
             return 0
         stable = _same(stars, previous) and number > 0
-        chi2 = normal_equations(star_table, seen, rotation, n, stars, normal, right)
+        chi2 = normal_equations(star_table, seen, rotation, stars, unknowns, normal, right)
         if not solve_symmetric(normal, right, unknowns, step):
             return 0
         for k in range(unknowns):
@@ -296,15 +376,20 @@ def refine(
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom
         if stable:
-            break
+            worst = -1
+            if matched <= FEW_MATCHED:
+                worst = _outlier(star_table, seen, rotation, stars, normal, chi2, freedom, settings)
+            if worst < 0:
+                break
+            refused[worst] = True
         sigma = math.sqrt(numbers[VARIANCE])
         if number == 0:
             # wrong pairs may be among the first matches: robust estimates
-            sigma, _ = distances(star_table, seen, rotation, n, stars, scratch)
+            sigma, _ = distances(star_table, seen, rotation, stars, scratch)
             sigma *= math.sqrt(2.0 * matched / freedom)
-            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, n, stars, scratch)
-            gate = min(gate, max(5.0 * numbers[SCATTER], 0.75))
+            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, stars, scratch)
+            gate = min(gate, max(5.0 * numbers[SCATTER], LEAST_GATE))
             reach = BY_NOISE
-    _, numbers[RMS] = distances(star_table, seen, rotation, n, stars, scratch)
+    _, numbers[RMS] = distances(star_table, seen, rotation, stars, scratch)
     numbers[SCALE_VARIANCE] = _marginalise(normal, scratch) if free_scale else 0.0
     return matched

@@ -24,6 +24,8 @@ from starid.answer import (
 from starid.jit_kernels import entry, inner
 from starid.observation import MAGNITUDE, Table, X, Y, Z, observe
 from starid.pattern_index import (
+    DEEP_LONGEST,
+    DEEP_SHORTEST,
     SHORTEST_SIDE,
     SIDE_BINS,
     SIDE_STEP,
@@ -73,11 +75,11 @@ def copy_corner(table: NDArray[np.float64], source: int, scale: float, frame: Ta
 
 @inner
 def make_frame(frame: Table) -> None:
-    """Turn three unit vectors (rows) into an orthonormal frame: sum, first − second made normal to it, third."""
+    """Turn three unit vectors (rows) into an orthonormal frame: sum, second − third made normal to it, normal."""
     along, square_sum, square_side = 0.0, 0.0, 0.0
     for axis in range(3):
         total = frame[0, axis] + frame[1, axis] + frame[2, axis]
-        frame[1, axis] = frame[0, axis] - frame[1, axis]
+        frame[1, axis] = frame[1, axis] - frame[2, axis]
         frame[0, axis] = total
         square_sum += total * total
         along += total * frame[1, axis]
@@ -103,6 +105,8 @@ def set_rotation(
     frames: NDArray[np.float64],
 ) -> None:
     """Fill ``frames[2]`` with the ICRS→sensor matrix that carries three stars into three detections.
+
+    The second and the third should be far apart: they give the roll.
 
     Parameters
     ----------
@@ -289,6 +293,8 @@ def identify_kernel(
                     break
                 drawing = True
                 tolerance *= DRAWN_TOLERANCE
+                shortest = index.numbers[DEEP_SHORTEST] / (1.0 + spread)
+                longest = index.numbers[DEEP_LONGEST] / (1.0 - spread)
                 chords = chord_table(given, choice)
         if drawing:
             state, i, j, k = _drawn(state, choice)

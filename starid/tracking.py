@@ -28,7 +28,7 @@ from starid.observation import MAGNITUDE, Table, observe
 from starid.pattern_index import (
     GRID_CELLS,
     GRID_MARGIN,
-    SHORTEST_SIDE,
+    DEEP_SHORTEST,
     STAR_MAGNITUDE,
     IndexArrays,
     chord,
@@ -101,7 +101,7 @@ def _try_pair(
     if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
         return 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
-    set_rotation(given, (i, j, j), 1.0, index.stars, (a, b, b), candidate.frames)
+    set_rotation(given, (i, i, j), 1.0, index.stars, (a, a, b), candidate.frames)
     _, bound = judged(index, given, settings, candidate, tests, (i, j, j), prior_volume)
     return bound
 
@@ -125,7 +125,7 @@ def _try_detections(
     """
     i, j = detections
     separation = chord(given, i, j)
-    if separation < index.numbers[SHORTEST_SIDE]:
+    if separation < index.numbers[DEEP_SHORTEST]:
         return 0.0
     for p in range(counts[i]):
         for q in range(counts[j]):

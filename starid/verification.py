@@ -65,6 +65,9 @@ NOISE_RANGE: Final = math.log(5.0 / 0.05)
 SHARES: Final = (0.2, 0.5, 0.9)
 """Shares of true stars among the detections that the Bayes factor is averaged over."""
 
+_SMALL: Final = 1e-150
+"""Beyond this, and its inverse, a product is turned into its logarithm."""
+
 SCATTER_FLOOR: Final = 0.15
 """Least scatter of magnitudes believed in the judgement."""
 
@@ -191,7 +194,7 @@ def _log_detections(
     cell = cell_of(rotation[2, 0], rotation[2, 1], rotation[2, 2], COUNT_CELLS)
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
     deviation_of_one = math.sqrt(numbers[VARIANCE])
-    totals = np.zeros(len(SHARES))
+    totals, products = np.zeros(len(SHARES)), np.ones(len(SHARES))
     for i in range(stars.shape[0]):
         gain = 0.0
         star = stars[i]
@@ -205,7 +208,12 @@ def _log_detections(
             weight = min(brightness / _stars_per_magnitude(counts, cell, magnitude), 1.0)
             gain = field_px * weight * here
         for k in range(len(SHARES)):
-            totals[k] += math.log(1.0 - SHARES[k] + SHARES[k] * gain)
+            products[k] *= 1.0 - SHARES[k] + SHARES[k] * gain
+            if not _SMALL < products[k] < 1.0 / _SMALL:
+                totals[k] += math.log(products[k])
+                products[k] = 1.0
+    for k in range(len(SHARES)):
+        totals[k] += math.log(products[k])
     best = totals[0]
     for k in range(1, len(SHARES)):
         best = max(best, totals[k])
