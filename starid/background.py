@@ -54,40 +54,33 @@ class Background:
 
 @compiled_sums
 def _refine(
-    values: npt.NDArray[np.float32], columns: int, start: tuple[float, float], plane: npt.NDArray[np.float32]
+    values: npt.NDArray[np.float32],
+    dx: npt.NDArray[np.float32],
+    dy: npt.NDArray[np.float32],
+    start: tuple[float, float],
+    plane: npt.NDArray[np.float32],
 ) -> None:
-    """Plane through the samples of a block without its stars: (level, slope along, slope across rows, noise).
+    """Plane through the samples of a block without its stars: (level, slopes by dx and dy, noise).
 
-    `values` are whole rows of `columns` pixels; samples farther than 3.5 sigmas from the plane are left out, half a
-    count more being allowed, so that rounding to counts does not make the interval lopsided.
+    Samples farther than 3.5 sigmas from the plane are left out, half a count more being allowed, so that rounding to
+    counts does not make the interval lopsided. The places `dx`, `dy` are measured from their mean.
     """
-    rows = values.size // columns
     level, sigma = np.float32(start[0]), np.float32(start[1])
     along = across = np.float32(0.0)
-    middle = np.float32(0.5 * (columns - 1))
-    half = np.float32(0.5 * (rows - 1))
     for _ in range(_ROUNDS):
         reach = np.float32(_CLIP_SIGMA) * sigma + np.float32(0.5)
         kept = total = squares = tilt = tilt2 = lean = lean2 = np.float32(0.0)
-        for row in range(rows):
-            dy = np.float32(row) - half
-            base = level + across * dy
-            line = values[row * columns : (row + 1) * columns]
-            row_kept = row_total = np.float32(0.0)
-            for k in range(columns):
-                dx = np.float32(k) - middle
-                off = line[k] - base - along * dx
-                inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
-                off *= inside
-                row_kept += inside
-                row_total += off
-                squares += off * off
-                tilt += off * dx
-                tilt2 += inside * dx * dx
-            kept += row_kept
-            total += row_total
-            lean += row_total * dy
-            lean2 += row_kept * dy * dy
+        for k in range(values.size):
+            off = values[k] - level - along * dx[k] - across * dy[k]
+            inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
+            off *= inside
+            kept += inside
+            total += off
+            squares += off * off
+            tilt += off * dx[k]
+            tilt2 += inside * dx[k] * dx[k]
+            lean += off * dy[k]
+            lean2 += inside * dy[k] * dy[k]
         if kept < np.float32(_LEAST_SAMPLES):
             break
         mean = total / kept
@@ -104,6 +97,17 @@ def _refine(
 
 
 @compiled_loops
+def _sample_places(
+    columns: int, count: int, dx: npt.NDArray[np.float32], dy: npt.NDArray[np.float32]
+) -> None:
+    """Places of the samples of a block from their mean, pixels: every fourth row, all its columns."""
+    middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (count // columns - 1)
+    for k in range(count):
+        dx[k] = np.float32(k % columns - middle_x)
+        dy[k] = np.float32((k // columns - middle_y) * _ROW_STEP)
+
+
+@compiled_loops
 def _block_statistics(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     block: int,
@@ -114,6 +118,9 @@ def _block_statistics(
     height, width = image.shape
     first = np.empty(_FIRST_SAMPLES, np.int32)
     values = np.empty(block * block, np.float32)
+    dx = np.empty(block * block, np.float32)
+    dy = np.empty(block * block, np.float32)
+    laid = (0, 0)
     plane = np.empty(4, np.float32)
     for row in range(level.shape[0]):
         for column in range(level.shape[1]):
@@ -137,13 +144,17 @@ def _block_statistics(
                     j -= 1
                 first[j + 1] = key
             spread = (first[(3 * chosen) // 4] - first[chosen // 4]) / _QUARTILE_SIGMA
-            _refine(values[:count], columns, (float(first[chosen // 2]), max(spread, 0.5)), plane)
+            if laid != (columns, count):
+                laid = (columns, count)
+                _sample_places(columns, count, dx, dy)
+            start = (float(first[chosen // 2]), max(spread, 0.5))
+            _refine(values[:count], dx[:count], dy[:count], start, plane)
             # from the middle of the sampled pixels to the middle of the block's place on the grid
             first_row = top + column % _ROW_STEP
             last_row = first_row + _ROW_STEP * (count // columns - 1)
             off_y = (row + 0.5) * block - 0.5 - 0.5 * (first_row + last_row)
             off_x = (column + 0.5) * block - 0.5 - (left + 0.5 * (columns - 1))
-            level[row, column] = plane[0] + plane[1] * off_x + plane[2] * off_y / _ROW_STEP
+            level[row, column] = plane[0] + plane[1] * off_x + plane[2] * off_y
             noise[row, column] = plane[3]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.background import grid_place
-from starid.jit_loops import compiled_loops
+from starid.jit_loops import compiled_loops, compiled_sums
 
 INTEGER_TAPS_SUM: Final = 16
 """Sum of the integer filter's taps along one axis; a byte smoothed along both axes fills 16 bits then."""
@@ -23,8 +23,7 @@ _INTEGER_UP_TO_PX: Final = 1.3
 _SHARP_TAPS: Final = np.array([8, 4, 0], dtype=np.uint16)
 _SOFT_TAPS: Final = np.array([6, 4, 1], dtype=np.uint16)
 _LINE_STEP: Final = 4
-_BYTES: Final = 8
-_WORDS: Final = 4
+_GROUP: Final = 32
 _HALF_WIDTH_SIGMA: Final = 2.2
 _SQRT_HALF: Final = math.sqrt(0.5)
 
@@ -151,13 +150,11 @@ def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDA
 
 
 @compiled_loops
-def _mark(
-    row: npt.NDArray[np.float32], lines: npt.NDArray[np.float32], q: np.float32, above: npt.NDArray[np.uint8]
-) -> None:
-    """Mark what lies above the threshold between two lines of it."""
+def _between(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[np.float32]) -> None:
+    """Threshold of a row between two lines of it."""
     upper, lower = lines[0], lines[1]
-    for x in range(row.size):
-        above[x] = row[x] > upper[x] + q * (lower[x] - upper[x])
+    for x in range(limit.size):
+        limit[x] = upper[x] + q * (lower[x] - upper[x])
 
 
 @compiled_loops
@@ -179,6 +176,36 @@ def _is_top(
     return not ((a < x and row[a] >= value) or row[b] > value)
 
 
+@compiled_sums
+def _flag_groups(
+    row: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], flags: npt.NDArray[np.uint8]
+) -> None:
+    """Mark the groups of 32 pixels in which one lies above its limit."""
+    for group in range(flags.size):
+        start = group * _GROUP
+        most = np.float32(0.0)
+        for k in range(start, min(start + _GROUP, row.size)):
+            most = max(most, row[k] - limit[k])
+        flags[group] = most > np.float32(0.0)
+
+
+@compiled_sums
+def _flag_groups_integer(
+    row: npt.NDArray[np.uint16], limit: npt.NDArray[np.uint16], flags: npt.NDArray[np.uint8]
+) -> None:
+    """As `_flag_groups`, for 16-bit integers."""
+    whole = row.size // _GROUP
+    for group in range(whole):
+        start = group * _GROUP
+        most = np.uint16(0)
+        for k in range(_GROUP):
+            value, least = row[start + k], limit[start + k]
+            most = max(most, np.uint16(value - least) if value > least else np.uint16(0))
+        flags[group] = most > np.uint16(0)
+    if whole < flags.size:
+        flags[whole] = 1
+
+
 @compiled_loops
 def _peaks_of_row(
     y: int,
@@ -186,21 +213,19 @@ def _peaks_of_row(
     row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
     before: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
     after: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    above: npt.NDArray[np.uint8],
-    words: npt.NDArray[np.uint64],
+    limit: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
+    flags: npt.NDArray[np.uint8],
     count: int,
     peaks: npt.NDArray[np.int32],
     heights: npt.NDArray[np.float32],
 ) -> int:
-    """Add the peaks of row y, among the pixels that are marked, to the list; return how many there are now.
-
-    `words` is `above`, eight marks at a time, so that the empty stretches are passed over quickly.
-    """
-    for word in range(0, words.size, _WORDS):
-        if words[word] | words[word + 1] | words[word + 2] | words[word + 3] == 0:
+    """Add the peaks of row y above its limit, in the groups that are marked, to the list; return how many there are."""
+    for group in range(flags.size):
+        if flags[group] == 0:
             continue
-        for x in range(_BYTES * word, min(_BYTES * (word + _WORDS), row.size)):
-            if above[x] == 0 or not _is_top(row, before, after, x, y > 0, y < height - 1):
+        start = group * _GROUP
+        for x in range(start, min(start + _GROUP, row.size)):
+            if not row[x] > limit[x] or not _is_top(row, before, after, x, y > 0, y < height - 1):
                 continue
             if count == peaks.shape[0]:
                 return count
@@ -259,8 +284,8 @@ def find_peaks(
     padded = np.empty(width + 2 * reach, np.float32)
     smooth = np.empty((3, width), np.float32)
     lines = np.empty((2, width), np.float32)
-    above = np.zeros(-(-width // (_BYTES * _WORDS)) * _BYTES * _WORDS, np.uint8)
-    words = above.view(np.uint64)
+    limit = np.empty(width, np.float32)
+    flags = np.empty(-(-width // _GROUP), np.uint8)
     count = 0
     line = -1
     for y in range(height + 1):
@@ -271,8 +296,9 @@ def find_peaks(
             # row y − 1 has both neighbours now
             line, q = _set_lines(threshold, block, y - 1, line, lines)
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
-            _mark(row, lines, q, above)
-            count = _peaks_of_row(y - 1, height, row, before, after, above, words, count, peaks, heights)
+            _between(lines, q, limit)
+            _flag_groups(row, limit, flags)
+            count = _peaks_of_row(y - 1, height, row, before, after, limit, flags, count, peaks, heights)
     return count
 
 
@@ -287,15 +313,16 @@ def find_peaks_in_smooth(
     """As `find_peaks`, in an image (h, w) that has been smoothed already."""
     height, width = smooth.shape
     lines = np.empty((2, width), np.float32)
-    above = np.zeros(-(-width // (_BYTES * _WORDS)) * _BYTES * _WORDS, np.uint8)
-    words = above.view(np.uint64)
+    limit = np.empty(width, np.float32)
+    flags = np.empty(-(-width // _GROUP), np.uint8)
     count = 0
     line = -1
     for y in range(height):
         line, q = _set_lines(threshold, block, y, line, lines)
         before, after = smooth[max(y - 1, 0)], smooth[min(y + 1, height - 1)]
-        _mark(smooth[y], lines, q, above)
-        count = _peaks_of_row(y, height, smooth[y], before, after, above, words, count, peaks, heights)
+        _between(lines, q, limit)
+        _flag_groups(smooth[y], limit, flags)
+        count = _peaks_of_row(y, height, smooth[y], before, after, limit, flags, count, peaks, heights)
     return count
 
 
@@ -345,8 +372,7 @@ def find_peaks_in_bytes(
     smooth = np.empty((3, width), np.uint16)
     lines = np.empty((2, width), np.float32)
     limit = np.empty(width, np.uint16)
-    above = np.zeros(-(-width // (_BYTES * _WORDS)) * _BYTES * _WORDS, np.uint8)
-    words = above.view(np.uint64)
+    flags = np.empty(-(-width // _GROUP), np.uint8)
     scale = np.float32(INTEGER_TAPS_SUM**2)
     highest = np.float32(65535.0)
     count = 0
@@ -363,9 +389,8 @@ def find_peaks_in_bytes(
                     value = scale * (upper[x] + q * (lower[x] - upper[x]))
                     limit[x] = np.int32(min(max(value, np.float32(0.0)), highest))
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
-            for x in range(width):
-                above[x] = row[x] > limit[x]
-            count = _peaks_of_row(y - 1, height, row, before, after, above, words, count, peaks, heights)
+            _flag_groups_integer(row, limit, flags)
+            count = _peaks_of_row(y - 1, height, row, before, after, limit, flags, count, peaks, heights)
     for k in range(count):
         heights[k] /= scale
     return count

@@ -187,8 +187,9 @@ def shape_from_moments(
     mean, split = 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
     across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else float(np.median(mean - split))
     across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
-    length = trail_length(mean + split, across)
-    if float(np.median(length)) > _ROUND_BELOW_PX:
+    # a short trail of length L makes the split L²/24
+    if math.sqrt(24.0 * float(np.median(split))) > _ROUND_BELOW_PX:
+        length = trail_length(mean + split, across)
         angle = 0.5 * np.arctan2(2.0 * c_xy, c_xx - c_yy)
         trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         half = 0.5 * max(width, height)

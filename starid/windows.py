@@ -38,12 +38,16 @@ LARGEST_HALF_WIDTH: Final = 40
 MOST_SATURATED: Final = 400
 """Connected saturated pixels from which on an object is no star."""
 
+PATCH_REACH: Final = 40
+"""So far from its peak the saturated patch of a star reaches at most, pixels."""
+
 EXTENDED: Final = -1.0
 SEEN_BEFORE: Final = -2.0
 NO_ROOM: Final = -3.0
 ONE_PIXEL: Final = -4.0
 """Values of COLUMNS that say why a candidate has no window."""
 
+_MOST_PATCHES: Final = 1000
 _RING_PIXELS: Final = 48
 _RING_SHIFT_SIGMA: Final = 0.6
 _BLOCK_OF_MORE_THAN_SKY: Final = 1.5
@@ -119,40 +123,52 @@ def _saturated_patch(
     x: int,
     y: int,
     saturation: float,
-    visited: npt.NDArray[np.uint8],
+    seen: npt.NDArray[np.uint8],
     stack: npt.NDArray[np.int32],
     patch: npt.NDArray[np.float64],
-) -> int:
-    """Follow the connected saturated pixels from (x, y), marking them.
+) -> bool:
+    """Follow the connected saturated pixels from (x, y); False if there are too many, or too far, for a star.
 
-    Fills `patch` (3,) with their mean column and row and half their larger extent. Returns their number, −1 if the
-    pixel was visited before; counting stops at `MOST_SATURATED`.
+    Fills `patch` (7,) with their mean column and row, half their larger extent, and their first and last column and
+    row. `seen` is scratch of (2·PATCH_REACH + 1)².
     """
     height, width = image.shape
-    if visited[y, x] != 0:
-        return -1
-    visited[y, x] = 1
+    seen[:] = 0
+    seen[PATCH_REACH, PATCH_REACH] = 1
     stack[0, 0], stack[0, 1] = x, y
     waiting, count = 1, 0
     total_x = total_y = 0.0
     left, right, top, bottom = x, x, y, y
-    while waiting > 0 and count < MOST_SATURATED:
+    while waiting > 0:
         waiting -= 1
         column, row = stack[waiting, 0], stack[waiting, 1]
         count += 1
+        if count >= MOST_SATURATED or max(abs(column - x), abs(row - y)) >= PATCH_REACH:
+            return False
         total_x += column
         total_y += row
         left, right = min(left, column), max(right, column)
         top, bottom = min(top, row), max(bottom, row)
         for b in range(max(row - 1, 0), min(row + 2, height)):
             for a in range(max(column - 1, 0), min(column + 2, width)):
-                if visited[b, a] == 0 and image[b, a] >= saturation and waiting < stack.shape[0]:
-                    visited[b, a] = 1
+                i, j = a - x + PATCH_REACH, b - y + PATCH_REACH
+                if seen[j, i] == 0 and image[b, a] >= saturation and waiting < stack.shape[0]:
+                    seen[j, i] = 1
                     stack[waiting, 0], stack[waiting, 1] = a, b
                     waiting += 1
     patch[0], patch[1] = total_x / count, total_y / count
     patch[2] = 0.5 * (max(right - left, bottom - top) + 1)
-    return count
+    patch[3], patch[4], patch[5], patch[6] = left, right, top, bottom
+    return True
+
+
+@compiled_loops
+def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: int) -> bool:
+    """Whether a pixel lies in the box around a patch that was followed before."""
+    for k in range(count):
+        if patches[k, 3] <= column <= patches[k, 4] and patches[k, 5] <= row <= patches[k, 6]:
+            return True
+    return False
 
 
 @compiled_loops
@@ -252,22 +268,24 @@ def lay_windows(
     for k in range(_RING_PIXELS):
         circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
         circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
-    bright = False
-    for k in range(peaks.shape[0]):
-        bright = bright or image[peaks[k, 1], peaks[k, 0]] >= saturation
-    visited = np.zeros((height, width) if bright else (1, 1), np.uint8)
+    seen = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
     stack = np.empty((2 * MOST_SATURATED, 2), np.int32)
-    patch = np.zeros(3)
+    patches = np.empty((_MOST_PATCHES, 7))
+    patch_count = 0
     total = 0
     for k in range(peaks.shape[0]):
         window = windows[k]
         column, row = peaks[k, 0], peaks[k, 1]
+        patch = patches[patch_count]
         patch[0], patch[1], patch[2] = column, row, 0.0
         if image[row, column] >= saturation:
-            count = _saturated_patch(image, column, row, saturation, visited, stack, patch)
-            if count < 0 or count >= MOST_SATURATED:
-                window[COLUMNS] = SEEN_BEFORE if count < 0 else EXTENDED
+            if _in_patches(column, row, patches, patch_count):
+                window[COLUMNS] = SEEN_BEFORE
                 continue
+            if not _saturated_patch(image, column, row, saturation, seen, stack, patch):
+                window[COLUMNS] = EXTENDED
+                continue
+            patch_count = min(patch_count + 1, _MOST_PATCHES - 1)
         x, y, extra = patch[0], patch[1], patch[2]
         trail_x, trail_y = trail_at(flow, x, y, width, height)
         radius = light_radius(sigma, float(flux[k]), typical_noise)
