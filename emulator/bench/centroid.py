@@ -8,6 +8,7 @@ counts as unknown, the sky as known.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -208,7 +209,7 @@ def _compare(renderer: Renderer, frame: Frame, found: Detections) -> Array:
 def _rows(rate: float, table: Array) -> list[CentroidRow]:
     """Summarise the stars of one rate by magnitude."""
     rows = []
-    for low, high in zip(EDGES_V[:-1], EDGES_V[1:], strict=True):
+    for low, high in itertools.pairwise(EDGES_V):
         chosen = table[(table[:, 0] >= low) & (table[:, 0] < high)]
         seen = chosen[chosen[:, 1] > 0.0]
         if len(seen) == 0:
