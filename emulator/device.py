@@ -93,7 +93,10 @@ class Device:
         self.clock = clock
         self.scheduler = Scheduler()
         self.time = DeviceTime(clock)
-        self.parameters = Parameters(icd, profile_defaults(profile, icd))
+        try:
+            self.parameters = Parameters(icd, profile_defaults(profile, icd))
+        except EmulatorError as error:
+            raise EmulatorError(f"profile {profile.source}: {error}") from None
         self.counters = Counters()
         self.acknowledge = Acknowledge()
         self.modes = Modes(self._mode_changed)

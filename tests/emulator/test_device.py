@@ -616,3 +616,16 @@ def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
 
 def test_unsolicited_telemetry_needs_a_row(bench):
     assert bench.command("set_unsolicited", telemetry=200, rate=1.0) is ErrorCode.INVALID_PARAMETER
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"exposure": 1e9}, "profile bench: parameters.exposure: 1e+09 is outside"),
+        ({"nope": 1}, "profile bench: parameters: no parameter named 'nope'"),
+    ],
+)
+def test_a_bad_default_is_refused_with_the_name_of_its_profile(make_bench, given, said):
+    with pytest.raises(EmulatorError) as refusal:
+        make_bench(Profile(name="bench", parameters=given))
+    assert str(refusal.value).startswith(said)
