@@ -26,9 +26,9 @@ from starid.jit_kernels import entry, inner
 from starid.matching import to_sky
 from starid.observation import MAGNITUDE, Table, observe
 from starid.pattern_index import (
+    DEEP_SHORTEST,
     GRID_CELLS,
     GRID_MARGIN,
-    DEEP_SHORTEST,
     STAR_MAGNITUDE,
     IndexArrays,
     chord,
