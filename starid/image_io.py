@@ -148,14 +148,15 @@ def _decode(source: Path, content: bytes) -> NDArray[Any]:
     """Pixels (height, width) or (height, width, channels) as they are stored."""
     import cv2
 
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    log: Any = getattr(cv2.utils, "logging", cv2)  # its place since OpenCV 5
+    level = log.getLogLevel()
+    log.setLogLevel(0)
     try:
         pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise StaridError(f"image {source}: cannot be decoded ({error.err}); convert it to PNG") from None
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        log.setLogLevel(level)
     if pixels is None or pixels.size == 0:
         raise _truncated(source)
     return np.asarray(pixels)
