@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.jit_kernels import inner
-from starid.observation import SIGMA_U, SIGMA_V, SOURCE, Table, rescale
+from starid.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
 from starid.pattern_index import IndexArrays
 from starid.refinement import (
     NUMBERS,
@@ -86,6 +86,7 @@ def new_candidate(count: int) -> Candidate:
 @inner
 def judged(
     index: IndexArrays,
+    raw: Raw,
     given: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
@@ -116,19 +117,18 @@ def judged(
     rotation, numbers = candidate.frames[2], candidate.numbers
     faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
     odds, order = tests
-    if not worth_refining(index, given, rotation, numbers[SCALE], faintest, settings, odds, order, used):
+    if not worth_refining(
+        index, raw.params, given, rotation, numbers[SCALE], faintest, settings, odds, order, used
+    ):
         return 0, 0.0
+    seen = np.empty_like(given) if settings[SCALE_TOLERANCE] > 0.0 else given
     matched = refine(
-        index, given, settings, LEAST_MATCHED, rotation, candidate.stars, candidate.normal, numbers
+        index, raw, given, settings, LEAST_MATCHED, seen, rotation, candidate.stars, candidate.normal, numbers
     )
     if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
         return 0, 0.0
-    seen = given
-    if settings[SCALE_TOLERANCE] > 0.0:
-        if abs(math.log(numbers[SCALE])) > 1.5 * settings[SCALE_TOLERANCE]:
-            return 0, 0.0
-        seen = np.empty_like(given)
-        rescale(given, numbers[SCALE], seen)
+    if abs(math.log(numbers[SCALE])) > 1.5 * settings[SCALE_TOLERANCE]:
+        return 0, 0.0
     bound = log_false_probability(
         index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior_volume
     )

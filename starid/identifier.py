@@ -54,6 +54,9 @@ from starid.tracking import track_kernel
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
 WIDEST_TOLERANCE: Final = 0.3
+_QUICK_TRIANGLES: Final = 60
+"""Triangles tried at each of several focal lengths before any gets the whole effort."""
+
 _SCALE_ERROR: Final = 0.012
 """Difference of scale across the field that the look-up of triangles bears."""
 
@@ -217,21 +220,27 @@ class Identifier:
         numbers: NDArray[np.float64],
         begin: float,
     ) -> Solution:
-        """Try focal lengths from the nominal one outward, each with its share of the tolerance."""
-        lateral2 = math.tan(min(self._camera.field_radius_rad, 1.4)) ** 2
-        steps = math.ceil(self._fov_tolerance * lateral2 / _SCALE_ERROR)
+        """Try focal lengths from the nominal one outward, each with its share of the tolerance.
+
+        All of them get a little effort before any gets the whole.
+        """
+        steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
         share = self._fov_tolerance / (2 * steps - 1)
         numbers = numbers.copy()
         numbers[SCALE_TOLERANCE] = share
+        cameras = [
+            scaled_camera(self._camera, 1.0 + 2.0 * share * step)
+            for step in sorted(range(1 - steps, steps), key=abs)
+        ]
         solution = Solution.invalid(Reason.NO_MATCH)
-        for step in sorted(range(1 - steps, steps), key=abs):
-            camera = scaled_camera(self._camera, 1.0 + 2.0 * share * step)
-            answer = identify_kernel(self._index, camera.params, xy, brightness, sigmas, numbers)
-            solution = self._solution(answer, "lost_in_space", begin)
-            if solution.valid:
-                return dataclasses.replace(
-                    solution, camera=scaled_camera(camera, 1.0 / float(answer.numbers[3]))
-                )
+        for triangles in (_QUICK_TRIANGLES, self._effort.max_triangles):
+            numbers[MAX_TRIANGLES] = triangles
+            for camera in cameras:
+                answer = identify_kernel(self._index, camera.params, xy, brightness, sigmas, numbers)
+                solution = self._solution(answer, "lost_in_space", begin)
+                if solution.valid:
+                    found = scaled_camera(camera, 1.0 / float(answer.numbers[3]))
+                    return dataclasses.replace(solution, camera=found)
         return solution
 
     def track(
@@ -318,6 +327,14 @@ class Identifier:
             mode=mode,
             elapsed=time.perf_counter() - begin,
         )
+
+
+def _scale_variation(camera: Camera) -> float:
+    """How differently the sides of triangles scale across the field, per relative change of the focal length."""
+    angle = min(camera.field_radius_rad, 0.5 * math.pi)
+    if camera.model == "pinhole":
+        return 2.0 * math.sin(angle) ** 2
+    return 1.0 - angle / math.tan(angle)
 
 
 def scaled_camera(camera: Camera, factor: float) -> Camera:

@@ -24,6 +24,8 @@ from starid.matching import (
 )
 from starid.observation import (
     MAGNITUDE,
+    OFFSET_U,
+    OFFSET_V,
     SIGMA_U,
     SIGMA_V,
     U_X,
@@ -32,11 +34,9 @@ from starid.observation import (
     V_X,
     V_Y,
     V_Z,
+    Raw,
     Table,
-    X,
-    Y,
-    Z,
-    rescale,
+    observe_again,
 )
 from starid.pattern_index import STAR_MAGNITUDE, IndexArrays
 from starid.settings import (
@@ -133,17 +133,14 @@ def solve_symmetric(
 def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: NDArray[np.float64]) -> None:
     """Fill (2, 4) with how the predicted position of detection i moves with turn and scale.
 
-    For a turn v it moves by G (c × v), c = (x, y, z) being the star in the sensor; for the logarithm of the
-    scale by −G du/dln(scale).
+    For a turn v it moves by G (c × v), c = (x, y, z) being the star in the sensor; a larger scale, a shorter
+    focal length, draws it to the centre.
     """
     ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
     vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
-    dx, dy, dz = seen[i, X], seen[i, Y], seen[i, Z]
-    lateral2 = dx * dx + dy * dy
     slopes[0, 0], slopes[0, 1], slopes[0, 2] = uy * z - uz * y, uz * x - ux * z, ux * y - uy * x
     slopes[1, 0], slopes[1, 1], slopes[1, 2] = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
-    slopes[0, 3] = uz * dz * lateral2 - (ux * dx + uy * dy) * (1.0 - lateral2)
-    slopes[1, 3] = vz * dz * lateral2 - (vx * dx + vy * dy) * (1.0 - lateral2)
+    slopes[0, 3], slopes[1, 3] = -seen[i, OFFSET_U], -seen[i, OFFSET_V]
 
 
 @inner
@@ -309,9 +306,11 @@ def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> f
 @inner
 def refine(
     index: IndexArrays,
+    raw: Raw,
     given: Table,
     settings: NDArray[np.float64],
     least_matched: int,
+    seen: Table,
     rotation: NDArray[np.float64],
     stars: NDArray[np.int64],
     normal: NDArray[np.float64],
@@ -321,10 +320,12 @@ def refine(
 
     Parameters
     ----------
-    given : Table
-        Detections under the nominal focal length.
+    raw, given
+        Detections as the caller gave them, and sorted (`observe`).
     least_matched : int
         Fewer matches are a failure.
+    seen : Table
+        Where the focal length is free: filled with the detections under the refined one. Else `given`.
     rotation : ndarray (3, 3)
         ICRS→sensor; coarse on entry, refined on return.
     stars : ndarray (n,) int64
@@ -349,10 +350,8 @@ def refine(
     right, step = np.empty(4), np.zeros(4)
     free_scale = settings[SCALE_TOLERANCE] > 0.0
     unknowns = 4 if free_scale else 3
-    seen = given
     if free_scale:
-        seen = np.empty_like(given)
-        rescale(given, numbers[SCALE], seen)
+        observe_again(raw, given, numbers[SCALE], seen)
     gate, numbers[SCATTER] = settings[MAGNITUDE_GATE], settings[MAGNITUDE_GATE]
     reach, sigma = settings[WINDOW], 1.0
     matched = 0
@@ -372,7 +371,7 @@ def refine(
         turn(rotation, step[0], step[1], step[2])
         if free_scale:
             numbers[SCALE] *= math.exp(step[3])
-            rescale(given, numbers[SCALE], seen)
+            observe_again(raw, given, numbers[SCALE], seen)
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom
         if stable:

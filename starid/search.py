@@ -22,7 +22,7 @@ from starid.answer import (
     new_candidate,
 )
 from starid.jit_kernels import entry, inner
-from starid.observation import MAGNITUDE, Table, X, Y, Z, observe
+from starid.observation import MAGNITUDE, Raw, Table, X, Y, Z, observe, scaled
 from starid.pattern_index import (
     DEEP_LONGEST,
     DEEP_SHORTEST,
@@ -36,6 +36,7 @@ from starid.pattern_index import (
     handedness,
     sorted_triangle,
 )
+from starid.projection import MODEL
 from starid.refinement import SCALE, ZERO_POINT
 from starid.settings import (
     ACCEPTED,
@@ -66,11 +67,13 @@ _SEED: Final = 88172645463325252
 
 
 @inner
-def copy_corner(table: NDArray[np.float64], source: int, scale: float, frame: Table, row: int) -> None:
-    """Copy a unit vector to a row of a frame, its first two components times `scale` (and unit length again)."""
-    x, y, z = table[source, X] * scale, table[source, Y] * scale, table[source, Z]
-    norm = 1.0 / math.sqrt(x * x + y * y + z * z) if scale != 1.0 else 1.0
-    frame[row, 0], frame[row, 1], frame[row, 2] = x * norm, y * norm, z * norm
+def copy_corner(
+    table: NDArray[np.float64], source: int, model: float, scale: float, frame: Table, row: int
+) -> None:
+    """Copy a unit vector to a row of a frame, as seen with the focal length divided by `scale`."""
+    frame[row, 0], frame[row, 1], frame[row, 2] = scaled(
+        model, table[source, X], table[source, Y], table[source, Z], scale
+    )
 
 
 @inner
@@ -99,6 +102,7 @@ def make_frame(frame: Table) -> None:
 def set_rotation(
     given: Table,
     detections: tuple[int, int, int],
+    model: float,
     scale: float,
     star_table: NDArray[np.float64],
     stars: tuple[int, int, int],
@@ -110,15 +114,15 @@ def set_rotation(
 
     Parameters
     ----------
-    scale : float
-        Factor on the tangents of the detections' directions.
+    model, scale : float
+        Model of the camera, and by what its focal length is to be divided.
     frames : ndarray (3, 3, 3)
         The other two are workspace: the frame of the detections, and that of the stars.
     """
     sensor, sky = frames[0], frames[1]
     for row in range(3):
-        copy_corner(given, detections[row], scale, sensor, row)
-        copy_corner(star_table, stars[row], 1.0, sky, row)
+        copy_corner(given, detections[row], model, scale, sensor, row)
+        copy_corner(star_table, stars[row], model, 1.0, sky, row)
     make_frame(sensor)
     make_frame(sky)
     for i in range(3):
@@ -180,6 +184,7 @@ def _look_up(
 @inner
 def _try_patterns(
     index: IndexArrays,
+    raw: Raw,
     given: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
@@ -214,8 +219,8 @@ def _try_patterns(
         numbers[ZERO_POINT], numbers[SCALE] = zero_point, 1.0
         if spread > 0.0:
             numbers[SCALE] = patterns[pattern, 0] * index.numbers[SIDE_STEP] / longest_side
-        set_rotation(given, corners, numbers[SCALE], stars, (a, b, c), frames)
-        _, bound = judged(index, given, settings, candidate, tests, corners, ROTATIONS)
+        set_rotation(given, corners, raw.params[MODEL], numbers[SCALE], stars, (a, b, c), frames)
+        _, bound = judged(index, raw, given, settings, candidate, tests, corners, ROTATIONS)
         if bound < settings[LOG_CHANCE]:
             return bound
     return 0.0
@@ -267,7 +272,8 @@ def identify_kernel(
     settings: NDArray[np.float64],
 ) -> Answer:
     """Find the attitude of a set of detections without knowing anything of it."""
-    given = observe(params, xy, flux, sigmas)
+    raw = Raw(params, xy, flux, sigmas)
+    given = observe(raw)
     n = given.shape[0]
     candidate = new_candidate(n)
     tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
@@ -310,7 +316,7 @@ def identify_kernel(
         )
         if count > 0:
             candidates += count
-            bound = _try_patterns(index, given, settings, candidate, tests, (a, b, c), s0, found, count)
+            bound = _try_patterns(index, raw, given, settings, candidate, tests, (a, b, c), s0, found, count)
             if bound < 0.0:
                 status = ACCEPTED
                 break

@@ -24,7 +24,7 @@ from starid.answer import (
 )
 from starid.jit_kernels import entry, inner
 from starid.matching import to_sky
-from starid.observation import MAGNITUDE, Table, observe
+from starid.observation import MAGNITUDE, Raw, Table, observe
 from starid.pattern_index import (
     DEEP_SHORTEST,
     GRID_CELLS,
@@ -33,6 +33,7 @@ from starid.pattern_index import (
     IndexArrays,
     chord,
 )
+from starid.projection import MODEL
 from starid.refinement import SCALE, ZERO_POINT
 from starid.search import set_rotation
 from starid.settings import (
@@ -85,6 +86,7 @@ def _stars_near(
 @inner
 def _try_pair(
     index: IndexArrays,
+    raw: Raw,
     given: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
@@ -101,14 +103,15 @@ def _try_pair(
     if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
         return 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
-    set_rotation(given, (i, i, j), 1.0, index.stars, (a, a, b), candidate.frames)
-    _, bound = judged(index, given, settings, candidate, tests, (i, j, j), prior_volume)
+    set_rotation(given, (i, i, j), raw.params[MODEL], 1.0, index.stars, (a, a, b), candidate.frames)
+    _, bound = judged(index, raw, given, settings, candidate, tests, (i, j, j), prior_volume)
     return bound
 
 
 @inner
 def _try_detections(
     index: IndexArrays,
+    raw: Raw,
     given: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
@@ -134,7 +137,7 @@ def _try_detections(
             if a == b or abs(chord(index.stars, a, b) - separation) > settings[SEARCH_TOLERANCE]:
                 continue
             work[1] += 1
-            bound = _try_pair(index, given, settings, candidate, tests, detections, (a, b), prior_volume)
+            bound = _try_pair(index, raw, given, settings, candidate, tests, detections, (a, b), prior_volume)
             if bound < settings[LOG_CHANCE_TRACKING]:
                 return bound
     return 0.0
@@ -160,7 +163,8 @@ def track_kernel(
     window_rad : float
         Largest angle of a star from where the prediction puts it.
     """
-    given = observe(params, xy, flux, sigmas)
+    raw = Raw(params, xy, flux, sigmas)
+    given = observe(raw)
     n = given.shape[0]
     candidate = new_candidate(n)
     tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
@@ -175,7 +179,7 @@ def track_kernel(
         counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
         for i in range(j):
             bound = _try_detections(
-                index, given, settings, candidate, tests, (i, j), near, counts, prior_volume, work
+                index, raw, given, settings, candidate, tests, (i, j), near, counts, prior_volume, work
             )
             if bound < 0.0:
                 status = ACCEPTED

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from starid.jit_kernels import inner
 from starid.matching import residual
-from starid.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z
+from starid.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.pattern_index import (
     BINS_PER_MAGNITUDE,
     COUNT_CELLS,
@@ -37,6 +37,7 @@ from starid.pattern_index import (
     IndexArrays,
     magnitude_bin,
 )
+from starid.projection import MODEL
 from starid.refinement import SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
 from starid.settings import FIELD_PX, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
 from starid.sky_grid import cell_of
@@ -102,6 +103,7 @@ def test_order(count: int) -> NDArray[np.int64]:
 @inner
 def worth_refining(
     index: IndexArrays,
+    params: NDArray[np.float64],
     given: Table,
     rotation: NDArray[np.float64],
     scale: float,
@@ -115,8 +117,10 @@ def worth_refining(
 
     Parameters
     ----------
+    params : ndarray
+        The camera.
     scale : float
-        Factor on the tangents of the directions (1 where the focal length is known).
+        By which its focal length is to be divided (1 where it is known).
     faintest_offset : float
         Catalogue minus instrumental magnitude that a true star can have at most.
     odds : ndarray
@@ -141,13 +145,10 @@ def worth_refining(
             place = 0
         if i == used[0] or i == used[1] or i == used[2]:
             continue
-        u, v, w = given[i, X] * scale, given[i, Y] * scale, given[i, Z]
+        u, v, w = scaled(params[MODEL], given[i, X], given[i, Y], given[i, Z], scale)
         x = rotation[0, 0] * u + rotation[1, 0] * v + rotation[2, 0] * w
         y = rotation[0, 1] * u + rotation[1, 1] * v + rotation[2, 1] * w
         z = rotation[0, 2] * u + rotation[1, 2] * v + rotation[2, 2] * w
-        if scale != 1.0:
-            norm = 1.0 / math.sqrt(x * x + y * y + z * z)
-            x, y, z = x * norm, y * norm, z * norm
         faintest = given[i, MAGNITUDE] + faintest_offset
         cell = cell_of(x, y, z, cells)
         hit = False
