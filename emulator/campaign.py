@@ -22,7 +22,7 @@ from emulator.errors import EmulatorError
 from starid.attitude import Attitude, random_attitude
 
 if TYPE_CHECKING:
-    from emulator.sensor import Renderer
+    from emulator.imaging.sensor import Renderer
     from starid.interface import StarIdentifier
     from starid.solution import Solution
 
@@ -134,7 +134,7 @@ class FrameMaker:
     """What one process needs to make and solve the frames of a plan; made once a process."""
 
     def __init__(self, plan: CampaignPlan) -> None:
-        from emulator.sensor import Renderer, SensorModel
+        from emulator.imaging.sensor import Renderer, SensorModel
         from starid.camera import Camera
         from starid.catalog import load_catalog
         from starid.interface import make_identifier

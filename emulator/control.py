@@ -17,7 +17,7 @@ given, comes back in the answer. An answer has `ok`; where that is false, `error
 ``quit``                  end the emulator as SIGTERM does
 ========================  =======================================================================================
 
-Faults: `optical` = fields of `emulator.sky_objects.SkyObjects` (false_stars, missing_stars, moon, …) or blocked_share; `device` = stuck (requests are
+Faults: `optical` = fields of `emulator.imaging.sky_objects.SkyObjects` (false_stars, missing_stars, moon, …) or blocked_share; `device` = stuck (requests are
 neither taken nor answered), error (a name of the enumeration `device_error`: enter the error mode), reset (a name of `reset_cause`:
 restart now); `serial` and `can` = drop, corrupt, junk (chances 0 … 1), delay_s, split (bytes a piece, serial only), gap_s.
 """
@@ -35,14 +35,14 @@ import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from emulator.clock import NANOSECONDS
-from emulator.cycle import Measurement, as_quaternion
+from emulator.device.cycle import Measurement, as_quaternion
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
 from emulator.profile import explain
-from emulator.truth import TruthState
-from emulator.truth_config import FixedConfig, TruthConfig
-from emulator.truth_live import LiveTruth
-from emulator.truth_log import compare
+from emulator.truth.config import FixedConfig, TruthConfig
+from emulator.truth.live import LiveTruth
+from emulator.truth.log import compare
+from emulator.truth.source import TruthState
 from protocol.errors import ProtocolError
 from starid.errors import StaridError
 

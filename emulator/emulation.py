@@ -13,24 +13,24 @@ from typing import TYPE_CHECKING, Final
 
 from emulator.clock import Clock, SteppedClock, make_clock
 from emulator.control import ControlServer
-from emulator.cycle import Measurement
-from emulator.device import Background, Device, do_at_once
+from emulator.device.cycle import Measurement
+from emulator.device.device import Background, Device, do_at_once
+from emulator.device.modes import Mode
+from emulator.device.state_store import FileStore, MemoryStore, StateStore
 from emulator.errors import EmulatorError
 from emulator.faults import Faults
-from emulator.frames import PipelineSetup, Warm
-from emulator.imager import ProcessImager, ThreadImager
+from emulator.imaging.frames import PipelineSetup, Warm
+from emulator.imaging.imager import ProcessImager, ThreadImager
+from emulator.imaging.worker_process import WorkerProcess
 from emulator.links.can import CanLink
 from emulator.links.serial import SerialLink
-from emulator.modes import Mode
 from emulator.profile import Profile
 from emulator.pump import ClockPump, StepPump
 from emulator.scenario import load_scenario
-from emulator.state_store import FileStore, MemoryStore, StateStore
-from emulator.truth import TruthSource
-from emulator.truth_config import LiveConfig, TruthConfig
-from emulator.truth_live import LiveFeed, LiveTruth
-from emulator.truth_log import TruthLog
-from emulator.worker_process import WorkerProcess
+from emulator.truth.config import LiveConfig, TruthConfig
+from emulator.truth.live import LiveFeed, LiveTruth
+from emulator.truth.log import TruthLog
+from emulator.truth.source import TruthSource
 from protocol.icd import InterfaceDefinition, load_icd
 from protocol.values import Value
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import AfterValidator, Field
 
 from emulator.errors import EmulatorError
+from emulator.imaging.sky_objects import SkyObjects
 from emulator.links.wire_faults import WireFaultSettings
-from emulator.sky_objects import SkyObjects
-from emulator.truth_config import Strict
+from emulator.truth.config import Strict
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation

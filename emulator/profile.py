@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 
 from emulator.errors import EmulatorError
-from emulator.truth_config import FixedConfig, Strict, TruthConfig
+from emulator.truth.config import FixedConfig, Strict, TruthConfig
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_DEPTH: Final = 8
@@ -138,9 +138,9 @@ class Profile(Strict):
     catalog: CatalogConfig = CatalogConfig()
     camera: CameraConfig = CameraConfig()
     sensor: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `emulator.sensor_model.SensorModel`, but for those that are parameters of the device."""
+    """Fields of `emulator.imaging.sensor_model.SensorModel`, but for those that are parameters of the device."""
     sky: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `emulator.sky_objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
+    """Fields of `emulator.imaging.sky_objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")

@@ -6,9 +6,9 @@ import asyncio
 from typing import Final
 
 from emulator.clock import NANOSECONDS, Clock, SteppedClock
+from emulator.device.scheduler import Scheduler
 from emulator.errors import EmulatorError
-from emulator.imager import Imager
-from emulator.scheduler import Scheduler
+from emulator.imaging.imager import Imager
 
 MAX_STEP_S: Final = 86_400.0
 LONGEST_SLEEP_S: Final = 3600.0

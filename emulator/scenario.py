@@ -29,7 +29,7 @@ from emulator.clock import NANOSECONDS
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
 from emulator.profile import configs_folder, explain
-from emulator.truth_config import LiveConfig, Strict, TruthConfig
+from emulator.truth.config import LiveConfig, Strict, TruthConfig
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation

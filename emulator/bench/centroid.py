@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from emulator.errors import EmulatorError
-from emulator.sensor import Frame, Renderer, SensorModel
+from emulator.imaging.sensor import Frame, Renderer, SensorModel
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

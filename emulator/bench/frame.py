@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.errors import EmulatorError
-from emulator.sensor import Renderer, SensorModel
+from emulator.imaging.sensor import Renderer, SensorModel
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

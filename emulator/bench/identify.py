@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.bench.peers import OWN, PEERS, Reply, Solver, make_solver, version_of
+from emulator.bench.scenes import Scene, SceneMaker, SceneSettings
 from emulator.errors import EmulatorError
-from emulator.scenes import Scene, SceneMaker, SceneSettings
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog

@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.bench.scenes import Scene
 from emulator.errors import EmulatorError
-from emulator.scenes import Scene
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.interface import make_identifier

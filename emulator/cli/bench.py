@@ -84,7 +84,7 @@ def centroid(
     from rich.table import Table
 
     from emulator.bench.centroid import DEFAULT_RATES_DEG_S, measure_centroids, plot_centroids
-    from emulator.sensor_model import SensorModel
+    from emulator.imaging.sensor_model import SensorModel
 
     progress = Console(stderr=True)
     sensor = SensorModel(bits=bits)

@@ -140,7 +140,7 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
     """The image with circles at identified stars, and other ones at detections without an identity."""
     import numpy as np
 
-    from emulator.annotate import annotate, star_label
+    from emulator.imaging.annotate import annotate, star_label
     from starid.catalog import load_catalog
 
     solution, found = result.solution, result.detections

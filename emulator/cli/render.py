@@ -12,7 +12,7 @@ import typer
 from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
-    from emulator.sensor import Frame, SensorModel
+    from emulator.imaging.sensor import Frame, SensorModel
     from starid.camera import Camera
 
 _NUMBERED_TO_MAGNITUDE = 3.6
@@ -48,7 +48,7 @@ def command(
     ] = False,
 ) -> None:
     """Render one frame of the sky; the same options give the same bytes."""
-    from emulator.sensor import Renderer
+    from emulator.imaging.sensor import Renderer
     from starid.attitude import Attitude
     from starid.catalog import load_catalog
     from starid.image_io import write_image
@@ -82,7 +82,7 @@ def _equipment(
     profile: str | None, fov: float | None, size: str | None, model: str | None
 ) -> tuple[Camera, SensorModel]:
     """Camera and sensor from a profile or the defaults, with the options put over them."""
-    from emulator.sensor_model import SensorModel
+    from emulator.imaging.sensor_model import SensorModel
     from starid.camera import Camera
 
     values: dict[str, Any] = {}
@@ -119,7 +119,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _marked(frame: Frame) -> Any:
     """Mark the stars of a frame: names and Hipparcos numbers for the bright ones."""
-    from emulator.annotate import annotate, star_label
+    from emulator.imaging.annotate import annotate, star_label
 
     stars = frame.stars
     labels = [

@@ -44,7 +44,7 @@ def command(
 
     One line on stdout, `ready serial=… can=… seed=…`, tells that it takes commands and where.
     """
-    from emulator.worker_process import WorkerProcess
+    from emulator.imaging.worker_process import WorkerProcess
 
     worker = WorkerProcess()  # first of all: it imports and warms up while this process does the rest
 

@@ -7,7 +7,7 @@ import logging
 from abc import ABC, abstractmethod
 from typing import Final, Generic, Protocol, TypeVar
 
-from emulator.device import Device
+from emulator.device.device import Device
 from emulator.links.wire_faults import Pieces, WireFaults
 from protocol.errors import ProtocolError
 from protocol.messages import LinkFault, Reply, Request

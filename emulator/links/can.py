@@ -7,7 +7,7 @@ import random
 from collections import deque
 from collections.abc import Sequence
 
-from emulator.device import Device
+from emulator.device.device import Device
 from emulator.links.base import DeviceLink
 from protocol.can_framing import (
     MAX_EXTENDED_ID,

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from emulator.clock import NANOSECONDS
-from emulator.cycle import Measurement
-from emulator.device import Device
+from emulator.device.cycle import Measurement
+from emulator.device.device import Device
+from emulator.device.modes import Mode, Transition
+from emulator.device.refusal import Refused
 from emulator.errors import EmulatorError
 from emulator.links.wire_faults import WireFaults
-from emulator.modes import Mode, Transition
-from emulator.refusal import Refused
 from protocol.can_framing import MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
 from protocol.canopen.abort import AbortCode, SdoAbortError
 from protocol.canopen.application import Picture, abort_of, check_status
@@ -34,7 +34,7 @@ from protocol.transports.base import Transport
 from protocol.values import MessageError, Value
 
 if TYPE_CHECKING:
-    from emulator.scheduler import Event
+    from emulator.device.scheduler import Event
     from protocol.errors import ProtocolError
 
 log = logging.getLogger("starhil.canopen")

@@ -6,7 +6,7 @@ import random
 from collections.abc import Sequence
 from typing import Final
 
-from emulator.device import Device
+from emulator.device.device import Device
 from emulator.links.base import DeviceLink
 from protocol.messages import Reply
 from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply

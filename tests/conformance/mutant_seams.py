@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from emulator.device import Device
+from emulator.device.device import Device
 from protocol.messages import FaultKind, Reply, Request
 from tests.conformance.simulated import SimulatedUnit
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from emulator.device import Device
+from emulator.device.device import Device
 from protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from tests.conformance.mutant_seams import (
     Damage,

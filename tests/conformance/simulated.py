@@ -9,15 +9,15 @@ from collections.abc import Callable
 from typing import Any, Self
 
 from emulator.clock import NANOSECONDS
-from emulator.device import Device
-from emulator.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
-from emulator.imager import Answer, Asked, DirectImager
+from emulator.device.device import Device
+from emulator.device.state_store import MemoryStore
+from emulator.imaging.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
+from emulator.imaging.imager import Answer, Asked, DirectImager
 from emulator.links.can import CanLink
 from emulator.links.serial import SerialLink
 from emulator.profile import Profile
 from emulator.pump import ClockPump
-from emulator.state_store import MemoryStore
-from emulator.truth import FixedTruth
+from emulator.truth.source import FixedTruth
 from hil_tests.conformance.can_probe import CanProbe
 from hil_tests.conformance.link_probe import ProbeTimes
 from hil_tests.conformance.serial_probe import SerialProbe

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from emulator.clock import SteppedClock
-from emulator.device import Device
-from emulator.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
-from emulator.imager import Answer, Asked, DirectImager
+from emulator.device.device import Device
+from emulator.device.state_store import MemoryStore, StateStore
+from emulator.imaging.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
+from emulator.imaging.imager import Answer, Asked, DirectImager
 from emulator.profile import Profile
-from emulator.state_store import MemoryStore, StateStore
-from emulator.truth import FixedTruth, TruthSource
+from emulator.truth.source import FixedTruth, TruthSource
 from protocol.icd import load_icd
 from protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starid.attitude import Attitude

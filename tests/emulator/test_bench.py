@@ -12,7 +12,7 @@ from emulator.bench.centroid import cramer_rao_px, measure_centroids
 from emulator.bench.frame import measure_frames
 from emulator.cli.app import main
 from emulator.errors import EmulatorError
-from emulator.sensor_model import SensorModel
+from emulator.imaging.sensor_model import SensorModel
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

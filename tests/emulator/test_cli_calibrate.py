@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from emulator.cli.app import main
-from emulator.sensor import render
+from emulator.imaging.sensor import render
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.camera_file import load_camera

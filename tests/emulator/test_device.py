@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from emulator.device import missing_handlers
+from emulator.device.device import missing_handlers
+from emulator.device.state_store import FileStore
+from emulator.device.telecommands import TELECOMMANDS
+from emulator.device.telemetry import TELEMETRY
 from emulator.errors import EmulatorError
 from emulator.profile import Profile
-from emulator.state_store import FileStore
-from emulator.telecommands import TELECOMMANDS
-from emulator.telemetry import TELEMETRY
-from emulator.truth import FixedTruth, RateTruth
+from emulator.truth.source import FixedTruth, RateTruth
 from protocol.icd import load_icd
 from protocol.messages import ErrorCode, ReplyKind, Request
 from starid.attitude import Attitude

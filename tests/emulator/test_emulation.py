@@ -9,12 +9,12 @@ import emulator.emulation
 from emulator.clock import SteppedClock
 from emulator.emulation import Emulation, RunOptions
 from emulator.errors import EmulatorError
-from emulator.frames import Warm
-from emulator.imager import DirectImager, ProcessImager
+from emulator.imaging.frames import Warm
+from emulator.imaging.imager import DirectImager, ProcessImager
 from emulator.profile import Profile, RunConfig, configs_folder
 from emulator.scenario import load_scenario
-from emulator.truth_file import read_truth_file
-from emulator.truth_log import COLUMNS
+from emulator.truth.file import read_truth_file
+from emulator.truth.log import COLUMNS
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
 ORION = {"ra_deg": 83.8, "dec_deg": -1.2}

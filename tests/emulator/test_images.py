@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from emulator.images import StoredImage
+from emulator.device.images import StoredImage
 from protocol.messages import ErrorCode, ReplyKind, Request
 
 

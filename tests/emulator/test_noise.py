@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from emulator.noise import Digitizer, digitize, fill_normal, lane_states
+from emulator.imaging.noise import Digitizer, digitize, fill_normal, lane_states
 
 SHAPE = (512, 512)
 FINE = Digitizer(read_noise_e=12.0, full_well_e=15000.0, gain_e_per_dn=0.1, offset_dn=2000.0, max_dn=65535)

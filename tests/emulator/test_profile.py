@@ -2,7 +2,7 @@ import pytest
 
 from emulator.errors import EmulatorError
 from emulator.profile import configs_folder, load_profile
-from emulator.truth_config import SlewConfig
+from emulator.truth.config import SlewConfig
 
 
 def write(tmp_path, text, name="mine.toml"):

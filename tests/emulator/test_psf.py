@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from emulator.psf import add_spots, path_rule
+from emulator.imaging.psf import add_spots, path_rule
 
 SIZE = 64
 

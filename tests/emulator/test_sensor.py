@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from emulator.errors import EmulatorError
-from emulator.fixed_pattern import make_fixed_pattern
-from emulator.sensor import Renderer, SensorModel, render
+from emulator.imaging.fixed_pattern import make_fixed_pattern
+from emulator.imaging.sensor import Renderer, SensorModel, render
 from starid.attitude import Attitude, random_attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from emulator.errors import EmulatorError
-from emulator.sensor import Renderer, SensorModel
-from emulator.sky_light import icrs_vector
-from emulator.sky_objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
+from emulator.imaging.sensor import Renderer, SensorModel
+from emulator.imaging.sky_light import icrs_vector
+from emulator.imaging.sky_objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import load_catalog

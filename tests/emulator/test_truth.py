@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.errors import EmulatorError
-from emulator.truth import (
+from emulator.truth.file import read_truth_file
+from emulator.truth.live import LiveTruth
+from emulator.truth.source import (
     FixedTruth,
     HoldSegment,
     RateSegment,
@@ -16,8 +18,6 @@ from emulator.truth import (
     SlewTruth,
     TruthStatus,
 )
-from emulator.truth_file import read_truth_file
-from emulator.truth_live import LiveTruth
 from starid.attitude import Attitude, propagate
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 30.0)

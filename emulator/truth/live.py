@@ -31,7 +31,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from emulator.errors import EmulatorError
-from emulator.truth import ZERO_RATE, TruthState, TruthStatus, Vector
+from emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
 from starid.attitude import Attitude, interpolate, propagate, rate_between
 
 HISTORY: Final = 512

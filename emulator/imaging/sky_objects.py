@@ -1,6 +1,6 @@
 """What else a star sensor sees, or does not see: bodies, stray light, hidden parts of the field, false and missing stars.
 
-All are plain values, so that profiles and tests can name them; how they look is in `emulator.sky_light`.
+All are plain values, so that profiles and tests can name them; how they look is in `emulator.imaging.sky_light`.
 """
 
 from __future__ import annotations

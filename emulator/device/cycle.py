@@ -15,13 +15,21 @@ from typing import Any, Final
 import numpy as np
 
 from emulator.clock import NANOSECONDS, DeviceTime
-from emulator.frames import ZERO, Failure, FrameRequest, FrameResult, Quaternion, SolverSettings, Triple
-from emulator.imager import Answer, Imager
-from emulator.modes import Mode
-from emulator.parameters import Parameters
+from emulator.device.modes import Mode
+from emulator.device.parameters import Parameters
+from emulator.device.scheduler import Event, Scheduler
+from emulator.imaging.frames import (
+    ZERO,
+    Failure,
+    FrameRequest,
+    FrameResult,
+    Quaternion,
+    SolverSettings,
+    Triple,
+)
+from emulator.imaging.imager import Answer, Imager
 from emulator.profile import TimingConfig
-from emulator.scheduler import Event, Scheduler
-from emulator.truth import FixedTruth, TruthSource, TruthState
+from emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
 
 MAX_PENDING: Final = 2

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from emulator.sensor_model import SensorModel
+from emulator.imaging.sensor_model import SensorModel
 
 _HOT_LOG_SPREAD: Final = 1.0
 

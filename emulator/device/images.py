@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
-from emulator.binning import mean_over_squares
 from emulator.clock import NANOSECONDS
-from emulator.cycle import FrameCycle
-from emulator.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
-from emulator.imager import Answer, Imager
-from emulator.scheduler import Scheduler
+from emulator.device.cycle import FrameCycle
+from emulator.device.scheduler import Scheduler
+from emulator.imaging.binning import mean_over_squares
+from emulator.imaging.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
+from emulator.imaging.imager import Answer, Imager
 from protocol.image_transfer import FRAME_SIZE
 
 STORE_S: Final = 0.1

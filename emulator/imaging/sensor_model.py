@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Self
 
 from emulator.errors import EmulatorError
-from emulator.noise import Digitizer
+from emulator.imaging.noise import Digitizer
 from starid.detection import DetectionSettings
 
 ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from emulator.clock import NANOSECONDS
-from emulator.cycle import as_quaternion
-from emulator.frames import ZERO, Quaternion, Triple
-from emulator.modes import Mode
+from emulator.device.cycle import as_quaternion
+from emulator.device.modes import Mode
+from emulator.imaging.frames import ZERO, Quaternion, Triple
 from starid.attitude import Attitude
 
 if TYPE_CHECKING:
-    from emulator.device import Device
-    from emulator.parameters import Parameters
+    from emulator.device.device import Device
+    from emulator.device.parameters import Parameters
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from emulator.clock import NANOSECONDS
-from emulator.cycle import Measurement, as_quaternion
+from emulator.device.cycle import Measurement, as_quaternion
 from emulator.errors import EmulatorError
 from starid.attitude import Attitude
 

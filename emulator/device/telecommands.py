@@ -10,16 +10,16 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from emulator.clock import NANOSECONDS
-from emulator.counters import Acknowledge
+from emulator.device.counters import Acknowledge
+from emulator.device.images import edge_of
+from emulator.device.modes import Mode
+from emulator.device.refusal import Refused
 from emulator.errors import EmulatorError
-from emulator.images import edge_of
-from emulator.modes import Mode
-from emulator.refusal import Refused
 from protocol.messages import FIRST_TELEMETRY_ID, ErrorCode, Reply
 from protocol.values import MessageError, Value
 
 if TYPE_CHECKING:
-    from emulator.device import Device
+    from emulator.device.device import Device
 
 Values: TypeAlias = dict[str, Value]
 Handler: TypeAlias = "Callable[[Device, Values, Acknowledge], list[Reply] | None]"

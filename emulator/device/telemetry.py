@@ -7,16 +7,16 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from emulator.clock import NANOSECONDS, split_unix
-from emulator.file_download import hole_map_values
-from emulator.frames import MatchedStar
-from emulator.refusal import Refused
-from emulator.reported import Reported, reported
+from emulator.device.file_download import hole_map_values
+from emulator.device.refusal import Refused
+from emulator.device.reported import Reported, reported
+from emulator.imaging.frames import MatchedStar
 from protocol.image_transfer import frame_checksum
 from protocol.messages import ErrorCode
 from protocol.values import Value
 
 if TYPE_CHECKING:
-    from emulator.device import Device
+    from emulator.device.device import Device
 
 Values: TypeAlias = dict[str, Value]
 

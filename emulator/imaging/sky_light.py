@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from emulator.sensor_model import SensorModel
-from emulator.sky_objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
+from emulator.imaging.sensor_model import SensorModel
+from emulator.imaging.sky_objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.jit_loops import compiled_loops

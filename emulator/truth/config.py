@@ -9,7 +9,9 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from emulator.truth import (
+from emulator.truth.file import read_truth_file
+from emulator.truth.live import LiveTruth
+from emulator.truth.source import (
     FixedTruth,
     HoldSegment,
     RateSegment,
@@ -19,8 +21,6 @@ from emulator.truth import (
     SlewTruth,
     TruthSource,
 )
-from emulator.truth_file import read_truth_file
-from emulator.truth_live import LiveTruth
 from starid.attitude import Attitude
 
 Rate: TypeAlias = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -162,7 +162,7 @@ class FileConfig(Strict):
 
 
 class LiveConfig(Strict):
-    """A feed of JSON lines, the message of `emulator.truth_live`."""
+    """A feed of JSON lines, the message of `emulator.truth.live`."""
 
     kind: Literal["live"]
     protocol: Literal["udp", "tcp"] = "udp"

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from emulator.errors import EmulatorError
-from emulator.fixed_pattern import make_fixed_pattern
-from emulator.noise import digitize
-from emulator.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
-from emulator.sensor_model import SOLAR_COLOUR_B_V, SensorModel
-from emulator.sky_light import AreaLight, AreaPainter, add_cosmic_rays, icrs_vector
-from emulator.sky_objects import PointSource, SkyObjects
+from emulator.imaging.fixed_pattern import make_fixed_pattern
+from emulator.imaging.noise import digitize
+from emulator.imaging.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
+from emulator.imaging.sensor_model import SOLAR_COLOUR_B_V, SensorModel
+from emulator.imaging.sky_light import AreaLight, AreaPainter, add_cosmic_rays, icrs_vector
+from emulator.imaging.sky_objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog

@@ -7,22 +7,22 @@ from collections.abc import Callable
 from typing import Final, TypeAlias
 
 from emulator.clock import NANOSECONDS, Clock, DeviceTime
-from emulator.counters import Acknowledge, Counters
-from emulator.cycle import FrameCycle, Measurement
+from emulator.device.counters import Acknowledge, Counters
+from emulator.device.cycle import FrameCycle, Measurement
+from emulator.device.file_download import FileDownload
+from emulator.device.images import ImageStore
+from emulator.device.modes import Mode, Modes, Transition
+from emulator.device.parameters import Parameters, ParameterValue
+from emulator.device.refusal import Refused
+from emulator.device.scheduler import Event, Scheduler
+from emulator.device.state_store import StateStore
+from emulator.device.telecommands import TELECOMMANDS
+from emulator.device.telemetry import TELEMETRY
 from emulator.errors import EmulatorError
-from emulator.file_download import FileDownload
-from emulator.frames import FrameRequest
-from emulator.imager import Imager
-from emulator.images import ImageStore
-from emulator.modes import Mode, Modes, Transition
-from emulator.parameters import Parameters, ParameterValue
+from emulator.imaging.frames import FrameRequest
+from emulator.imaging.imager import Imager
 from emulator.profile import LINK_PARAMETERS, Profile
-from emulator.refusal import Refused
-from emulator.scheduler import Event, Scheduler
-from emulator.state_store import StateStore
-from emulator.telecommands import TELECOMMANDS
-from emulator.telemetry import TELEMETRY
-from emulator.truth import TruthSource
+from emulator.truth.source import TruthSource
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
 from protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind

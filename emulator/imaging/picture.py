@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.binning import mean_over_squares
 from emulator.errors import EmulatorError
-from emulator.frames import (
+from emulator.imaging.binning import mean_over_squares
+from emulator.imaging.frames import (
     Failure,
     FrameRequest,
     FrameResult,
@@ -23,10 +23,10 @@ from emulator.frames import (
     SolverSettings,
     Warm,
 )
-from emulator.precompile import picture_was_compiled, start_helper
-from emulator.sensor import Frame, Renderer
-from emulator.sensor_model import SensorModel
-from emulator.sky_objects import SkyObjects
+from emulator.imaging.precompile import picture_was_compiled, start_helper
+from emulator.imaging.sensor import Frame, Renderer
+from emulator.imaging.sensor_model import SensorModel
+from emulator.imaging.sky_objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

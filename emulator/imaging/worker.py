@@ -9,7 +9,7 @@ import socket
 import sys
 from typing import Any, Final
 
-from emulator.frames import LENGTH, Failure
+from emulator.imaging.frames import LENGTH, Failure
 
 NICE: Final = 5
 """How much the worker stands back where processors are short: the links of the emulator come first."""
@@ -20,7 +20,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
     link = socket.socket(fileno=int(sys.argv[1]))
-    from emulator.picture import make_picture  # while the emulator itself still starts
+    from emulator.imaging.picture import make_picture  # while the emulator itself still starts
 
     setup = _receive(link)
     if setup is None:

@@ -15,7 +15,7 @@ class WorkerProcess:
 
     def __init__(self) -> None:
         self.socket, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "emulator.worker", str(theirs.fileno())]
+        command = [sys.executable, "-m", "emulator.imaging.worker", str(theirs.fileno())]
         self.process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)  # noqa: S603
         theirs.close()
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.errors import EmulatorError
-from emulator.truth import ZERO_RATE, TruthState, TruthStatus, Vector
+from emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
 from starid.attitude import Attitude, interpolate, rate_between
 
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")

@@ -21,7 +21,7 @@ def picture_was_compiled() -> bool:
 
 def start_helper() -> subprocess.Popen[bytes]:
     """Start the process that compiles the identifier; whoever starts it waits for it."""
-    return subprocess.Popen([sys.executable, "-m", "emulator.precompile"], stdin=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-m", "emulator.imaging.precompile"], stdin=subprocess.DEVNULL)
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias
 
 from emulator.errors import EmulatorError
-from emulator.frames import (
+from emulator.imaging.frames import (
     LENGTH,
     Failure,
     FrameRequest,
@@ -25,7 +25,7 @@ from emulator.frames import (
     PipelineSetup,
     Warm,
 )
-from emulator.worker_process import EXIT_GRACE_S, WorkerProcess
+from emulator.imaging.worker_process import EXIT_GRACE_S, WorkerProcess
 
 Asked: TypeAlias = FrameRequest | ImageRequest
 Answer: TypeAlias = FrameResult | ImageResult | Failure
@@ -219,7 +219,7 @@ class ThreadImager(_Queue):
         self._requests.put(request)
 
     def _work(self) -> None:
-        from emulator.picture import make_picture
+        from emulator.imaging.picture import make_picture
 
         made = make_picture(self._setup)
         if isinstance(made, Failure):
