@@ -148,7 +148,7 @@ class FrameMaker:
 
     def solve(self, frame: int) -> tuple[Any, ...]:
         """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
-        from starid.detection import detect
+        from starid.imaging.detection import detect
 
         rng = np.random.default_rng((self.plan.seed, frame))
         truth = random_attitude(rng)

@@ -14,22 +14,22 @@ if TYPE_CHECKING:
     from starid.camera import Camera as Camera
     from starid.catalog import StarCatalog as StarCatalog
     from starid.catalog import load_catalog as load_catalog
-    from starid.detection import Detections as Detections
-    from starid.detection import DetectionSettings as DetectionSettings
-    from starid.detection import detect as detect
-    from starid.identifier import Identifier as Identifier
+    from starid.geometric.identifier import Identifier as Identifier
+    from starid.imaging.detection import Detections as Detections
+    from starid.imaging.detection import DetectionSettings as DetectionSettings
+    from starid.imaging.detection import detect as detect
     from starid.interface import make_identifier as make_identifier
     from starid.solution import Solution as Solution
 
 _HOMES: Final = {
     "Attitude": "starid.attitude",
     "Camera": "starid.camera",
-    "DetectionSettings": "starid.detection",
-    "Detections": "starid.detection",
-    "Identifier": "starid.identifier",
+    "DetectionSettings": "starid.imaging.detection",
+    "Detections": "starid.imaging.detection",
+    "Identifier": "starid.geometric.identifier",
     "Solution": "starid.solution",
     "StarCatalog": "starid.catalog",
-    "detect": "starid.detection",
+    "detect": "starid.imaging.detection",
     "load_catalog": "starid.catalog",
     "make_identifier": "starid.interface",
 }

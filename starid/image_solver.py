@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
-from starid.detection import Detections, DetectionSettings, detect
 from starid.errors import StaridError
-from starid.identifier import Effort, Identifier
+from starid.geometric.identifier import Effort, Identifier
+from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.self_calibration import IMAGE_MODELS, Stars, self_calibrate
 from starid.solution import Solution
 

@@ -15,9 +15,9 @@ from starid.errors import StaridError
 from starid.solution import Solution
 
 ALGORITHMS: Final[dict[str, tuple[str, str]]] = {
-    "geometric": ("starid.identifier", "Identifier"),
-    "lsi": ("starid.lsi_identifier", "LsiIdentifier"),
-    "rsi": ("starid.rsi_identifier", "RsiIdentifier"),
+    "geometric": ("starid.geometric.identifier", "Identifier"),
+    "lsi": ("starid.thesis.lsi_identifier", "LsiIdentifier"),
+    "rsi": ("starid.thesis.rsi_identifier", "RsiIdentifier"),
 }
 """Name of an algorithm → module and class; modules are imported when they are asked for."""
 

@@ -28,7 +28,7 @@ from starid.calibration import (
 from starid.camera import Camera
 from starid.catalog import StarCatalog, blend, load_catalog
 from starid.errors import StaridError
-from starid.identifier import Identifier
+from starid.geometric.identifier import Identifier
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from emulator.imaging.sensor import Frame, Renderer, SensorModel
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.centroid import star_model
-from starid.detection import Detections, detect
+from starid.imaging.centroid import star_model
+from starid.imaging.detection import Detections, detect
 
 Array = npt.NDArray[np.float64]
 

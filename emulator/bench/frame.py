@@ -14,7 +14,7 @@ from emulator.imaging.sensor import Renderer, SensorModel
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.detection import detect
+from starid.imaging.detection import detect
 from starid.interface import make_identifier
 
 _WARM_UP = 3

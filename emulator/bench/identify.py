@@ -16,7 +16,7 @@ from emulator.errors import EmulatorError
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
-from starid.pattern_index import seen_stars
+from starid.geometric.pattern_index import seen_stars
 
 Array = NDArray[np.float64]
 

@@ -63,8 +63,8 @@ def command(
 
 def _stars(images: list[Path], *, allow_colour: bool) -> tuple[list[Stars], tuple[int, int]]:
     """Detections of each image, and the size (height, width) that all of them must have."""
-    from starid.detection import detect
-    from starid.image_io import read_image
+    from starid.imaging.detection import detect
+    from starid.imaging.image_io import read_image
     from starid.self_calibration import Stars
 
     frames: list[Stars] = []

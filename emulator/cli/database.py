@@ -51,8 +51,8 @@ def build(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from starid.database import build_database
-    from starid.database_file import save_database
+    from starid.thesis.database import build_database
+    from starid.thesis.database_file import save_database
 
     planar = geometry == "planar"
     parameters = frame_parameters(
@@ -97,7 +97,7 @@ def info(
     """Check a database file as a whole and tell what it was made with."""
     import dataclasses
 
-    from starid.database_file import load_database
+    from starid.thesis.database_file import load_database
 
     database = load_database(file)
     _print(

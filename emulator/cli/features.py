@@ -51,7 +51,7 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of one frame of the catalogue."""
-    from starid.database import sky_of
+    from starid.thesis.database import sky_of
 
     parameters = frame_parameters(
         geometry, fov=fov, kappa=kappa, direction=direction, band=band, full_field=full_field

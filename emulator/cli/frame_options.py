@@ -8,8 +8,8 @@ from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
     from starid.catalog import Band, StarCatalog
-    from starid.database import DatabaseParameters
-    from starid.frame_sky import Direction
+    from starid.thesis.database import DatabaseParameters
+    from starid.thesis.frame_sky import Direction
 
 PLANAR_EPOCH: Final = 1991.25
 """The catalogue's own epoch: the published numbers know no proper motion."""
@@ -39,7 +39,7 @@ def frame_parameters(
 ) -> DatabaseParameters:
     """Parameters of frames from command-line options; `overlap_percent` is in percent."""
     from starid.camera import Camera
-    from starid.database import DatabaseParameters
+    from starid.thesis.database import DatabaseParameters
 
     side = cast("Direction", choice("direction", direction, ("faintest", "brightest")))
     magnitude = cast("Band", choice("band", band, ("hp", "v")))

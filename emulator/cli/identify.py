@@ -42,8 +42,8 @@ def command(
     Without --profile or --fov the camera is the emulator's own, 937×937 pixels and 42° wide.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
-    from starid.image_io import read_image, write_image
     from starid.image_solver import solve_image
+    from starid.imaging.image_io import read_image, write_image
 
     pixels = read_image(image, allow_colour=allow_colour)
     camera = _camera(profile, fov, model, pixels.shape)

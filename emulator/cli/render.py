@@ -51,7 +51,7 @@ def command(
     from emulator.imaging.sensor import Renderer
     from starid.attitude import Attitude
     from starid.catalog import load_catalog
-    from starid.image_io import write_image
+    from starid.imaging.image_io import write_image
 
     for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
         if not math.isfinite(value):

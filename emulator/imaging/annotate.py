@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from starid.background import estimate_background
+from starid.imaging.background import estimate_background
 
 MARK_BGR: Final = (70, 190, 105)
 MISS_BGR: Final = (70, 90, 240)

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.jit_loops import compiled_loops
+from starid.imaging.jit_loops import compiled_loops
 
 LANES: Final = 512
 """Random generators that run side by side; pixels are made in blocks of twice as many."""

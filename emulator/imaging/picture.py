@@ -30,8 +30,8 @@ from emulator.imaging.sky_objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.detection import Detections, DetectionSettings, detect
 from starid.errors import StaridError
+from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.interface import StarIdentifier, make_identifier
 from starid.solution import Reason, Solution
 
@@ -177,7 +177,7 @@ class Picture:
         key = (camera, settings.error_margin, tuple(sorted(options.items())))
         if self._identifier is None or key != self._identifier_key:
             if self._setup.algorithm == "geometric":
-                from starid.identifier import Effort
+                from starid.geometric.identifier import Effort
 
                 nominal = Effort()
                 options["effort"] = replace(

@@ -26,7 +26,7 @@ def start_helper() -> subprocess.Popen[bytes]:
 
 def main() -> None:
     """Compile the identifier's kernels and leave them in the cache."""
-    from starid.identifier import Identifier
+    from starid.geometric.identifier import Identifier
 
     Identifier().warm_up()
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.jit_loops import compiled_loops
+from starid.imaging.jit_loops import compiled_loops
 
 MOST_GAUSS_NODES: Final = 200
 MOST_NODES: Final = 20_000

@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 from emulator.errors import EmulatorError
 from emulator.imaging.noise import Digitizer
-from starid.detection import DetectionSettings
+from starid.imaging.detection import DetectionSettings
 
 ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
 SOLAR_COLOUR_B_V: Final = 0.65

@@ -15,7 +15,7 @@ from emulator.imaging.sensor_model import SensorModel
 from emulator.imaging.sky_objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.jit_loops import compiled_loops
+from starid.imaging.jit_loops import compiled_loops
 
 Image = npt.NDArray[np.float32]
 

@@ -59,9 +59,9 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _work(context: Context, part: Part) -> Results:
-    from starid.database import DatabaseParameters, build_database
-    from starid.database_file import save_database
-    from starid.frame_grid import make_grid
+    from starid.thesis.database import DatabaseParameters, build_database
+    from starid.thesis.database_file import save_database
+    from starid.thesis.frame_grid import make_grid
 
     overlap = part.values["percent"] / 100.0
     parameters = DatabaseParameters(overlap=overlap)
@@ -101,7 +101,7 @@ def _size_row(percent: float, kilobytes: float) -> Row:
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    from starid.frame_grid import minimum_overlap, nominal_cells
+    from starid.thesis.frame_grid import minimum_overlap, nominal_cells
 
     least = minimum_overlap()
     rows = [

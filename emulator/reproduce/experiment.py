@@ -18,9 +18,9 @@ from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
     from starid.catalog import StarCatalog
-    from starid.database import FeatureDatabase
-    from starid.frame_sky import FrameSky
-    from starid.lsi import LostInSpace
+    from starid.thesis.database import FeatureDatabase
+    from starid.thesis.frame_sky import FrameSky
+    from starid.thesis.lsi import LostInSpace
 
 Results = dict[str, NDArray[Any]]
 """What one part yields: named arrays."""
@@ -271,8 +271,8 @@ def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None
     from dataclasses import replace
     from typing import cast
 
-    from starid.database import DatabaseParameters, sky_of
-    from starid.frame_sky import Direction
+    from starid.thesis.database import DatabaseParameters, sky_of
+    from starid.thesis.frame_sky import Direction
 
     parameters = replace(DatabaseParameters(), direction=cast("Direction", direction))
     if kappa is not None:
@@ -284,8 +284,8 @@ def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None
 
 @lru_cache(maxsize=3)
 def _database(folder: Path, overlap: float) -> FeatureDatabase:
-    from starid.database import DatabaseParameters, build_database
-    from starid.database_file import load_database, save_database
+    from starid.thesis.database import DatabaseParameters, build_database
+    from starid.thesis.database_file import load_database, save_database
 
     catalog = star_catalog()
     path = folder / f"planar-{100 * overlap:g}.features"
@@ -300,6 +300,6 @@ def _database(folder: Path, overlap: float) -> FeatureDatabase:
 
 @lru_cache(maxsize=3)
 def _lost_in_space(folder: Path, overlap: float) -> LostInSpace:
-    from starid.lsi import LostInSpace
+    from starid.thesis.lsi import LostInSpace
 
     return LostInSpace(_database(folder, overlap))

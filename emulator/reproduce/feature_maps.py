@@ -48,7 +48,7 @@ makes r grow and n fall at the upper and lower rims of the maps."""
 
 def _features(centres: NDArray[np.float64], kappa: float) -> NDArray[np.float64]:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without a star."""
-    from starid.frame_sky import cell_features
+    from starid.thesis.frame_sky import cell_features
 
     sky = planar_sky(kappa, "faintest", FRAME_DEG)
     table = np.full((len(centres), 6), np.nan)

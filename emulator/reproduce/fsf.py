@@ -21,12 +21,12 @@ from emulator.reproduce.experiment import (
 )
 from emulator.reproduce.fsf_published import TABLES
 from emulator.reproduce.plots import colours, figure, save
-from starid.cme import estimate_motion
-from starid.false_stars import FilterResult
-from starid.fsf import ClusterFilter
-from starid.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis_metrics import Confusion
-from starid.thesis_simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
+from starid.thesis.cme import estimate_motion
+from starid.thesis.false_stars import FilterResult
+from starid.thesis.fsf import ClusterFilter
+from starid.thesis.metrics import Confusion
+from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
+from starid.thesis.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
 
 RADIUS_DEG: Final = 21.0
 """Radius of the circular field of these experiments."""

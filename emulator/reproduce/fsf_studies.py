@@ -22,13 +22,13 @@ from emulator.reproduce.experiment import (
 )
 from emulator.reproduce.fsf import RADIUS_DEG, first_frame, noise_of
 from emulator.reproduce.plots import figure, save
-from starid.cme import estimate_motion
-from starid.false_stars import FilterError, ObservedFrame
-from starid.fsf import ClusterFilter
-from starid.rsi import correlation
-from starid.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis_metrics import Confusion
-from starid.thesis_simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
+from starid.thesis.cme import estimate_motion
+from starid.thesis.false_stars import FilterError, ObservedFrame
+from starid.thesis.fsf import ClusterFilter
+from starid.thesis.metrics import Confusion
+from starid.thesis.rsi import correlation
+from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
+from starid.thesis.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 
 _SPREAD_DEG: Final = 0.1
 _EPSILONS: Final = tuple(round(0.2 * k, 1) for k in range(1, 11))

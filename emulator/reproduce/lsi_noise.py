@@ -22,7 +22,7 @@ from emulator.reproduce.experiment import (
 from emulator.reproduce.lsi_patterns import complete, pattern_files, pattern_rows
 from emulator.reproduce.lsi_trials import OFF, ON, share, solve_frames
 from emulator.reproduce.plots import colours, figure, precision_curve, save
-from starid.thesis_simulation import NoiseModel
+from starid.thesis.simulation import NoiseModel
 
 IDENTIFIED_DEG: Final = 0.283
 """A frame counts as identified when its boresight is within 16.98′, section 6.1.2.3."""

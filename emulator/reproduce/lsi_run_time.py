@@ -71,10 +71,10 @@ def _milliseconds(count: int, work: Callable[[int], object]) -> NDArray[np.float
 
 
 def _work(context: Context, part: Part) -> Results:
-    from starid.features import extract_features
-    from starid.lasso import LAMBDAS, choose_lambdas, lasso_path
-    from starid.lsi import fill_dictionary
-    from starid.subcell import SubcellSearch
+    from starid.thesis.features import extract_features
+    from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
+    from starid.thesis.lsi import fill_dictionary
+    from starid.thesis.subcell import SubcellSearch
 
     lsi = context.lost_in_space(part.values["percent"] / 100.0)
     fine = SubcellSearch(lsi)

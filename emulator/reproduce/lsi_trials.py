@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.reproduce.experiment import Context, Results
-from starid.features import extract_features
-from starid.lsi import LsiEstimate
-from starid.subcell import FineEstimate, SubcellSearch
-from starid.thesis_simulation import NoiseModel, add_noise, turned
+from starid.thesis.features import extract_features
+from starid.thesis.lsi import LsiEstimate
+from starid.thesis.simulation import NoiseModel, add_noise, turned
+from starid.thesis.subcell import FineEstimate, SubcellSearch
 
 COLUMNS: Final = 63
 """Test frames along right ascension: α corner 2° + 5°·k."""

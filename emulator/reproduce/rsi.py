@@ -21,10 +21,10 @@ from emulator.reproduce.experiment import (
 )
 from emulator.reproduce.fsf import EQUIVALENT
 from emulator.reproduce.plots import colours, figure, precision_curve, save
-from starid.rsi import RecursiveIdentification, RsiSettings, region_cells
-from starid.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis_metrics import boresight_error, rotation_error
-from starid.thesis_simulation import PIXEL_DEG, NoiseModel, sky_sequence
+from starid.thesis.metrics import boresight_error, rotation_error
+from starid.thesis.rsi import RecursiveIdentification, RsiSettings, region_cells
+from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
+from starid.thesis.simulation import PIXEL_DEG, NoiseModel, sky_sequence
 
 START: Final = (108.41, 12.14)
 """Boresight of the first frame: corner (87.41°, −8.86°), 42° wide."""

@@ -24,8 +24,8 @@ from emulator.reproduce.lsi_trials import HALF_FRAME_DEG, boresight_error
 from emulator.reproduce.plots import figure, save
 
 if TYPE_CHECKING:
-    from starid.features import FeatureVector
-    from starid.lsi import LostInSpace
+    from starid.thesis.features import FeatureVector
+    from starid.thesis.lsi import LostInSpace
 
 _CORNER: Final = (95.0, -85.0)
 _NAMES: Final = ("n", "A", "r", "σ_A", "σ_r")
@@ -71,7 +71,7 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _work(context: Context, part: Part) -> Results:
-    from starid.subcell import SubcellSearch
+    from starid.thesis.subcell import SubcellSearch
 
     lsi = context.lost_in_space(part.values["percent"] / 100.0)
     centre = np.array(_CORNER) + HALF_FRAME_DEG

@@ -12,8 +12,8 @@ import pytest
 from emulator.cli.app import main
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
-from starid.detection import detect
-from starid.image_io import read_image
+from starid.imaging.detection import detect
+from starid.imaging.image_io import read_image
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

@@ -32,7 +32,7 @@ from emulator.reproduce.lsi_trials import (
     centres,
     frames_under_test,
 )
-from starid.frame_grid import make_grid
+from starid.thesis.frame_grid import make_grid
 
 WORKED_EXAMPLE_CHECKS = 8
 

@@ -12,7 +12,7 @@ from emulator.imaging.sky_objects import EarthLimb, Moon, Obstruction, PointSour
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import load_catalog
-from starid.detection import detect
+from starid.imaging.detection import detect
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 

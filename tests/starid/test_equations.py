@@ -21,7 +21,7 @@ PRINTED = (
 
 
 def docstrings():
-    for path in sorted(Path(starid.__file__).parent.glob("*.py")):
+    for path in sorted(Path(starid.__file__).parent.rglob("*.py")):
         body = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(body):
             if (

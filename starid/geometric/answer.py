@@ -1,0 +1,213 @@
+"""The end of an identification in the kernels: test, refine, judge; covariance, quaternion and pairs."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.geometric.jit_kernels import inner
+from starid.geometric.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
+from starid.geometric.pattern_index import IndexArrays
+from starid.geometric.refinement import (
+    NUMBERS,
+    PRIOR_FREEDOM,
+    RMS,
+    SCALE,
+    VARIANCE,
+    ZERO_POINT,
+    refine,
+    solve_symmetric,
+)
+from starid.geometric.settings import (
+    LARGEST_SIGMA,
+    MAGNITUDE_GATE,
+    NOTHING,
+    SCALE_TOLERANCE,
+    SIGMAS_KNOWN,
+)
+from starid.geometric.verification import log_false_probability, worth_refining
+
+LEAST_MATCHED: Final = 4
+"""Matches that an answer needs."""
+
+
+class Answer(NamedTuple):
+    """What a kernel hands back to Python.
+
+    Attributes
+    ----------
+    status : int
+        As in `starid.geometric.settings`.
+    quaternion : ndarray (4,)
+        Scalar-last, ICRS→sensor, scalar ≥ 0.
+    covariance : ndarray (3, 3)
+        rad², sensor frame.
+    pairs : ndarray (2, m) int64
+        Matched rows of the detections, and of the index's stars.
+    numbers : ndarray (6,)
+        rms (px), noise (px), logarithm of the bound on a false answer, scale, triangles, candidates.
+    """
+
+    status: int
+    quaternion: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+    numbers: NDArray[np.float64]
+
+
+class Candidate(NamedTuple):
+    """Workspace of a candidate attitude; see `starid.geometric.refinement.refine`.
+
+    Attributes
+    ----------
+    frames : ndarray (3, 3, 3)
+        Frames of the pattern in the sensor and in the sky, and the rotation between them.
+    stars : ndarray (n,) int64
+    normal : ndarray (4, 4)
+    numbers : ndarray (`NUMBERS`,)
+    """
+
+    frames: NDArray[np.float64]
+    stars: NDArray[np.int64]
+    normal: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+
+
+@inner
+def new_candidate(count: int) -> Candidate:
+    """Workspace for so many detections."""
+    stars = np.empty(count, dtype=np.int64)
+    return Candidate(np.empty((3, 3, 3)), stars, np.empty((4, 4)), np.empty(NUMBERS))
+
+
+@inner
+def judged(
+    index: IndexArrays,
+    raw: Raw,
+    given: Table,
+    settings: NDArray[np.float64],
+    candidate: Candidate,
+    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    used: tuple[int, int, int],
+    prior_volume: float,
+) -> tuple[int, float]:
+    """Test, refine and judge the attitude in ``candidate.frames[2]``.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Rotation, scale and zero point are set.
+    tests : (odds, order)
+        From `starid.geometric.verification.hit_odds` and `test_order`.
+    used : (int, int, int)
+        Detections that the attitude was made from.
+    prior_volume : float
+        As in `log_false_probability`.
+
+    Returns
+    -------
+    matched : int
+        Stars matched; 0 for a candidate that fell through.
+    bound : float
+        Logarithm of the bound on the probability of a false answer.
+    """
+    rotation, numbers = candidate.frames[2], candidate.numbers
+    faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
+    odds, order = tests
+    if not worth_refining(
+        index, raw.params, given, rotation, numbers[SCALE], faintest, settings, odds, order, used
+    ):
+        return 0, 0.0
+    seen = np.empty_like(given) if settings[SCALE_TOLERANCE] > 0.0 else given
+    matched = refine(
+        index, raw, given, settings, LEAST_MATCHED, seen, rotation, candidate.stars, candidate.normal, numbers
+    )
+    if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
+        return 0, 0.0
+    if abs(math.log(numbers[SCALE])) > 1.5 * settings[SCALE_TOLERANCE]:
+        return 0, 0.0
+    bound = log_false_probability(
+        index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior_volume
+    )
+    return matched, bound
+
+
+@inner
+def quaternion_of(m: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+    """Fill in the scalar-last quaternion, scalar ≥ 0, of a rotation matrix (Shepperd 1978)."""
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    if trace > 0.0:
+        q[3] = 1.0 + trace
+        q[0], q[1], q[2] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    else:
+        i = 0
+        if m[1, 1] > m[0, 0]:
+            i = 1
+        if m[2, 2] > m[i, i]:
+            i = 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1.0 + m[i, i] - m[j, j] - m[k, k]
+        q[j] = m[j, i] + m[i, j]
+        q[k] = m[k, i] + m[i, k]
+        q[3] = m[k, j] - m[j, k]
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if q[3] < 0.0:
+        norm = -norm
+    for k in range(4):
+        q[k] /= norm
+
+
+@inner
+def finish(
+    status: int,
+    given: Table,
+    candidate: Candidate,
+    settings: NDArray[np.float64],
+    bound: float,
+    triangles: int,
+    candidates: int,
+) -> Answer:
+    """Turn a candidate that stands (or, with a status other than `ACCEPTED`, nothing) into an answer.
+
+    The covariance is the inverse normal matrix times the variance of unit weight. That is estimated from the
+    residuals with ν degrees of freedom and multiplied by ν/(ν − 2), which makes it the covariance of the
+    (Student) posterior; errors given by the caller count as further degrees of freedom.
+    """
+    numbers = candidate.numbers
+    quaternion, covariance = np.full(4, math.nan), np.full((3, 3), math.nan)
+    facts = np.full(6, math.nan)
+    facts[2], facts[4], facts[5] = bound, triangles, candidates
+    if status <= NOTHING or bound == 0.0:
+        return Answer(status, quaternion, covariance, np.empty((2, 0), dtype=np.int64), facts)
+    m = 0
+    for i in range(candidate.stars.shape[0]):
+        m += 1 if candidate.stars[i] >= 0 else 0
+    pairs = np.empty((2, m), dtype=np.int64)
+    mean_sigma2 = 0.0
+    filled = 0
+    for i in range(candidate.stars.shape[0]):
+        if candidate.stars[i] >= 0:
+            pairs[0, filled] = np.int64(given[i, SOURCE])
+            pairs[1, filled] = candidate.stars[i]
+            mean_sigma2 += 0.5 * (given[i, SIGMA_U] ** 2 + given[i, SIGMA_V] ** 2) / m
+            filled += 1
+    freedom = float(max(2 * m - (4 if settings[SCALE_TOLERANCE] > 0.0 else 3), 1))
+    variance = numbers[VARIANCE]
+    if settings[SIGMAS_KNOWN] > 0.0:
+        variance = (PRIOR_FREEDOM + variance * freedom) / (PRIOR_FREEDOM + freedom)
+        freedom += PRIOR_FREEDOM
+    facts[0], facts[1], facts[3] = numbers[RMS], math.sqrt(variance * mean_sigma2), numbers[SCALE]
+    if freedom > 2.0:
+        variance *= freedom / (freedom - 2.0)
+    unit, column = np.empty(4), np.empty(4)
+    for axis in range(3):
+        for k in range(3):
+            unit[k] = variance if k == axis else 0.0
+        solve_symmetric(candidate.normal, unit, 3, column)
+        for k in range(3):
+            covariance[k, axis] = column[k]
+    quaternion_of(candidate.frames[2], quaternion)
+    return Answer(status, quaternion, covariance, pairs, facts)

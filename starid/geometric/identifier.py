@@ -1,0 +1,371 @@
+"""The geometric identifier: verified triangles of bright stars, over the whole sky, for any camera.
+
+How it finds an attitude that it knows nothing of (`starid.geometric.search`), follows one (`starid.geometric.tracking`), what it
+believes (`starid.geometric.verification`) and how it polishes (`starid.geometric.refinement`) stand in those modules; here they
+are put together for a camera and a catalogue.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import StarCatalog, load_catalog
+from starid.errors import StaridError
+from starid.geometric.answer import Answer
+from starid.geometric.index_choice import (
+    default_limiting_magnitude,
+    index_settings,
+    obtain_index,
+    pixels_per_radian,
+)
+from starid.geometric.pattern_index import field_solid_angle, seen_stars
+from starid.geometric.search import identify_kernel
+from starid.geometric.settings import (
+    ACCEPTED,
+    FIELD_PX,
+    LARGEST_SIGMA,
+    LOG_CHANCE,
+    LOG_CHANCE_TRACKING,
+    MAGNITUDE_GATE,
+    MAX_TRIANGLES,
+    NOISY,
+    PX_PER_RAD,
+    SCALE_TOLERANCE,
+    SEARCH_TOLERANCE,
+    SETTING_COUNT,
+    SIGMAS_KNOWN,
+    TEST_WINDOW,
+    TOO_FEW,
+    WINDOW,
+)
+from starid.geometric.tracking import track_kernel
+from starid.solution import Mode, Reason, Solution
+
+BLEND_PX: Final = 2.0
+TRACKING_WINDOW_PX: Final = 20.0
+WIDEST_TOLERANCE: Final = 0.3
+_QUICK_TRIANGLES: Final = 60
+"""Triangles tried at each of several focal lengths before any gets the whole effort."""
+
+_SCALE_ERROR: Final = 0.012
+"""Difference of scale across the field that the look-up of triangles bears."""
+
+_REASONS: Final = {TOO_FEW: Reason.TOO_FEW_STARS, NOISY: Reason.RESIDUAL}
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How the search is bounded.
+
+    Attributes
+    ----------
+    tolerance_px : float
+        Largest error of a triangle's side, pixels.
+    window_px : float
+        First matching window, pixels; a third of it is the largest centroid noise believed.
+    test_window_px : float
+        Window in which a candidate attitude is tested, pixels.
+    magnitude_gate : float
+        Largest deviation of a star's magnitude from what its flux says.
+    max_triangles : int
+        Triangles of detections looked up before giving up.
+    max_false_probability, max_false_probability_tracking : float
+        Largest bound on the probability of a false answer that is accepted, lost in space and near a
+        predicted attitude.
+    """
+
+    tolerance_px: float = 4.0
+    window_px: float = 12.0
+    test_window_px: float = 10.0
+    magnitude_gate: float = 1.5
+    max_triangles: int = 2400
+    max_false_probability: float = 1e-5
+    max_false_probability_tracking: float = 1e-5
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not 0.0 < value < math.inf:
+                raise StaridError(f"identifier {field.name}: {value} given, a positive number needed")
+
+    def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
+        """Settings for the kernels (`starid.geometric.settings`) with this camera, its focal length known."""
+        numbers = np.zeros(SETTING_COUNT)
+        numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
+        numbers[MAGNITUDE_GATE] = self.magnitude_gate
+        numbers[MAX_TRIANGLES] = self.max_triangles
+        numbers[WINDOW] = self.window_px
+        numbers[TEST_WINDOW] = self.test_window_px / px_per_rad
+        numbers[LARGEST_SIGMA] = self.window_px / 3.0
+        numbers[LOG_CHANCE] = math.log(self.max_false_probability)
+        numbers[LOG_CHANCE_TRACKING] = math.log(self.max_false_probability_tracking)
+        numbers[PX_PER_RAD] = px_per_rad
+        numbers[FIELD_PX] = camera.width * camera.height
+        return numbers
+
+
+class Identifier:
+    """Star identification for one camera against one catalogue.
+
+    Parameters
+    ----------
+    camera : Camera
+        What the detections were taken with.
+    catalog : StarCatalog, optional
+        Default: the whole of Hipparcos at its default epoch.
+    limiting_magnitude : float, optional
+        Faintest V in the index; by default what gives some 200 stars a field, at least 6.
+    fov_tolerance : float
+        Relative uncertainty of the focal length, 0 where it is calibrated. Solutions then carry the refined
+        camera.
+    blend_px : float
+        Stars closer than this are seen as one.
+    effort : Effort
+        Bounds of the search.
+    cache : bool or path
+        Keep the index on disk: in the cache folder, in a folder given, or not at all.
+
+    Raises
+    ------
+    StaridError
+        A value is out of its range, or the catalogue has too few stars for the field.
+    """
+
+    def __init__(
+        self,
+        camera: Camera = DEFAULT_CAMERA,
+        catalog: StarCatalog | None = None,
+        *,
+        limiting_magnitude: float | None = None,
+        fov_tolerance: float = 0.0,
+        blend_px: float = BLEND_PX,
+        effort: Effort | None = None,
+        cache: bool | str | Path = True,
+    ) -> None:
+        if not 0.0 <= fov_tolerance <= WIDEST_TOLERANCE:
+            raise StaridError(
+                f"identifier fov_tolerance: {fov_tolerance} given, 0…{WIDEST_TOLERANCE:g} needed"
+            )
+        self._camera = camera
+        self._catalog = load_catalog() if catalog is None else catalog
+        self._effort = effort or Effort()
+        if limiting_magnitude is None:
+            limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(camera))
+        settings = index_settings(camera, self._catalog, limiting_magnitude, blend_px, self._effort.window_px)
+        self._stars = seen_stars(self._catalog, limiting_magnitude, settings.blend_rad)
+        self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
+        self._index = obtain_index(self._stars, settings, cache)
+        self._px_per_rad = pixels_per_radian(camera)
+        self._numbers = self._effort.numbers(camera, self._px_per_rad)
+        self._numbers_with_errors = self._numbers.copy()
+        self._numbers_with_errors[SIGMAS_KNOWN] = 1.0
+        self._fov_tolerance = fov_tolerance
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the positions belong to."""
+        return self._camera
+
+    @property
+    def catalog(self) -> StarCatalog:
+        """The catalogue that `Solution.catalog_index` counts in."""
+        return self._catalog
+
+    @property
+    def stars(self) -> StarCatalog:
+        """The stars of the index as the camera sees them: doubles merged, brightest first."""
+        return self._stars
+
+    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+        """Lost in space: attitude without any knowledge of it.
+
+        Parameters
+        ----------
+        xy_px : array (n, 2)
+            Positions, pixels.
+        flux : array (n,)
+            Brightness in any linear unit.
+        xy_sigma_px : array (n,) or (n, 2), optional
+            One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
+            the residuals when not given.
+
+        Raises
+        ------
+        StaridError
+            The arrays do not fit each other, or hold values that are not finite.
+        """
+        begin = time.perf_counter()
+        xy, brightness, sigmas = _checked(xy_px, flux, xy_sigma_px)
+        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        if self._fov_tolerance > 0.0:
+            return self._identify_any_scale(xy, brightness, sigmas, numbers, begin)
+        answer = identify_kernel(self._index, self._camera.params, xy, brightness, sigmas, numbers)
+        return self._solution(answer, "lost_in_space", begin)
+
+    def _identify_any_scale(
+        self,
+        xy: NDArray[np.float64],
+        brightness: NDArray[np.float64],
+        sigmas: NDArray[np.float64],
+        numbers: NDArray[np.float64],
+        begin: float,
+    ) -> Solution:
+        """Try focal lengths from the nominal one outward, each with its share of the tolerance.
+
+        All of them get a little effort before any gets the whole.
+        """
+        steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
+        share = self._fov_tolerance / (2 * steps - 1)
+        numbers = numbers.copy()
+        numbers[SCALE_TOLERANCE] = share
+        cameras = [
+            scaled_camera(self._camera, 1.0 + 2.0 * share * step)
+            for step in sorted(range(1 - steps, steps), key=abs)
+        ]
+        solution = Solution.invalid(Reason.NO_MATCH)
+        for triangles in (_QUICK_TRIANGLES, self._effort.max_triangles):
+            numbers[MAX_TRIANGLES] = triangles
+            for camera in cameras:
+                answer = identify_kernel(self._index, camera.params, xy, brightness, sigmas, numbers)
+                solution = self._solution(answer, "lost_in_space", begin)
+                if solution.valid:
+                    found = scaled_camera(camera, 1.0 / float(answer.numbers[3]))
+                    return dataclasses.replace(solution, camera=found)
+        return solution
+
+    def track(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        predicted: Attitude | ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        window_px: float | None = None,
+    ) -> Solution:
+        """Attitude near a predicted one; invalid, with the reason, where it does not hold.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `identify`.
+        predicted : Attitude or array (4,)
+            Attitude expected at the time of the exposure, or its scalar-last quaternion.
+        window_px : float, optional
+            Largest distance of a star from where the prediction puts it, pixels (`TRACKING_WINDOW_PX`).
+
+        Raises
+        ------
+        StaridError
+            The arrays do not fit each other, or hold values that are not finite.
+        """
+        begin = time.perf_counter()
+        xy, brightness, sigmas = _checked(xy_px, flux, xy_sigma_px)
+        window = TRACKING_WINDOW_PX if window_px is None else window_px
+        if not 0.0 < window < math.inf:
+            raise StaridError(f"tracking window_px: {window} given, a positive number of pixels needed")
+        attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
+        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        answer = track_kernel(
+            self._index, self._camera.params, xy, brightness, sigmas, numbers, attitude.matrix,
+            window / self._px_per_rad,
+        )  # fmt: skip
+        return self._solution(answer, "tracking", begin)
+
+    def warm_up(self) -> None:
+        """Compile, or load, the kernels, so that the first real frame is not late."""
+        xy = self._camera.border(2)[:6]
+        self.identify(xy, np.ones(6))
+        self.track(xy, np.ones(6), Attitude.identity())
+
+    def with_camera(self, camera: Camera) -> Identifier:
+        """Identifier for a camera refined from this one (same size, focal length within the tolerance).
+
+        It shares the index, and takes the focal length as known.
+        """
+        if (camera.width, camera.height) != (self._camera.width, self._camera.height):
+            raise StaridError(
+                f"camera {camera.width}×{camera.height}: the identifier is for "
+                f"{self._camera.width}×{self._camera.height}; make another one"
+            )
+        other = object.__new__(Identifier)
+        other.__dict__.update(self.__dict__)
+        other._camera = camera
+        other._fov_tolerance = 0.0
+        other._px_per_rad = pixels_per_radian(camera)
+        other._numbers = self._effort.numbers(camera, other._px_per_rad)
+        other._numbers_with_errors = other._numbers.copy()
+        other._numbers_with_errors[SIGMAS_KNOWN] = 1.0
+        return other
+
+    def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
+        if answer.status != ACCEPTED:
+            lost = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST
+            reason = _REASONS.get(answer.status, lost)
+            return Solution.invalid(reason, mode=mode, elapsed=time.perf_counter() - begin)
+        rms, sigma, log_false, _, _, _ = answer.numbers.tolist()
+        return Solution(
+            valid=True,
+            reason=Reason.OK,
+            quaternion_xyzw=answer.quaternion,
+            detection_index=answer.pairs[0],
+            catalog_index=self._rows[answer.pairs[1]],
+            hip=self._stars.hip[answer.pairs[1]],
+            covariance=answer.covariance,
+            rms_px=rms,
+            sigma_px=sigma,
+            probability_false=math.exp(log_false),
+            mode=mode,
+            elapsed=time.perf_counter() - begin,
+        )
+
+
+def _scale_variation(camera: Camera) -> float:
+    """How differently the sides of triangles scale across the field, per relative change of the focal length."""
+    angle = min(camera.field_radius_rad, 0.5 * math.pi)
+    if camera.model == "pinhole":
+        return 2.0 * math.sin(angle) ** 2
+    return 1.0 - angle / math.tan(angle)
+
+
+def scaled_camera(camera: Camera, factor: float) -> Camera:
+    """Camera with the focal length times a factor."""
+    fx, fy = camera.focal_px
+    return dataclasses.replace(camera, focal_px=(fx * factor, fy * factor))
+
+
+def _checked(
+    xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Own, contiguous copies of the input, or a one-line error."""
+    xy = np.array(xy_px, dtype=np.float64, order="C")
+    brightness = np.array(flux, dtype=np.float64, order="C")
+    if xy.size == 0:
+        xy = xy.reshape(-1, 2)
+    n = xy.shape[0]
+    if xy.ndim != 2 or xy.shape[1] != 2 or brightness.shape != (n,):
+        raise StaridError(
+            f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
+        )
+    sigmas = np.ones((n, 2))
+    if xy_sigma_px is not None:
+        given = np.asarray(xy_sigma_px, dtype=np.float64)
+        if given.shape not in {(n,), (n, 2)}:
+            raise StaridError(
+                f"detections: errors {given.shape} given for {n} positions, (n,) or (n, 2) needed"
+            )
+        sigmas[:] = given if given.ndim == 2 else given[:, None]
+        if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):
+            raise StaridError("detections: every position error must be finite and positive")
+    if not (np.isfinite(xy).all() and np.isfinite(brightness).all()):
+        raise StaridError("detections: positions and flux must be finite numbers")
+    return xy, brightness, sigmas

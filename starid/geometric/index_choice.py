@@ -1,0 +1,135 @@
+"""Which index suits a camera: depth, pattern size and fineness from its field and its pixels."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import astuple
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from starid.cache import cache_dir
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+from starid.geometric import index_file
+from starid.geometric.pattern_index import (
+    INDEX_VERSION,
+    IndexArrays,
+    IndexSettings,
+    build_arrays,
+    field_solid_angle,
+)
+
+STARS_PER_FIELD: Final = 200
+"""Catalogue stars a field, on the average, that the default limiting magnitude aims at."""
+
+BRIGHTEST_LIMIT: Final = 6.0
+FAINTEST_LIMIT: Final = 9.0
+"""The default limiting magnitude stays between these: Hipparcos thins out beyond the second."""
+
+BRIGHT_QUOTA: Final = 5
+LARGEST_QUOTA: Final = 20
+SMALLEST_QUOTA: Final = 6
+"""Pattern stars in half the field's area: a few bright ones, and deep ones, many where the index allows."""
+
+MOST_BRIGHT: Final = 120_000
+MOST_DEEP: Final = 420_000
+"""Triangles at most, about, of bright and of deep pattern stars."""
+
+BRIGHT_SIDES: Final = (0.04, 1.3)
+DEEP_SIDES: Final = (0.12, 0.95)
+"""Shortest and longest side as shares of the field's width; narrow fields stop short of the longest."""
+
+MIDDLE_SIDE: Final = 0.5
+"""Rather fewer deep pattern stars than triangles that must be smaller than this share."""
+
+SIDE_BINS: Final = 68
+_STARS_PER_QUOTA: Final = 30.0
+"""Pattern stars of the whole sky, times the field's solid angle, over the quota; found by building."""
+
+_TRIANGLES_PER_QUOTA2: Final = 6.0
+"""Triangles a pattern star over (quota² · (longest side / width)⁴); found by building."""
+
+
+def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> float:
+    """V to which a field holds `STARS_PER_FIELD` on the average, in steps of ¼, within 6…9."""
+    wanted = STARS_PER_FIELD * 4.0 * math.pi / field_area_sr
+    row = min(int(wanted), len(catalog)) - 1
+    limit = math.ceil(4.0 * float(catalog.v[row])) / 4.0
+    return min(max(limit, BRIGHTEST_LIMIT), FAINTEST_LIMIT)
+
+
+def pixels_per_radian(camera: Camera) -> float:
+    """Least pixels per radian anywhere in the field: the smaller singular value of the projection."""
+    steps = np.linspace(0.0, 1.0, 9)
+    grid = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), axis=-1)
+    directions = camera.back_project(grid.reshape(-1, 2))
+    directions = directions[np.isfinite(directions[:, 0])]
+    values = np.linalg.svd(camera.jacobian(directions), compute_uv=False)
+    return float(values[:, 1].min())
+
+
+def index_settings(
+    camera: Camera, catalog: StarCatalog, limiting_magnitude: float, blend_px: float, window_px: float
+) -> IndexSettings:
+    """Settings of the index that suits a camera.
+
+    Parameters
+    ----------
+    camera, catalog
+        What it is for.
+    limiting_magnitude : float
+        Faintest V.
+    blend_px, window_px : float
+        Distance within which two stars are seen as one, and the largest matching window, pixels.
+    """
+    area = field_solid_angle(camera)
+    width = math.sqrt(area)
+    least = pixels_per_radian(camera)
+    window = window_px / least
+    spacing = math.sqrt(4.0 * math.pi / max(len(catalog.brighter_than(limiting_magnitude)), 1))
+    cube = MOST_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
+    quota = min(max(int(cube ** (1.0 / 3.0)), SMALLEST_QUOTA), LARGEST_QUOTA)
+    deep = min(_longest_share(MOST_DEEP, quota, area), DEEP_SIDES[1])
+    bright = max(min(_longest_share(MOST_BRIGHT, BRIGHT_QUOTA, area), BRIGHT_SIDES[1]), deep)
+    return IndexSettings(
+        limiting_magnitude=limiting_magnitude,
+        blend_rad=blend_px / least,
+        window_rad=window,
+        field_area_sr=area,
+        bright_sides_rad=(BRIGHT_SIDES[0] * width, min(bright * width, 0.9 * math.pi)),
+        deep_sides_rad=(DEEP_SIDES[0] * width, min(deep * width, 0.9 * math.pi)),
+        bright_quota=BRIGHT_QUOTA,
+        deep_quota=quota,
+        cells_per_edge=max(int(0.5 * math.pi / max(window, 0.7 * spacing)), 1),
+        side_bins=SIDE_BINS,
+    )
+
+
+def _longest_share(triangles: int, quota: int, area: float) -> float:
+    """Longest side, as a share of the field's width, that gives about so many triangles."""
+    per_star = triangles * area / (_STARS_PER_QUOTA * quota)
+    return float((per_star / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25)
+
+
+def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str | Path) -> IndexArrays:
+    """Map the index from the cache, or build it and keep it there.
+
+    Parameters
+    ----------
+    stars : StarCatalog
+        As `starid.geometric.pattern_index.seen_stars` gives them.
+    settings : IndexSettings
+        What to build.
+    cache : bool or path
+        The cache folder, a folder given, or (False) memory only.
+    """
+    text = repr((INDEX_VERSION, stars.identity, astuple(settings)))
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    if cache is False:
+        return index_file.unpack(index_file.pack(build_arrays(stars, settings), key), key)
+    folder = cache_dir() if cache is True else Path(cache)
+    path = folder / f"index-{key}.bin"
+    return index_file.load(path, key) or index_file.store(path, build_arrays(stars, settings), key)

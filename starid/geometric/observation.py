@@ -1,0 +1,164 @@
+"""Detections as the identification kernels see them: one table of directions, gradients and magnitudes."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.geometric.jit_kernels import inner
+from starid.projection import (
+    CX,
+    CY,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    MODEL,
+    P1,
+    P2,
+    PINHOLE,
+    distort_slopes,
+    from_plane,
+    plane_slopes,
+    undistort,
+)
+
+Table = NDArray[np.float64]
+
+X: Final = 0
+Y: Final = 1
+Z: Final = 2
+"""Direction: unit vector in the sensor frame."""
+U_X: Final = 3
+U_Y: Final = 4
+U_Z: Final = 5
+"""Derivative of the column by the direction, pixels per unit."""
+V_X: Final = 6
+V_Y: Final = 7
+V_Z: Final = 8
+"""Derivative of the row by the direction, pixels per unit."""
+MAGNITUDE: Final = 9
+"""−2.5·log10(flux)."""
+SIGMA_U: Final = 10
+SIGMA_V: Final = 11
+"""One-sigma errors of column and row, pixels, or in units of an unknown common one."""
+SOURCE: Final = 12
+"""Row of the detection as given."""
+OFFSET_U: Final = 13
+OFFSET_V: Final = 14
+"""Position from the camera's centre, pixels."""
+COLUMNS: Final = 15
+
+FAINTEST: Final = 99.0
+"""Instrumental magnitude of a detection without positive flux."""
+
+
+class Raw(NamedTuple):
+    """What the caller gave: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
+
+    params: NDArray[np.float64]
+    xy: NDArray[np.float64]
+    flux: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+
+
+@inner
+def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Rows by falling flux (Shell sort, gaps of Ciura); equal ones keep no particular order."""
+    n = flux.shape[0]
+    order = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        order[i] = i
+    for gap in (1750, 701, 301, 132, 57, 23, 10, 4, 1):
+        for i in range(gap, n):
+            row = order[i]
+            j = i
+            while j >= gap and flux[order[j - gap]] < flux[row]:
+                order[j] = order[j - gap]
+                j -= gap
+            order[j] = row
+    return order
+
+
+@inner
+def look(params: NDArray[np.float64], scale: float, column: float, row: float, table: Table, n: int) -> bool:
+    """Fill in direction and gradients of a position, the focal length divided by `scale`; False if unseen."""
+    fx, fy, model = params[FX] / scale, params[FY] / scale, params[MODEL]
+    a, b = (column - params[CX]) / fx, (row - params[CY]) / fy
+    j11, j12, j22 = 1.0, 0.0, 1.0
+    if not (
+        params[K1] == 0.0
+        and params[K2] == 0.0
+        and params[P1] == 0.0
+        and params[P2] == 0.0
+        and params[K3] == 0.0
+    ):
+        a, b, solved = undistort(params, a, b)
+        if not solved:
+            return False
+        j11, j12, j22 = distort_slopes(params, a, b)
+    x, y, z, seen = from_plane(model, a, b)
+    if not seen:
+        return False
+    ax, ay, az, bx, by, bz = plane_slopes(model, x, y, z)
+    table[n, X], table[n, Y], table[n, Z] = x, y, z
+    table[n, U_X] = fx * (j11 * ax + j12 * bx)
+    table[n, U_Y] = fx * (j11 * ay + j12 * by)
+    table[n, U_Z] = fx * (j11 * az + j12 * bz)
+    table[n, V_X] = fy * (j12 * ax + j22 * bx)
+    table[n, V_Y] = fy * (j12 * ay + j22 * by)
+    table[n, V_Z] = fy * (j12 * az + j22 * bz)
+    return True
+
+
+@inner
+def observe(raw: Raw) -> Table:
+    """Sort detections by falling flux and look along them; those that see no direction are left out."""
+    order = by_falling_flux(raw.flux)
+    params, xy, flux, sigmas = raw.params, raw.xy, raw.flux, raw.sigmas
+    table = np.empty((flux.shape[0], COLUMNS))
+    n = 0
+    for row in order:
+        if not look(params, 1.0, xy[row, 0], xy[row, 1], table, n):
+            continue
+        table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
+        table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
+        table[n, OFFSET_U], table[n, OFFSET_V] = xy[row, 0] - params[CX], xy[row, 1] - params[CY]
+        table[n, SOURCE] = row
+        n += 1
+    return table[:n]
+
+
+@inner
+def observe_again(raw: Raw, given: Table, scale: float, seen: Table) -> None:
+    """Fill `seen` with the same detections under a focal length divided by `scale`.
+
+    A detection that sees no direction then gets none: it lies near no star.
+    """
+    for i in range(given.shape[0]):
+        for column in range(COLUMNS):
+            seen[i, column] = given[i, column]
+        row = int(np.int64(given[i, SOURCE]))
+        if not look(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], seen, i):
+            seen[i, X], seen[i, Y], seen[i, Z] = 0.0, 0.0, 0.0
+
+
+@inner
+def scaled(model: float, x: float, y: float, z: float, scale: float) -> tuple[float, float, float]:
+    """Unit direction seen where the focal length is divided by `scale` (distortion left aside)."""
+    if scale == 1.0:
+        return x, y, z
+    if model == PINHOLE:
+        x, y = x * scale, y * scale
+        norm = 1.0 / math.sqrt(x * x + y * y + z * z)
+        return x * norm, y * norm, z * norm
+    lateral = math.sqrt(x * x + y * y)
+    if lateral == 0.0:
+        return x, y, z
+    angle = scale * math.atan2(lateral, z)
+    factor = math.sin(angle) / lateral
+    return x * factor, y * factor, math.cos(angle)

@@ -1,0 +1,380 @@
+"""The identification index: blended catalogue stars, sky grid, star counts and triangles of bright stars.
+
+Triangles are made of *pattern stars*, picked by falling brightness, a star being taken while fewer than a
+quota of taken ones lie within a neighbourhood of half the field's area: so every part of the sky, rich or
+poor, offers about as many, and a half-blocked field still holds some. With a small quota come the *bright*
+pattern stars: any three of them that can be in the field together make a triangle, for fields that show
+little else. With a large quota come the *deep* ones: triangles of middling size, for fields full of false
+stars. A narrow field has more sky to cover, and gets by with smaller triangles.
+
+Sides are chords of the unit sphere (2·sin(angle/2)), sorted longest first; corner k lies opposite side k.
+Triangles are binned by handedness and all three sides, so that a query reads a few short runs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.camera import Camera
+from starid.catalog import StarCatalog, blend
+from starid.errors import StaridError
+from starid.geometric.jit_kernels import entry, inner
+from starid.geometric.sky_grid import FACES, build_sky_grid, cell_of
+
+INDEX_VERSION: Final = 4
+"""Raised whenever the same catalogue and settings would give another index."""
+
+SIDE_STEPS: Final = 65535
+"""Sides are stored in this many steps of the longest chord."""
+
+BRIGHTEST_BIN: Final = -2.0
+"""Magnitude at which the bins of the star counts begin."""
+
+BINS_PER_MAGNITUDE: Final = 4
+COUNT_CELLS: Final = 12
+_BLEND_DEPTH: Final = 1.5
+"""Stars this much fainter than the limit still join a blend."""
+
+
+class IndexArrays(NamedTuple):
+    """The index as the kernels take it.
+
+    Attributes
+    ----------
+    stars : ndarray (m, 4) float64
+        Unit vector ICRS and V magnitude of the (blended) stars, brightest first.
+    grid_start, grid_stars : ndarray int32
+        Sky grid, see `starid.geometric.sky_grid`.
+    counts : ndarray (cells + 1, bins) int32
+        Stars down to a magnitude bin in a cap with the area of the field around each coarse cell; the last
+        row counts the whole sky.
+    bin_start : ndarray int32
+        Triangles of bin ``((hand · b + longest) · b + middle) · b + shortest`` stand in
+        ``[start[bin], start[bin + 1])``.
+    patterns : ndarray (p, 6) uint16
+        Longest, middle and shortest chord in steps, and the pattern star opposite each.
+    pattern_stars : ndarray int32
+        Row of `stars` for each pattern star.
+    numbers : ndarray (7,) float64
+        cells per edge of the grid, its margin (rad), bins per side, chord of one step, shortest side of all,
+        shortest and longest side of the deep triangles (chords).
+    """
+
+    stars: NDArray[np.float64]
+    grid_start: NDArray[np.int32]
+    grid_stars: NDArray[np.int32]
+    counts: NDArray[np.int32]
+    bin_start: NDArray[np.int32]
+    patterns: NDArray[np.uint16]
+    pattern_stars: NDArray[np.int32]
+    numbers: NDArray[np.float64]
+
+
+STAR_MAGNITUDE: Final = 3
+"""Column of `IndexArrays.stars`."""
+
+GRID_CELLS: Final = 0
+GRID_MARGIN: Final = 1
+SIDE_BINS: Final = 2
+SIDE_STEP: Final = 3
+SHORTEST_SIDE: Final = 4
+DEEP_SHORTEST: Final = 5
+DEEP_LONGEST: Final = 6
+
+
+@dataclass(frozen=True)
+class IndexSettings:
+    """What an index is built for.
+
+    Attributes
+    ----------
+    limiting_magnitude : float
+        Faintest V of a star in it.
+    blend_rad : float
+        Stars closer than this are seen as one.
+    window_rad : float
+        Largest distance at which a detection is looked up: the margin of the sky grid.
+    field_area_sr : float
+        Solid angle of the field.
+    bright_sides_rad, deep_sides_rad : (float, float)
+        Shortest and longest side of a triangle of bright pattern stars, and of any; the first range holds
+        the second.
+    bright_quota, deep_quota : int
+        Pattern stars within a neighbourhood of half the field's area.
+    cells_per_edge : int
+        Fineness of the sky grid.
+    side_bins : int
+        Bins for each side.
+    """
+
+    limiting_magnitude: float
+    blend_rad: float
+    window_rad: float
+    field_area_sr: float
+    bright_sides_rad: tuple[float, float]
+    deep_sides_rad: tuple[float, float]
+    bright_quota: int
+    deep_quota: int
+    cells_per_edge: int
+    side_bins: int
+
+    def __post_init__(self) -> None:
+        (bright_low, bright_high), (deep_low, deep_high) = self.bright_sides_rad, self.deep_sides_rad
+        if not 0.0 < bright_low <= deep_low < deep_high <= bright_high < math.pi:
+            raise StaridError(
+                f"index sides: bright {self.bright_sides_rad}, deep {self.deep_sides_rad} rad given; "
+                "0 < shortest < longest < π needed, the deep range within the bright one"
+            )
+        if not (
+            self.deep_quota >= self.bright_quota >= 3 and self.cells_per_edge >= 1 and self.side_bins >= 1
+        ):
+            raise StaridError("index: quota must be 3 or more, cells and bins 1 or more")
+
+
+def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float) -> StarCatalog:
+    """Stars to a limit as the sensor sees them: doubles closer than `blend_rad` merged, brightest first."""
+    deep = catalog.brighter_than(limiting_magnitude + _BLEND_DEPTH)
+    return blend(deep, blend_rad).brighter_than(limiting_magnitude)
+
+
+@entry
+def _pick(
+    vectors: NDArray[np.float64],
+    neighbour_start: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    quota: int,
+) -> NDArray[np.bool_]:
+    """Take stars by falling brightness while fewer than `quota` taken ones are their neighbours."""
+    taken = np.zeros(vectors.shape[0], dtype=np.bool_)
+    crowd = np.zeros(vectors.shape[0], dtype=np.int64)
+    for star in range(vectors.shape[0]):
+        if crowd[star] >= quota:
+            continue
+        taken[star] = True
+        for k in range(neighbour_start[star], neighbour_start[star + 1]):
+            crowd[neighbours[k]] += 1
+    return taken
+
+
+def _adjacency(
+    vectors: NDArray[np.float64], radius_rad: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """All pairs within a radius, as compressed rows: (start (m + 1,), neighbours), both ways, ascending."""
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(vectors).query_pairs(2.0 * math.sin(0.5 * radius_rad), output_type="ndarray")
+    left = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    right = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    order = np.lexsort((right, left))
+    start = np.zeros(vectors.shape[0] + 1, dtype=np.int64)
+    np.cumsum(np.bincount(left, minlength=vectors.shape[0]), out=start[1:])
+    return start, np.ascontiguousarray(right[order], dtype=np.int64)
+
+
+def pick_pattern_stars(vectors: NDArray[np.float64], cap_area_sr: float, quota: int) -> NDArray[np.int64]:
+    """Rows of the stars (brightest first in `vectors`) that patterns are made of; see the module."""
+    radius = math.acos(max(1.0 - cap_area_sr / (2.0 * math.pi), -1.0))
+    start, neighbours = _adjacency(vectors, radius)
+    return np.flatnonzero(_pick(vectors, start, neighbours, quota))
+
+
+@inner
+def sorted_triangle(
+    c0: float, c1: float, c2: float, i: int, j: int, k: int
+) -> tuple[float, float, float, int, int, int]:
+    """Sides (opposite i, j, k) sorted longest first, and the corners in the same order."""
+    if c0 < c1:
+        c0, c1, i, j = c1, c0, j, i
+    if c1 < c2:
+        c1, c2, j, k = c2, c1, k, j
+        if c0 < c1:
+            c0, c1, i, j = c1, c0, j, i
+    return c0, c1, c2, i, j, k
+
+
+@inner
+def chord(vectors: NDArray[np.float64], i: int, j: int) -> float:
+    """Chord between two unit vectors, the first three columns of rows i and j."""
+    x = vectors[i, 0] - vectors[j, 0]
+    y = vectors[i, 1] - vectors[j, 1]
+    z = vectors[i, 2] - vectors[j, 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@inner
+def handedness(vectors: NDArray[np.float64], i: int, j: int, k: int) -> int:
+    """1 where the triple product of rows i, j, k is positive, else 0."""
+    product = (
+        vectors[i, 0] * (vectors[j, 1] * vectors[k, 2] - vectors[k, 1] * vectors[j, 2])
+        + vectors[i, 1] * (vectors[j, 2] * vectors[k, 0] - vectors[k, 2] * vectors[j, 0])
+        + vectors[i, 2] * (vectors[j, 0] * vectors[k, 1] - vectors[k, 0] * vectors[j, 1])
+    )
+    return 1 if product > 0.0 else 0
+
+
+@entry
+def _triangles(
+    vectors: NDArray[np.float64],
+    start: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    bright: NDArray[np.bool_],
+    bright_sides: tuple[float, float],
+    deep_sides: tuple[float, float],
+    bins: int,
+) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+    """All triangles i < j < k with sides within their limits: patterns and bins (see `IndexArrays`)."""
+    longest = bright_sides[1]
+    step = longest / SIDE_STEPS
+    count = 0
+    patterns = np.empty((0, 6), dtype=np.uint16)
+    binned = np.empty(0, dtype=np.int64)
+    for fill in range(2):
+        if fill == 1:
+            patterns = np.empty((count, 6), dtype=np.uint16)
+            binned = np.empty(count, dtype=np.int64)
+            count = 0
+        for i in range(vectors.shape[0]):
+            for p in range(start[i], start[i + 1]):
+                j = neighbours[p]
+                if j <= i:
+                    continue
+                c2 = chord(vectors, i, j)
+                both = bright[i] and bright[j]
+                if not both and not deep_sides[0] <= c2 <= deep_sides[1]:
+                    continue
+                for q in range(p + 1, start[i + 1]):
+                    k = neighbours[q]
+                    if not (both and bright[k]) and not deep_sides[0] <= c2 <= deep_sides[1]:
+                        continue
+                    s0, s1, s2, a, b, c = sorted_triangle(
+                        chord(vectors, j, k), chord(vectors, i, k), c2, i, j, k
+                    )
+                    shortest, limit = bright_sides if both and bright[k] else deep_sides
+                    if s2 < shortest or s0 > limit:
+                        continue
+                    if fill == 1:
+                        patterns[count, 0] = round(s0 / step)
+                        patterns[count, 1] = round(s1 / step)
+                        patterns[count, 2] = round(s2 / step)
+                        patterns[count, 3], patterns[count, 4], patterns[count, 5] = a, b, c
+                        hand = handedness(vectors, a, b, c)
+                        bin0 = min(int(s0 / longest * bins), bins - 1)
+                        bin1 = min(int(s1 / longest * bins), bins - 1)
+                        bin2 = min(int(s2 / longest * bins), bins - 1)
+                        binned[count] = ((hand * bins + bin0) * bins + bin1) * bins + bin2
+                    count += 1
+    return patterns, binned
+
+
+@entry
+def _count_field_stars(
+    vectors: NDArray[np.float64], magnitudes: NDArray[np.float64], cap_cosine: float, bins: int
+) -> NDArray[np.int32]:
+    """Cumulative star counts by magnitude in a cap around the centre of each coarse cell."""
+    cells = FACES * COUNT_CELLS * COUNT_CELLS
+    counts = np.zeros((cells + 1, bins), dtype=np.int32)
+    for star in range(magnitudes.shape[0]):
+        counts[cells, magnitude_bin(magnitudes[star], bins)] += 1
+    for face in range(FACES):
+        for i in range(COUNT_CELLS):
+            for j in range(COUNT_CELLS):
+                centre = np.empty(3)
+                centre[face // 2] = 1.0 if face % 2 == 0 else -1.0
+                centre[(face // 2 + 1) % 3] = (2.0 * i + 1.0) / COUNT_CELLS - 1.0
+                centre[(face // 2 + 2) % 3] = (2.0 * j + 1.0) / COUNT_CELLS - 1.0
+                centre /= math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+                cell = cell_of(centre[0], centre[1], centre[2], COUNT_CELLS)
+                for star in range(vectors.shape[0]):
+                    v = vectors[star]
+                    if v[0] * centre[0] + v[1] * centre[1] + v[2] * centre[2] >= cap_cosine:
+                        counts[cell, magnitude_bin(magnitudes[star], bins)] += 1
+    for cell in range(cells + 1):
+        for b in range(1, bins):
+            counts[cell, b] += counts[cell, b - 1]
+    return counts
+
+
+@inner
+def magnitude_bin(magnitude: float, bins: int) -> int:
+    """Bin of a magnitude in `IndexArrays.counts`."""
+    return min(max(int((magnitude - BRIGHTEST_BIN) * BINS_PER_MAGNITUDE), 0), bins - 1)
+
+
+def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
+    """Index over stars sorted by falling brightness, as `seen_stars` gives them.
+
+    Raises
+    ------
+    StaridError
+        Too few stars for a single triangle, or too many pattern stars for the 16-bit corners.
+    """
+    vectors, magnitudes = stars.vectors.copy(), stars.v.copy()
+    grid_start, grid_stars = build_sky_grid(vectors, settings.cells_per_edge, settings.window_rad)
+    half_field = 0.5 * settings.field_area_sr
+    bright_stars = pick_pattern_stars(vectors, half_field, settings.bright_quota)
+    pattern_stars = np.union1d(bright_stars, pick_pattern_stars(vectors, half_field, settings.deep_quota))
+    if pattern_stars.size > SIDE_STEPS:
+        raise StaridError(
+            f"index: {pattern_stars.size} pattern stars, at most {SIDE_STEPS} fit; the field is too narrow"
+        )
+    chosen = np.ascontiguousarray(vectors[pattern_stars])
+    start, neighbours = _adjacency(chosen, settings.bright_sides_rad[1])
+    bright_sides, deep_sides = _chords(settings.bright_sides_rad), _chords(settings.deep_sides_rad)
+    bins = settings.side_bins
+    bright = np.isin(pattern_stars, bright_stars)
+    patterns, binned = _triangles(chosen, start, neighbours, bright, bright_sides, deep_sides, bins)
+    if binned.size == 0:
+        raise StaridError(
+            f"index: no triangle of stars to V {settings.limiting_magnitude:g} fits the field; "
+            "raise the limiting magnitude"
+        )
+    order = np.argsort(binned, kind="stable")
+    bin_start = np.zeros(2 * bins**3 + 1, dtype=np.int32)
+    np.cumsum(np.bincount(binned, minlength=2 * bins**3), out=bin_start[1:])
+    magnitude_bins = max(int((settings.limiting_magnitude - BRIGHTEST_BIN) * BINS_PER_MAGNITUDE) + 1, 1)
+    cap_cosine = 1.0 - settings.field_area_sr / (2.0 * math.pi)
+    counts = _count_field_stars(vectors, magnitudes, cap_cosine, magnitude_bins)
+    numbers = np.array(
+        [
+            settings.cells_per_edge,
+            settings.window_rad,
+            bins,
+            bright_sides[1] / SIDE_STEPS,
+            bright_sides[0],
+            deep_sides[0],
+            deep_sides[1],
+        ]
+    )
+    return IndexArrays(
+        stars=np.column_stack([vectors, magnitudes]),
+        grid_start=grid_start,
+        grid_stars=grid_stars,
+        counts=counts,
+        bin_start=bin_start,
+        patterns=np.ascontiguousarray(patterns[order]),
+        pattern_stars=pattern_stars.astype(np.int32),
+        numbers=numbers,
+    )
+
+
+def _chords(angles: tuple[float, float]) -> tuple[float, float]:
+    """Chords of the unit sphere under two angles."""
+    return 2.0 * math.sin(0.5 * angles[0]), 2.0 * math.sin(0.5 * angles[1])
+
+
+def field_solid_angle(camera: Camera) -> float:
+    """Solid angle of a camera's field, steradians, from the solid angles of a grid of its pixels."""
+    steps = 24
+    x = (np.arange(steps) + 0.5) * camera.width / steps - 0.5
+    y = (np.arange(steps) + 0.5) * camera.height / steps - 0.5
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    here = camera.back_project(grid)
+    right = camera.back_project(grid + np.array([0.01, 0.0])) - here
+    down = camera.back_project(grid + np.array([0.0, 0.01])) - here
+    areas = np.linalg.norm(np.cross(right, down), axis=1) / 1e-4
+    return float(np.nanmean(areas)) * camera.width * camera.height

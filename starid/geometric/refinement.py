@@ -1,0 +1,394 @@
+"""From a coarse attitude to the best one: match, solve, estimate the noise, match again.
+
+Residuals are pixels: ``r = G (u − A c)``, u the direction that a detection sees, c the catalogue star, G the
+derivative of the pixel position by the direction. A turn of the sensor by a small vector v moves the star's
+predicted position by ``G (A c × v)``, which makes weighted least squares a 3 × 3 system; where the focal
+length is unknown, its logarithm is the fourth unknown. Pixel residuals weighted by each star's own error make
+the estimate the maximum-likelihood one for centroid noise, wide fields included.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.geometric.jit_kernels import inner
+from starid.geometric.matching import (
+    BY_NOISE,
+    match_detections,
+    middle_value,
+    residual,
+)
+from starid.geometric.observation import (
+    MAGNITUDE,
+    OFFSET_U,
+    OFFSET_V,
+    SIGMA_U,
+    SIGMA_V,
+    U_X,
+    U_Y,
+    U_Z,
+    V_X,
+    V_Y,
+    V_Z,
+    Raw,
+    Table,
+    observe_again,
+)
+from starid.geometric.pattern_index import STAR_MAGNITUDE, IndexArrays
+from starid.geometric.settings import (
+    MAGNITUDE_GATE,
+    PX_PER_RAD,
+    SCALE_TOLERANCE,
+    SIGMAS_KNOWN,
+    WINDOW,
+)
+
+MAX_ROUNDS: Final = 12
+"""Rounds of matching and solving."""
+
+FEW_MATCHED: Final = 30
+"""Up to so many matches each is tested against the others: one outlier moves all the rest."""
+
+OUTLIER_CHANCE: Final = 3.3e-4
+"""Chance that the test takes a good star for an outlier: that of the window of 4 sigma."""
+
+LEAST_GATE: Final = 0.5
+"""Deviation from the expected magnitude that is always borne."""
+
+PRIOR_FREEDOM: Final = 10.0
+"""Weight of the errors that the caller gives, in degrees of freedom, against what the residuals say."""
+
+MAGNITUDE_FLOOR: Final = 0.1
+MAGNITUDE_CEILING: Final = 1.0
+_RAYLEIGH_MEDIAN: Final = 1.17741
+_MAD_TO_SIGMA: Final = 1.4826
+
+SCALE: Final = 0
+"""Factor on the tangents of the directions."""
+VARIANCE: Final = 1
+"""Mean square of residual over given error, per degree of freedom."""
+RMS: Final = 2
+"""Root mean square distance of the matched stars, pixels."""
+ZERO_POINT: Final = 3
+"""Catalogue minus instrumental magnitude."""
+SCATTER: Final = 4
+"""Its scatter, magnitudes."""
+SCALE_VARIANCE: Final = 5
+"""Variance of the logarithm of the scale in units of the given errors, 0 where it is fixed."""
+NUMBERS: Final = 6
+
+
+@inner
+def turn(rotation: NDArray[np.float64], vx: float, vy: float, vz: float) -> None:
+    """Turn the sensor by +v, in place: ``A ← exp(−[v]×)·A`` (Rodrigues)."""
+    angle2 = vx * vx + vy * vy + vz * vz
+    angle = math.sqrt(angle2)
+    s, c = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    if angle > 1e-4:
+        s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+    for column in range(3):
+        x, y, z = rotation[0, column], rotation[1, column], rotation[2, column]
+        along = c * (vx * x + vy * y + vz * z)
+        keep = 1.0 - c * angle2
+        rotation[0, column] = keep * x + along * vx + s * (vz * y - vy * z)
+        rotation[1, column] = keep * y + along * vy + s * (vx * z - vz * x)
+        rotation[2, column] = keep * z + along * vz + s * (vy * x - vx * y)
+
+
+@inner
+def solve_symmetric(
+    matrix: NDArray[np.float64], right: NDArray[np.float64], size: int, solution: NDArray[np.float64]
+) -> bool:
+    """Solve a positive definite system of the leading `size` rows by Cholesky; False where it is singular."""
+    lower = np.zeros((4, 4))
+    for i in range(size):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not value > 1e-12 * matrix[i, i]:
+                    return False
+                lower[i, i] = math.sqrt(value)
+            else:
+                lower[i, j] = value / lower[j, j]
+    for i in range(size):
+        value = right[i]
+        for k in range(i):
+            value -= lower[i, k] * solution[k]
+        solution[i] = value / lower[i, i]
+    for i in range(size - 1, -1, -1):
+        value = solution[i]
+        for k in range(i + 1, size):
+            value -= lower[k, i] * solution[k]
+        solution[i] = value / lower[i, i]
+    return True
+
+
+@inner
+def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: NDArray[np.float64]) -> None:
+    """Fill (2, 4) with how the predicted position of detection i moves with turn and scale.
+
+    For a turn v it moves by G (c × v), c = (x, y, z) being the star in the sensor; a larger scale, a shorter
+    focal length, draws it to the centre.
+    """
+    ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
+    vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
+    slopes[0, 0], slopes[0, 1], slopes[0, 2] = uy * z - uz * y, uz * x - ux * z, ux * y - uy * x
+    slopes[1, 0], slopes[1, 1], slopes[1, 2] = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
+    slopes[0, 3], slopes[1, 3] = -seen[i, OFFSET_U], -seen[i, OFFSET_V]
+
+
+@inner
+def _outlier(
+    star_table: NDArray[np.float64],
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    normal: NDArray[np.float64],
+    chi2: float,
+    freedom: int,
+    settings: NDArray[np.float64],
+) -> int:
+    """Match that the others speak against most, if by more than chance would have it; else −1.
+
+    Leaving match i out lowers χ² by ``r' (1 − H)⁻¹ r``, H its own block of the hat matrix; the drop over
+    what remains follows an F distribution with 2 and ν − 2 degrees of freedom, whose tail is
+    ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
+    """
+    rest = float(freedom - 2)
+    known = PRIOR_FREEDOM if settings[SIGMAS_KNOWN] > 0.0 else 0.0
+    if rest + known < 1.0:
+        return -1
+    unknowns = 4 if settings[SCALE_TOLERANCE] > 0.0 else 3
+    slopes, unit, column = np.empty((2, 4)), np.empty(4), np.empty(4)
+    worst, least = -1, OUTLIER_CHANCE
+    for i in range(stars.shape[0]):
+        if stars[i] < 0:
+            continue
+        r0, r1, x, y, z = residual(star_table, seen, rotation, i, stars[i])
+        _slopes(seen, i, x, y, z, slopes)
+        su, sv = seen[i, SIGMA_U], seen[i, SIGMA_V]
+        r0, r1 = r0 / su, r1 / sv
+        for k in range(4):
+            slopes[0, k] /= su
+            slopes[1, k] /= sv
+        block = np.zeros((2, 2))
+        for a in range(2):
+            for k in range(unknowns):
+                unit[k] = slopes[a, k]
+            solve_symmetric(normal, unit, unknowns, column)
+            for b in range(2):
+                for k in range(unknowns):
+                    block[a, b] += slopes[b, k] * column[k]
+        h00, h01, h11 = 1.0 - block[0, 0], -block[0, 1], 1.0 - block[1, 1]
+        determinant = h00 * h11 - h01 * h01
+        if not determinant > 1e-9:
+            continue
+        drop = (h11 * r0 * r0 - 2.0 * h01 * r0 * r1 + h00 * r1 * r1) / determinant
+        others = max(chi2 - drop, 0.0) + known
+        tail = (1.0 + drop / max(others, 1e-12)) ** (-0.5 * (rest + known))
+        if tail < least:
+            worst, least = i, tail
+    return worst
+
+
+@inner
+def normal_equations(
+    star_table: NDArray[np.float64],
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    unknowns: int,
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> float:
+    """Fill the normal matrix (4, 4) and right side (4,) over the matches; return Σ (r/σ)².
+
+    The unknowns are the turn of the sensor v (3) and, where there are 4, the change of the logarithm of the
+    scale.
+    """
+    for a in range(4):
+        right[a] = 0.0
+        for b in range(4):
+            normal[a, b] = 0.0
+    chi2 = 0.0
+    slopes = np.empty((2, 4))
+    for i in range(stars.shape[0]):
+        if stars[i] < 0:
+            continue
+        r0, r1, x, y, z = residual(star_table, seen, rotation, i, stars[i])
+        _slopes(seen, i, x, y, z, slopes)
+        weight_u, weight_v = 1.0 / seen[i, SIGMA_U] ** 2, 1.0 / seen[i, SIGMA_V] ** 2
+        chi2 += weight_u * r0 * r0 + weight_v * r1 * r1
+        for a in range(unknowns):
+            at_u, at_v = weight_u * slopes[0, a], weight_v * slopes[1, a]
+            right[a] += at_u * r0 + at_v * r1
+            for b in range(a + 1):
+                normal[a, b] += at_u * slopes[0, b] + at_v * slopes[1, b]
+    for a in range(4):
+        for b in range(a):
+            normal[b, a] = normal[a, b]
+    return chi2
+
+
+@inner
+def photometry(
+    star_table: NDArray[np.float64],
+    seen: Table,
+    stars: NDArray[np.int64],
+    scratch: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Zero point (catalogue minus instrumental magnitude) and its scatter, robust, over the matches."""
+    m = 0
+    for i in range(stars.shape[0]):
+        if stars[i] >= 0:
+            scratch[m] = star_table[stars[i], STAR_MAGNITUDE] - seen[i, MAGNITUDE]
+            m += 1
+    zero_point = middle_value(scratch, m)
+    for k in range(m):
+        scratch[k] = abs(scratch[k] - zero_point)
+    scatter = _MAD_TO_SIGMA * middle_value(scratch, m)
+    return zero_point, min(max(scatter, MAGNITUDE_FLOOR), MAGNITUDE_CEILING)
+
+
+@inner
+def distances(
+    star_table: NDArray[np.float64],
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    scratch: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Noise of a star of unit error from the median distance of the matches (Rayleigh), and their rms, px."""
+    m = 0
+    total = 0.0
+    for i in range(stars.shape[0]):
+        if stars[i] >= 0:
+            r0, r1, _, _, _ = residual(star_table, seen, rotation, i, stars[i])
+            scratch[m] = math.sqrt((r0 / seen[i, SIGMA_U]) ** 2 + (r1 / seen[i, SIGMA_V]) ** 2)
+            total += r0 * r0 + r1 * r1
+            m += 1
+    return middle_value(scratch, m) / _RAYLEIGH_MEDIAN, math.sqrt(total / max(m, 1))
+
+
+@inner
+def _same(stars: NDArray[np.int64], previous: NDArray[np.int64]) -> bool:
+    """Whether the matches stand still; `previous` is brought up to date."""
+    same = True
+    for i in range(stars.shape[0]):
+        if stars[i] != previous[i]:
+            same = False
+            previous[i] = stars[i]
+    return same
+
+
+@inner
+def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> float:
+    """Turn the leading block into the normal matrix of the rotation whatever the scale is.
+
+    Returns the variance of the logarithm of the scale whatever the rotation is.
+    """
+    solve_symmetric(normal, normal[3], 3, scratch)
+    weight = normal[3, 3]
+    for a in range(3):
+        weight -= normal[3, a] * scratch[a]
+    for a in range(3):
+        for b in range(3):
+            normal[a, b] -= normal[a, 3] * normal[3, b] / normal[3, 3]
+    return float(1.0 / weight)
+
+
+@inner
+def refine(
+    index: IndexArrays,
+    raw: Raw,
+    given: Table,
+    settings: NDArray[np.float64],
+    least_matched: int,
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    normal: NDArray[np.float64],
+    numbers: NDArray[np.float64],
+) -> int:
+    """Match and solve until the matches stand still.
+
+    Parameters
+    ----------
+    raw, given
+        Detections as the caller gave them, and sorted (`observe`).
+    least_matched : int
+        Fewer matches are a failure.
+    seen : Table
+        Where the focal length is free: filled with the detections under the refined one. Else `given`.
+    rotation : ndarray (3, 3)
+        ICRS→sensor; coarse on entry, refined on return.
+    stars : ndarray (n,) int64
+        Filled: index star of each detection, −1 without.
+    normal : ndarray (4, 4)
+        Filled: normal matrix of the rotation in units of the given errors (leading 3 × 3).
+    numbers : ndarray (`NUMBERS`,)
+        `SCALE` and `ZERO_POINT` on entry, all of them on return.
+
+    Returns
+    -------
+    int
+        Stars matched, 0 where it failed.
+    """
+    n = given.shape[0]
+    star_table = index.stars
+    previous, costs, scratch = np.empty(n, dtype=np.int64), np.empty(n), np.empty(max(n, 4))
+    size = 16
+    while size < 4 * n:
+        size *= 2
+    owners, refused = np.empty(size, dtype=np.int64), np.zeros(n, dtype=np.bool_)
+    right, step = np.empty(4), np.zeros(4)
+    free_scale = settings[SCALE_TOLERANCE] > 0.0
+    unknowns = 4 if free_scale else 3
+    if free_scale:
+        observe_again(raw, given, numbers[SCALE], seen)
+    gate, numbers[SCATTER] = settings[MAGNITUDE_GATE], settings[MAGNITUDE_GATE]
+    reach, sigma = settings[WINDOW], 1.0
+    matched = 0
+    for number in range(MAX_ROUNDS):
+        matched = match_detections(
+            index, seen, rotation, refused, (reach, sigma, gate, settings[PX_PER_RAD]),
+            numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
+        )  # fmt: skip
+        if matched < least_matched:
+            return 0
+        stable = _same(stars, previous) and number > 0
+        chi2 = normal_equations(star_table, seen, rotation, stars, unknowns, normal, right)
+        if not solve_symmetric(normal, right, unknowns, step):
+            return 0
+        for k in range(unknowns):
+            chi2 -= right[k] * step[k]
+        turn(rotation, step[0], step[1], step[2])
+        if free_scale:
+            numbers[SCALE] *= math.exp(step[3])
+            observe_again(raw, given, numbers[SCALE], seen)
+        freedom = max(2 * matched - unknowns, 1)
+        numbers[VARIANCE] = max(chi2, 1e-12) / freedom
+        if stable:
+            worst = -1
+            if matched <= FEW_MATCHED:
+                worst = _outlier(star_table, seen, rotation, stars, normal, chi2, freedom, settings)
+            if worst < 0:
+                break
+            refused[worst] = True
+        sigma = math.sqrt(numbers[VARIANCE])
+        if number == 0:
+            # wrong pairs may be among the first matches: robust estimates
+            sigma, _ = distances(star_table, seen, rotation, stars, scratch)
+            sigma *= math.sqrt(2.0 * matched / freedom)
+            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, stars, scratch)
+            gate = min(gate, max(5.0 * numbers[SCATTER], LEAST_GATE))
+            reach = BY_NOISE
+    _, numbers[RMS] = distances(star_table, seen, rotation, stars, scratch)
+    numbers[SCALE_VARIANCE] = _marginalise(normal, scratch) if free_scale else 0.0
+    return matched

@@ -1,0 +1,189 @@
+"""Tracking: the attitude near a predicted one.
+
+Bright detections are paired with the catalogue stars within a window around where the prediction puts them.
+Two such pairs that keep their distance give an attitude, which goes through the same sequential test,
+refinement and verification as one found lost in space. A prediction that is off by any turn within the
+window, roll included, is followed; anything else is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.geometric.answer import (
+    LEAST_MATCHED,
+    Answer,
+    Candidate,
+    finish,
+    judged,
+    new_candidate,
+)
+from starid.geometric.jit_kernels import entry, inner
+from starid.geometric.matching import to_sky
+from starid.geometric.observation import MAGNITUDE, Raw, Table, observe
+from starid.geometric.pattern_index import (
+    DEEP_SHORTEST,
+    GRID_CELLS,
+    GRID_MARGIN,
+    STAR_MAGNITUDE,
+    IndexArrays,
+    chord,
+)
+from starid.geometric.refinement import SCALE, ZERO_POINT
+from starid.geometric.search import set_rotation
+from starid.geometric.settings import (
+    ACCEPTED,
+    FIELD_PX,
+    LOG_CHANCE_TRACKING,
+    MAGNITUDE_GATE,
+    NOTHING,
+    PX_PER_RAD,
+    SEARCH_TOLERANCE,
+    TEST_WINDOW,
+    TOO_FEW,
+)
+from starid.geometric.sky_grid import cell_of
+from starid.geometric.verification import ROTATIONS, hit_odds, test_order
+from starid.projection import MODEL
+
+PAIRED: Final = 16
+"""Brightest detections that pairs are made of."""
+
+CANDIDATES: Final = 6
+"""Catalogue stars considered for each of them, the brightest in its window."""
+
+
+@inner
+def _stars_near(
+    index: IndexArrays, x: float, y: float, z: float, window_rad: float, found: NDArray[np.int64], row: int
+) -> int:
+    """Fill a row with the brightest stars within a window around a direction; return how many."""
+    stars = index.stars
+    first, last, listed = 0, stars.shape[0], False
+    if window_rad <= index.numbers[GRID_MARGIN]:
+        cell = cell_of(x, y, z, int(index.numbers[GRID_CELLS]))
+        first, last, listed = (
+            int(np.int64(index.grid_start[cell])),
+            int(np.int64(index.grid_start[cell + 1])),
+            True,
+        )
+    count = 0
+    for place in range(first, last):
+        star = int(np.int64(index.grid_stars[place])) if listed else place
+        dx, dy, dz = stars[star, 0] - x, stars[star, 1] - y, stars[star, 2] - z
+        if dx * dx + dy * dy + dz * dz < window_rad * window_rad:
+            found[row, count] = star
+            count += 1
+            if count == found.shape[1]:
+                break
+    return count
+
+
+@inner
+def _try_pair(
+    index: IndexArrays,
+    raw: Raw,
+    given: Table,
+    settings: NDArray[np.float64],
+    candidate: Candidate,
+    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    detections: tuple[int, int],
+    stars: tuple[int, int],
+    prior_volume: float,
+) -> float:
+    """Bound of the attitude that two pairs give, left in `candidate`; 0 where it falls through."""
+    i, j = detections
+    a, b = stars
+    da = index.stars[a, STAR_MAGNITUDE] - given[i, MAGNITUDE]
+    db = index.stars[b, STAR_MAGNITUDE] - given[j, MAGNITUDE]
+    if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
+        return 0.0
+    candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
+    set_rotation(given, (i, i, j), raw.params[MODEL], 1.0, index.stars, (a, a, b), candidate.frames)
+    _, bound = judged(index, raw, given, settings, candidate, tests, (i, j, j), prior_volume)
+    return bound
+
+
+@inner
+def _try_detections(
+    index: IndexArrays,
+    raw: Raw,
+    given: Table,
+    settings: NDArray[np.float64],
+    candidate: Candidate,
+    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    detections: tuple[int, int],
+    near: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    prior_volume: float,
+    work: NDArray[np.int64],
+) -> float:
+    """Try all pairs of stars near two detections; return the bound of the first that stands, or 0.
+
+    `work` counts pairs, and those that keep the distance.
+    """
+    i, j = detections
+    separation = chord(given, i, j)
+    if separation < index.numbers[DEEP_SHORTEST]:
+        return 0.0
+    for p in range(counts[i]):
+        for q in range(counts[j]):
+            a, b = near[i, p], near[j, q]
+            work[0] += 1
+            if a == b or abs(chord(index.stars, a, b) - separation) > settings[SEARCH_TOLERANCE]:
+                continue
+            work[1] += 1
+            bound = _try_pair(index, raw, given, settings, candidate, tests, detections, (a, b), prior_volume)
+            if bound < settings[LOG_CHANCE_TRACKING]:
+                return bound
+    return 0.0
+
+
+@entry
+def track_kernel(
+    index: IndexArrays,
+    params: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    flux: NDArray[np.float64],
+    sigmas: NDArray[np.float64],
+    settings: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    window_rad: float,
+) -> Answer:
+    """Find the attitude near a predicted one.
+
+    Parameters
+    ----------
+    predicted : ndarray (3, 3)
+        ICRS→sensor.
+    window_rad : float
+        Largest angle of a star from where the prediction puts it.
+    """
+    raw = Raw(params, xy, flux, sigmas)
+    given = observe(raw)
+    n = given.shape[0]
+    candidate = new_candidate(n)
+    tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
+    # a star at the border of the field still lies within the window after a turn of window/(field's radius)
+    roll = min(window_rad * settings[PX_PER_RAD] / math.sqrt(settings[FIELD_PX] / math.pi), math.pi)
+    prior_volume = min(2.0 * math.pi * window_rad**2 * roll, ROTATIONS)
+    near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
+    counts = np.zeros(PAIRED, dtype=np.int64)
+    status, bound, work = TOO_FEW if n < LEAST_MATCHED else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
+    for j in range(min(n, PAIRED) if status == NOTHING else 0):
+        x, y, z = to_sky(predicted, given, j)
+        counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
+        for i in range(j):
+            bound = _try_detections(
+                index, raw, given, settings, candidate, tests, (i, j), near, counts, prior_volume, work
+            )
+            if bound < 0.0:
+                status = ACCEPTED
+                break
+        if status == ACCEPTED:
+            break
+    return finish(status, given, candidate, settings, bound, work[0], work[1])

@@ -1,0 +1,270 @@
+"""How much an agreement between detections and catalogue is worth: tested fast, then stated.
+
+Two stages. `worth_refining` tests a candidate attitude star by star by Wald's sequential probability ratio:
+wrong candidates die after a handful of look-ups. `log_false_probability` is the judgement.
+
+It compares two explanations of the detections. *Chance*: each of n detections lies anywhere in the field of
+area A. *Sky*: an attitude drawn uniformly from all rotations; then each detection is, with probability a, a
+catalogue star of about its brightness, seen with the centroid noise, else anywhere. A detection matched to a
+star at distance r with magnitude deviation Δm thus favours the sky by
+
+    (1 − a) + a · A · w · N₂(r; σ) ,  w = N(Δm; s)/λ(m)  (at most 1),
+
+λ(m) being the catalogue stars a magnitude in the field: the chance that it is just this one of the stars of
+its brightness. Unmatched ones give 1 − a. The product is integrated over the attitude (Laplace's method:
+the posterior's volume over the prior's), over the photometric zero point, over the noise where it was
+estimated, and averaged over a few shares a. The result is a Bayes factor B whose expectation under chance
+is 1, so that by Markov's inequality chance reaches B or more with a probability of at most 1/B, however long
+the search was: 1/B is the bound that a solution states.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.geometric.jit_kernels import inner
+from starid.geometric.matching import residual
+from starid.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
+from starid.geometric.pattern_index import (
+    BINS_PER_MAGNITUDE,
+    COUNT_CELLS,
+    GRID_CELLS,
+    STAR_MAGNITUDE,
+    IndexArrays,
+    magnitude_bin,
+)
+from starid.geometric.refinement import SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
+from starid.geometric.settings import FIELD_PX, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
+from starid.geometric.sky_grid import cell_of
+from starid.projection import MODEL
+
+TRUE_SHARE: Final = 0.5
+"""Share of the detections that are catalogue stars, for the sequential test."""
+
+REJECT_BELOW: Final = -2.6
+"""Logarithmic odds at which a candidate is dropped: four misses in a row."""
+
+ACCEPT_ABOVE: Final = 9.0
+"""Logarithmic odds at which the sequential test passes a candidate on."""
+
+MAX_TESTED: Final = 40
+"""Detections tested at most."""
+
+ROTATIONS: Final = 8.0 * math.pi**2
+"""Volume of all rotations, measured in rotation vectors (rad³)."""
+
+ZERO_POINT_RANGE: Final = 10.0
+"""Magnitudes over which the photometric zero point may lie."""
+
+NOISE_RANGE: Final = math.log(5.0 / 0.05)
+"""Logarithmic range of the centroid noise where it is estimated."""
+
+SHARES: Final = (0.2, 0.5, 0.9)
+"""Shares of true stars among the detections that the Bayes factor is averaged over."""
+
+_SMALL: Final = 1e-150
+"""Beyond this, and its inverse, a product is turned into its logarithm."""
+
+SCATTER_FLOOR: Final = 0.15
+"""Least scatter of magnitudes believed in the judgement."""
+
+
+@inner
+def hit_odds(index: IndexArrays, window_rad: float) -> NDArray[np.float64]:
+    """Logarithm of the odds that a hit gives, for each magnitude limit of the look-up (bins)."""
+    sky, bins = index.counts.shape[0] - 1, index.counts.shape[1]
+    odds = np.empty(bins)
+    for b in range(bins):
+        chance = min(0.25 * index.counts[sky, b] * window_rad * window_rad + 1e-6, 0.9)
+        odds[b] = math.log(TRUE_SHARE / chance + 1.0 - TRUE_SHARE)
+    return odds
+
+
+@inner
+def test_order(count: int) -> NDArray[np.int64]:
+    """Order in which detections are tested: the brightest, and those of the fainter half, in turn.
+
+    The brightest are the most telling, but they are also where false stars gather. Each pattern begins at
+    another place of it, so that no handful of false stars can stop them all.
+    """
+    order = np.empty(count, dtype=np.int64)
+    half = (count + 1) // 2
+    for i in range(half):
+        order[2 * i] = i
+        if 2 * i + 1 < count:
+            order[2 * i + 1] = half + i
+    return order
+
+
+@inner
+def worth_refining(
+    index: IndexArrays,
+    params: NDArray[np.float64],
+    given: Table,
+    rotation: NDArray[np.float64],
+    scale: float,
+    faintest_offset: float,
+    settings: NDArray[np.float64],
+    odds: NDArray[np.float64],
+    order: NDArray[np.int64],
+    used: tuple[int, int, int],
+) -> bool:
+    """Sequential test of a candidate attitude on detections outside its pattern.
+
+    Parameters
+    ----------
+    params : ndarray
+        The camera.
+    scale : float
+        By which its focal length is to be divided (1 where it is known).
+    faintest_offset : float
+        Catalogue minus instrumental magnitude that a true star can have at most.
+    odds : ndarray
+        From `hit_odds`.
+    order : ndarray
+        From `test_order`.
+    used : (int, int, int)
+        Detections of the pattern.
+    """
+    stars, grid_start, grid_stars = index.stars, index.grid_start, index.grid_stars
+    cells = int(index.numbers[GRID_CELLS])
+    limit2 = settings[TEST_WINDOW] * settings[TEST_WINDOW]
+    miss = math.log(1.0 - TRUE_SHARE)
+    total = 0.0
+    hits = 0
+    count = order.shape[0]
+    place = (used[0] + used[1] + used[2]) % count
+    for _ in range(min(count, MAX_TESTED)):
+        i = order[place]
+        place += 1
+        if place == count:
+            place = 0
+        if i == used[0] or i == used[1] or i == used[2]:
+            continue
+        u, v, w = scaled(params[MODEL], given[i, X], given[i, Y], given[i, Z], scale)
+        x = rotation[0, 0] * u + rotation[1, 0] * v + rotation[2, 0] * w
+        y = rotation[0, 1] * u + rotation[1, 1] * v + rotation[2, 1] * w
+        z = rotation[0, 2] * u + rotation[1, 2] * v + rotation[2, 2] * w
+        faintest = given[i, MAGNITUDE] + faintest_offset
+        cell = cell_of(x, y, z, cells)
+        hit = False
+        for entry in range(grid_start[cell], grid_start[cell + 1]):
+            star = grid_stars[entry]
+            if stars[star, STAR_MAGNITUDE] > faintest:
+                break
+            dx, dy, dz = stars[star, 0] - x, stars[star, 1] - y, stars[star, 2] - z
+            if dx * dx + dy * dy + dz * dz < limit2:
+                hit = True
+                break
+        total += odds[magnitude_bin(faintest, odds.shape[0])] if hit else miss
+        hits += 1 if hit else 0
+        if total < REJECT_BELOW:
+            return False
+        if total > ACCEPT_ABOVE and hits > 1:
+            return True
+    return total > 0.0 and hits > 0
+
+
+@inner
+def _stars_per_magnitude(counts: NDArray[np.int32], cell: int, magnitude: float) -> float:
+    """Catalogue stars a magnitude in a field, smoothed over one magnitude; at least one."""
+    bins = counts.shape[1]
+    middle = magnitude_bin(magnitude, bins)
+    low, high = middle - BINS_PER_MAGNITUDE // 2 - 1, min(middle + BINS_PER_MAGNITUDE // 2, bins - 1)
+    stars = float(counts[cell, high])
+    if low >= 0:
+        stars -= counts[cell, low]
+    return float(max(stars * BINS_PER_MAGNITUDE / (high - max(low, -1)), 1.0))
+
+
+@inner
+def _log_detections(
+    index: IndexArrays,
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    numbers: NDArray[np.float64],
+    field_px: float,
+) -> float:
+    """Logarithm of the product over the detections, averaged over `SHARES`; see the module."""
+    star_table, counts = index.stars, index.counts
+    cell = cell_of(rotation[2, 0], rotation[2, 1], rotation[2, 2], COUNT_CELLS)
+    scatter = max(numbers[SCATTER], SCATTER_FLOOR)
+    deviation_of_one = math.sqrt(numbers[VARIANCE])
+    totals, products = np.zeros(len(SHARES)), np.ones(len(SHARES))
+    for i in range(stars.shape[0]):
+        gain = 0.0
+        star = stars[i]
+        if star >= 0:
+            magnitude = star_table[star, STAR_MAGNITUDE]
+            r0, r1, _, _, _ = residual(star_table, seen, rotation, i, star)
+            su, sv = deviation_of_one * seen[i, SIGMA_U], deviation_of_one * seen[i, SIGMA_V]
+            here = math.exp(-0.5 * ((r0 / su) ** 2 + (r1 / sv) ** 2)) / (2.0 * math.pi * su * sv)
+            deviation = (magnitude - seen[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
+            brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
+            weight = min(brightness / _stars_per_magnitude(counts, cell, magnitude), 1.0)
+            gain = field_px * weight * here
+        for k in range(len(SHARES)):
+            products[k] *= 1.0 - SHARES[k] + SHARES[k] * gain
+            if not _SMALL < products[k] < 1.0 / _SMALL:
+                totals[k] += math.log(products[k])
+                products[k] = 1.0
+    for k in range(len(SHARES)):
+        totals[k] += math.log(products[k])
+    best = totals[0]
+    for k in range(1, len(SHARES)):
+        best = max(best, totals[k])
+    mean = 0.0
+    for k in range(len(SHARES)):
+        mean += math.exp(totals[k] - best) / len(SHARES)
+    return float(best + math.log(mean))
+
+
+@inner
+def log_false_probability(
+    index: IndexArrays,
+    seen: Table,
+    rotation: NDArray[np.float64],
+    stars: NDArray[np.int64],
+    matched: int,
+    normal: NDArray[np.float64],
+    numbers: NDArray[np.float64],
+    settings: NDArray[np.float64],
+    prior_volume: float,
+) -> float:
+    """Logarithm of the bound on the probability that an agreement is chance; see the module.
+
+    Parameters
+    ----------
+    seen : Table
+        Detections as the refined attitude sees them (rescaled where the focal length was free).
+    rotation, stars, matched, normal, numbers
+        As `starid.geometric.refinement.refine` leaves them.
+    prior_volume : float
+        Volume of the rotations that were possible beforehand, rad³: `ROTATIONS` when lost in space.
+    """
+    spread = settings[SCALE_TOLERANCE]
+    freedom = 2 * matched - (4 if spread > 0.0 else 3)
+    variance = numbers[VARIANCE]
+    determinant = (
+        normal[0, 0] * (normal[1, 1] * normal[2, 2] - normal[1, 2] * normal[2, 1])
+        - normal[0, 1] * (normal[1, 0] * normal[2, 2] - normal[1, 2] * normal[2, 0])
+        + normal[0, 2] * (normal[1, 0] * normal[2, 1] - normal[1, 1] * normal[2, 0])
+    )
+    if freedom <= 0 or not (determinant > 0.0 and variance > 0.0):
+        return 0.0
+    log_factor = _log_detections(index, seen, rotation, stars, numbers, settings[FIELD_PX])
+    half_volume = 1.5 * math.log(2.0 * math.pi * variance) - 0.5 * math.log(determinant)
+    log_factor += min(half_volume - math.log(prior_volume), 0.0)
+    scatter = max(numbers[SCATTER], SCATTER_FLOOR)
+    log_factor += min(math.log(math.sqrt(2.0 * math.pi / matched) * scatter / ZERO_POINT_RANGE), 0.0)
+    if settings[SIGMAS_KNOWN] == 0.0:
+        log_factor += min(math.log(math.sqrt(math.pi / freedom) / NOISE_RANGE), 0.0)
+    if spread > 0.0:
+        error = math.sqrt(variance * numbers[SCALE_VARIANCE])
+        log_factor += min(math.log(math.sqrt(2.0 * math.pi) * error / (2.0 * spread)), 0.0)
+    return min(-log_factor, 0.0)

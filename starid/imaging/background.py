@@ -1,0 +1,195 @@
+"""Background and noise of a frame: robust in blocks, interpolated between their centres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.jit_loops import compiled_loops, compiled_sums
+
+BLOCK_PX: Final = 32
+"""Side of a block; stars fill a percent of it, glare hardly bends within it."""
+
+LEAST_NOISE_DN: Final = 12.0**-0.5
+"""Rounding to whole counts alone has this standard deviation."""
+
+_ROW_STEP: Final = 4
+_FIRST_SAMPLES: Final = 32
+_CLIP_SIGMA: Final = 3.5
+_QUARTILE_SIGMA: Final = 1.349
+_ROUNDS: Final = 2
+_LEAST_SAMPLES: Final = 8.0
+
+
+@dataclass(frozen=True)
+class Background:
+    """Background on a grid of blocks.
+
+    Attributes
+    ----------
+    level, noise : ndarray (rows, columns), float32
+        Counts; value in the middle of a block and standard deviation about the plane through its pixels, both
+        without its stars.
+    block_px : float
+        Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
+    """
+
+    level: npt.NDArray[np.float32]
+    noise: npt.NDArray[np.float32]
+    block_px: int
+
+    @property
+    def median_level(self) -> float:
+        """Typical background, counts."""
+        return float(np.median(self.level))
+
+    @property
+    def median_noise(self) -> float:
+        """Typical noise of a pixel, counts."""
+        return float(np.median(self.noise))
+
+
+@compiled_sums
+def _refine(
+    values: npt.NDArray[np.float32],
+    dx: npt.NDArray[np.float32],
+    dy: npt.NDArray[np.float32],
+    start: tuple[float, float],
+    plane: npt.NDArray[np.float32],
+) -> None:
+    """Plane through the samples of a block without its stars: (level, slopes by dx and dy, noise).
+
+    Samples farther than 3.5 sigmas from the plane are left out, half a count more being allowed, so that rounding to
+    counts does not make the interval lopsided. The places `dx`, `dy` are measured from their mean.
+    """
+    level, sigma = np.float32(start[0]), np.float32(start[1])
+    along = across = np.float32(0.0)
+    for _ in range(_ROUNDS):
+        reach = np.float32(_CLIP_SIGMA) * sigma + np.float32(0.5)
+        kept = total = squares = tilt = tilt2 = lean = lean2 = np.float32(0.0)
+        for k in range(values.size):
+            off = values[k] - level - along * dx[k] - across * dy[k]
+            inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
+            off *= inside
+            kept += inside
+            total += off
+            squares += off * off
+            tilt += off * dx[k]
+            tilt2 += inside * dx[k] * dx[k]
+            lean += off * dy[k]
+            lean2 += inside * dy[k] * dy[k]
+        if kept < np.float32(_LEAST_SAMPLES):
+            break
+        mean = total / kept
+        explained = mean * mean
+        level += mean
+        if tilt2 > np.float32(0.0):
+            along += tilt / tilt2
+            explained += tilt * tilt / (tilt2 * kept)
+        if lean2 > np.float32(0.0):
+            across += lean / lean2
+            explained += lean * lean / (lean2 * kept)
+        sigma = np.sqrt(max(squares / kept - explained, np.float32(LEAST_NOISE_DN**2)))
+    plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
+
+
+@compiled_loops
+def _sample_places(
+    columns: int, count: int, dx: npt.NDArray[np.float32], dy: npt.NDArray[np.float32]
+) -> None:
+    """Places of the samples of a block from their mean, pixels: every fourth row, all its columns."""
+    middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (count // columns - 1)
+    for k in range(count):
+        dx[k] = np.float32(k % columns - middle_x)
+        dy[k] = np.float32((k // columns - middle_y) * _ROW_STEP)
+
+
+@compiled_loops
+def _block_statistics(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    block: int,
+    level: npt.NDArray[np.float32],
+    noise: npt.NDArray[np.float32],
+) -> None:
+    """Median and quartiles of a few pixels of every block first, then a plane through every fourth row of it."""
+    height, width = image.shape
+    first = np.empty(_FIRST_SAMPLES, np.int32)
+    values = np.empty(block * block, np.float32)
+    dx = np.empty(block * block, np.float32)
+    dy = np.empty(block * block, np.float32)
+    laid = (0, 0)
+    plane = np.empty(4, np.float32)
+    for row in range(level.shape[0]):
+        for column in range(level.shape[1]):
+            top = min(row * block, max(height - block, 0))
+            left = min(column * block, max(width - block, 0))
+            bottom = min(top + block, height)
+            columns = min(left + block, width) - left
+            count = 0
+            for y in range(top + column % _ROW_STEP, bottom, _ROW_STEP):
+                line = image[y, left : left + columns]
+                for x in range(columns):
+                    values[count + x] = np.float32(line[x])
+                count += columns
+            step = max(count // _FIRST_SAMPLES, 1)
+            chosen = min(count // step, _FIRST_SAMPLES)
+            for k in range(chosen):
+                key = np.int32(values[k * step])
+                j = k - 1
+                while j >= 0 and first[j] > key:
+                    first[j + 1] = first[j]
+                    j -= 1
+                first[j + 1] = key
+            spread = (first[(3 * chosen) // 4] - first[chosen // 4]) / _QUARTILE_SIGMA
+            if laid != (columns, count):
+                laid = (columns, count)
+                _sample_places(columns, count, dx, dy)
+            start = (float(first[chosen // 2]), max(spread, 0.5))
+            _refine(values[:count], dx[:count], dy[:count], start, plane)
+            # from the middle of the sampled pixels to the middle of the block's place on the grid
+            first_row = top + column % _ROW_STEP
+            last_row = first_row + _ROW_STEP * (count // columns - 1)
+            off_y = (row + 0.5) * block - 0.5 - 0.5 * (first_row + last_row)
+            off_x = (column + 0.5) * block - 0.5 - (left + 0.5 * (columns - 1))
+            level[row, column] = plane[0] + plane[1] * off_x + plane[2] * off_y
+            noise[row, column] = plane[3]
+
+
+def estimate_background(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], block_px: int = BLOCK_PX
+) -> Background:
+    """Background and noise of an image (h, w) on a grid of blocks.
+
+    A block that lies over the image's edge is moved inside, so that every block is whole; images smaller than a
+    block are one block.
+    """
+    height, width = image.shape
+    rows, columns = -(-height // block_px), -(-width // block_px)
+    level = np.empty((rows, columns), dtype=np.float32)
+    noise = np.empty((rows, columns), dtype=np.float32)
+    _block_statistics(image, block_px, level, noise)
+    return Background(level, noise, block_px)
+
+
+@compiled_loops
+def grid_place(position: float, block: float, count: int) -> tuple[int, int, float]:
+    """The two of `count` block centres that a pixel lies between, and how far towards the second.
+
+    Beyond the outermost centres the share runs on below 0 or above 1, so that slopes go on to the image's edge.
+    """
+    u = (position + 0.5) / block - 0.5
+    i = min(max(int(u), 0), max(count - 2, 0))
+    return i, min(i + 1, count - 1), u - i
+
+
+@compiled_loops
+def interpolate_at(grid: npt.NDArray[np.float32], block: float, x: float, y: float) -> float:
+    """Value of a grid of blocks at a pixel position, linear between block centres and on to the edges."""
+    i, i2, q = grid_place(y, block, grid.shape[0])
+    j, j2, p = grid_place(x, block, grid.shape[1])
+    upper = grid[i, j] * (1.0 - p) + grid[i, j2] * p
+    lower = grid[i2, j] * (1.0 - p) + grid[i2, j2] * p
+    return float(upper * (1.0 - q) + lower * q)

@@ -1,0 +1,319 @@
+"""Sub-pixel position and flux of a star: the maximum-likelihood fit of its spot to the pixels around it.
+
+The model of a pixel is flux × (share of the spot in the pixel) + background. Position and flux are found by
+Gauss–Newton steps on the weighted squares, each pixel weighted by the inverse of its variance under the model:
+background noise, shot noise of the star's own light, and a share of its light for what the model does not hold
+(pixel response, shape of the spot). The inverse of the normal matrix is then the covariance of the estimate, that
+is the Cramér–Rao bound for the noise given. Saturated pixels carry no weight.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.jit_loops import compiled_loops, compiled_sums
+from starid.imaging.normal_table import normal
+
+FIT_COLUMNS: Final = 9
+X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
+"""Columns of a table of fits; STATE is one of the numbers below."""
+
+UNUSABLE: Final = 1e9
+"""Counts from which on a pixel of a window carries no weight: saturated ones and masked ones are set to infinity."""
+
+GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
+
+_ITERATIONS: Final = 12
+_CONVERGED_PX: Final = 1e-3
+_CONVERGED_SIGMA: Final = 0.05
+_CONVERGED_FLUX: Final = 0.01
+_SETTLED_PX: Final = 0.02
+_MAX_STEP_PX: Final = 1.0
+_FLOOR_FLUX: Final = 1e-6
+_LEAST_PIXELS: Final = 5
+_PIXEL_VARIANCE: Final = 1.0 / 12.0
+_FAR: Final = 5.0
+SHORT_TRAIL_PX: Final = 0.5
+"""A shorter trail is fitted as a round spot."""
+
+
+@compiled_loops
+def spot_profile(
+    centre: float,
+    sigma: float,
+    first: int,
+    share: npt.NDArray[np.float64],
+    slope: npt.NDArray[np.float64],
+    count: int,
+) -> None:
+    """Shares of a Gaussian at `centre` in `count` pixels from `first` on, and their derivatives by the centre."""
+    scale = 1.0 / sigma
+    z = (first - 0.5 - centre) * scale
+    cdf, bell = normal(z)
+    for k in range(count):
+        z += scale
+        next_cdf, next_bell = normal(z)
+        share[k] = next_cdf - cdf
+        slope[k] = (bell - next_bell) * scale
+        cdf = next_cdf
+        bell = next_bell
+
+
+@compiled_loops
+def spot_model(
+    x: float,
+    y: float,
+    sigma: float,
+    window: tuple[int, int, int, int],
+    model: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+) -> None:
+    """Shares of a round spot in the pixels of a window.
+
+    Parameters
+    ----------
+    x, y, sigma : float
+        Centre and standard deviation, pixels.
+    window : (int, int, int, int)
+        Image column and row of the first pixel; columns and rows.
+    model : ndarray (3, rows·columns)
+        Filled with the share of the light in each pixel, row by row, and its derivatives by x and by y.
+    work : ndarray (4, side)
+        Scratch; side at least that of the window.
+    """
+    left, top, columns, rows = window
+    share_x, slope_x, share_y, slope_y = work[0], work[1], work[2], work[3]
+    spot_profile(x, sigma, left, share_x, slope_x, columns)
+    spot_profile(y, sigma, top, share_y, slope_y, rows)
+    k = 0
+    for j in range(rows):
+        for i in range(columns):
+            model[0, k] = share_x[i] * share_y[j]
+            model[1, k] = slope_x[i] * share_y[j]
+            model[2, k] = share_x[i] * slope_y[j]
+            k += 1
+
+
+@compiled_loops
+def trail_model(
+    x: float,
+    y: float,
+    sigma: float,
+    trail: tuple[float, float],
+    window: tuple[int, int, int, int],
+    model: npt.NDArray[np.float64],
+) -> None:
+    """As `spot_model`, for a spot that moves evenly by `trail` pixels during the exposure, x and y its middle.
+
+    Along the trail the light is a Gaussian smeared over its length, across it a Gaussian; the pixel's own size
+    counts as 1/12 square pixel more of the spot's variance.
+    """
+    left, top, columns, rows = window
+    length = math.hypot(trail[0], trail[1])
+    along_x, along_y = trail[0] / length, trail[1] / length
+    inverse = 1.0 / math.sqrt(sigma * sigma + _PIXEL_VARIANCE)
+    half = 0.5 * length
+    per_length = 1.0 / length
+    k = -1
+    for j in range(rows):
+        dy = top + j - y
+        for i in range(columns):
+            k += 1
+            dx = left + i - x
+            u = dx * along_x + dy * along_y
+            v = (dy * along_x - dx * along_y) * inverse
+            head = (u + half) * inverse
+            tail = (u - half) * inverse
+            if abs(v) > _FAR or tail > _FAR or head < -_FAR:
+                model[0, k] = model[1, k] = model[2, k] = 0.0
+                continue
+            _, across = normal(v)
+            across *= inverse
+            head_cdf, head_bell = normal(head)
+            tail_cdf, tail_bell = normal(tail)
+            along = (head_cdf - tail_cdf) * per_length
+            by_u = (tail_bell - head_bell) * inverse * per_length * across
+            by_v = along * across * v * inverse
+            model[0, k] = along * across
+            model[1, k] = by_u * along_x - by_v * along_y
+            model[2, k] = by_u * along_y + by_v * along_x
+
+
+@compiled_loops
+def star_model(
+    x: float,
+    y: float,
+    shape: tuple[float, float, float],
+    window: tuple[int, int, int, int],
+    model: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+) -> None:
+    """Model of a round spot or of a trail, whichever the shape (sigma, trail x, trail y) says."""
+    if math.hypot(shape[1], shape[2]) > SHORT_TRAIL_PX:
+        trail_model(x, y, shape[0], (shape[1], shape[2]), window, model)
+    else:
+        spot_model(x, y, shape[0], window, model, work)
+
+
+@compiled_sums
+def _normal_equations(
+    pixels: npt.NDArray[np.float32],
+    model: npt.NDArray[np.float64],
+    flux: float,
+    noise: tuple[float, float, float],
+    sums: npt.NDArray[np.float64],
+) -> None:
+    """Sums over a window that a Gauss–Newton step needs; see the order in `fit_star`."""
+    variance, per_dn, model_error = noise
+    error2 = model_error * model_error
+    a_xx = a_xy = a_yy = a_xf = a_yf = a_ff = 0.0
+    b_x = b_y = b_f = 0.0
+    chi2 = used = 0.0
+    for k in range(pixels.size):
+        value = float(pixels[k])
+        valid = value < UNUSABLE
+        share = model[0, k]
+        light = flux * share
+        weight = (1.0 if valid else 0.0) / (variance + light * per_dn + error2 * light * light)
+        off = (value if valid else 0.0) - light
+        d_x = flux * model[1, k]
+        d_y = flux * model[2, k]
+        w_x = weight * d_x
+        w_y = weight * d_y
+        w_f = weight * share
+        a_xx += w_x * d_x
+        a_xy += w_x * d_y
+        a_yy += w_y * d_y
+        a_xf += w_x * share
+        a_yf += w_y * share
+        a_ff += w_f * share
+        b_x += w_x * off
+        b_y += w_y * off
+        b_f += w_f * off
+        chi2 += weight * off * off
+        used += 1.0 if valid else 0.0
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a_xx, a_xy, a_yy, a_xf, a_yf, a_ff
+    sums[6], sums[7], sums[8], sums[9], sums[10] = b_x, b_y, b_f, chi2, used
+
+
+@compiled_loops
+def fit_star(
+    pixels: npt.NDArray[np.float32],
+    window: tuple[int, int, int, int],
+    start: tuple[float, float],
+    shape: tuple[float, float, float],
+    noise: tuple[float, float, float],
+    model: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+    result: npt.NDArray[np.float64],
+) -> None:
+    """Fit one star to a window.
+
+    Parameters
+    ----------
+    pixels : ndarray (rows·columns,), float32
+        Counts above the background, row by row; those from `UNUSABLE` up are not used.
+    window : (int, int, int, int)
+        Image column and row of the first pixel; columns and rows.
+    start : (float, float)
+        First guess of the position, image pixels.
+    shape : (float, float, float)
+        Standard deviation of the spot, and the trail along x and y, pixels.
+    noise : (float, float, float)
+        Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
+        unknown); share of its light by which the model may be wrong in a pixel.
+    model : ndarray (3, rows·columns)
+        Left with the model near the result.
+    work : ndarray (5, side)
+        Scratch; side at least that of the window, and 11.
+    result : ndarray (FIT_COLUMNS,)
+        Filled; CHI2 is the sum of weighted squares over PIXELS pixels.
+    """
+    x, y = start
+    result[STATE] = NO_FIT
+    star_model(x, y, shape, window, model, work)
+    flux = _best_flux(pixels, model)
+    sums = work[4]
+    for iteration in range(_ITERATIONS + 1):
+        if iteration > 0:
+            star_model(x, y, shape, window, model, work)
+        _normal_equations(pixels, model, flux, noise, sums)
+        a_xx, a_xy, a_yy, a_xf, a_yf, a_ff = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+        b_x, b_y, b_f = sums[6], sums[7], sums[8]
+        # covariance of (x, y, flux): inverse of the symmetric 3 × 3 normal matrix
+        c_xx = a_yy * a_ff - a_yf * a_yf
+        c_xy = a_xf * a_yf - a_xy * a_ff
+        c_xf = a_xy * a_yf - a_xf * a_yy
+        c_yy = a_xx * a_ff - a_xf * a_xf
+        c_yf = a_xy * a_xf - a_xx * a_yf
+        c_ff = a_xx * a_yy - a_xy * a_xy
+        determinant = a_xx * c_xx + a_xy * c_xy + a_xf * c_xf
+        if sums[10] < _LEAST_PIXELS or not determinant > 0.0:
+            return
+        scale = 1.0 / determinant
+        step_x = (c_xx * b_x + c_xy * b_y + c_xf * b_f) * scale
+        step_y = (c_xy * b_x + c_yy * b_y + c_yf * b_f) * scale
+        step_f = (c_xf * b_x + c_yf * b_y + c_ff * b_f) * scale
+        longest = max(abs(step_x), abs(step_y))
+        # a step far below the errors changes nothing that could be seen
+        small = max(_CONVERGED_PX, _CONVERGED_SIGMA * math.sqrt(max(c_xx, c_yy) * scale))
+        small_flux = max(_CONVERGED_FLUX * flux, _CONVERGED_SIGMA * math.sqrt(c_ff * scale))
+        settled = longest <= small and abs(step_f) <= small_flux
+        if settled or iteration == _ITERATIONS:
+            result[X] = x + step_x if settled else x
+            result[Y] = y + step_y if settled else y
+            result[FLUX] = flux + step_f
+            result[VAR_X] = c_xx * scale
+            result[VAR_Y] = c_yy * scale
+            result[VAR_FLUX] = c_ff * scale
+            result[CHI2] = sums[9]
+            result[PIXELS] = sums[10]
+            result[STATE] = GOOD if longest <= _SETTLED_PX else WANDERED
+            return
+        shrink = min(1.0, _MAX_STEP_PX / longest)
+        x += shrink * step_x
+        y += shrink * step_y
+        flux = max(flux + shrink * step_f, 0.2 * flux)
+        if abs(x - start[0]) > window[2] or abs(y - start[1]) > window[3]:
+            result[STATE] = WANDERED
+            return
+
+
+@compiled_sums
+def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) -> float:
+    """Flux that fits a window best at a given place, all pixels weighted alike."""
+    above = 0.0
+    below = 1e-12
+    for k in range(pixels.size):
+        value = float(pixels[k])
+        share = model[0, k] if value < UNUSABLE else 0.0
+        above += share * (value if value < UNUSABLE else 0.0)
+        below += share * share
+    return max(above / below, _FLOOR_FLUX)
+
+
+@compiled_sums
+def explained(
+    pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    """Drop in the sum of squares of a window that the fitted shape makes, and that its highest pixel alone makes.
+
+    Each with its best brightness. Where the highest pixel explains more than the shape of a star does, it is a hot
+    pixel or a particle's hit. Returned beside them: the sum of squares itself, and the number of pixels in it.
+    """
+    highest = product = total = used = 0.0
+    shape2 = 1e-12
+    for k in range(pixels.size):
+        valid = float(pixels[k]) < UNUSABLE
+        value = float(pixels[k]) if valid else 0.0
+        share = model[0, k] if valid else 0.0
+        highest = max(highest, value)
+        product += share * value
+        shape2 += share * share
+        total += value * value
+        used += 1.0 if valid else 0.0
+    return product * product / shape2, highest * highest, total, used

@@ -1,0 +1,414 @@
+"""Detection: from an image to stars with sub-pixel positions, fluxes and honest errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.errors import StaridError
+from starid.imaging.background import Background, estimate_background
+from starid.imaging.centroid import CHI2, FIT_COLUMNS, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
+from starid.imaging.matched_filter import (
+    INTEGER_TAPS_SUM,
+    find_peaks,
+    find_peaks_in_bytes,
+    find_peaks_in_smooth,
+    integer_taps,
+    noise_factor,
+    spot_taps,
+)
+from starid.imaging.measurement import (
+    AGAIN,
+    AT_EDGE,
+    BAD_FIT,
+    FIT_PARAMETERS,
+    FRESH,
+    SATURATED,
+    TWICE,
+    find_neighbours,
+    measure,
+)
+from starid.imaging.pairs import split_pairs
+from starid.imaging.spot_shape import MOMENT_COLUMNS, SpotShape, moments_of, shape_from_moments
+from starid.imaging.spot_width import spot_widths
+from starid.imaging.trail_filter import smooth_along_trails, trail_noise_factor
+from starid.imaging.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
+
+Grid: TypeAlias = npt.NDArray[np.float32]
+Table: TypeAlias = npt.NDArray[np.float64]
+
+LEAST_SIDE_PX: Final = 16
+_ASSUMED_SIGMA_PX: Final = 0.9
+_MOST_PEAKS: Final = 8192
+_HIGHER: Final = 1.5
+_STARS_FOR_A_GLANCE: Final = 12
+_STARS_FOR_SHAPE: Final = 30
+_SHAPE_WINDOW_PX: Final = 40
+_STARS_FOR_WIDTH: Final = 15
+_LEAST_FOR_WIDTH: Final = 3
+_TRAIL_FILTER_PX: Final = 1.5
+_OTHER_WIDTH: Final = 0.3
+_MISFIT_SIGMA: Final = 3.0
+_RELAX: Final = 0.8
+_MOST_NEIGHBOURS: Final = 64
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """What detection may know and how careful it is.
+
+    Attributes
+    ----------
+    threshold_sigma : float
+        Least ratio of the smoothed peak to its noise.
+    psf_sigma_px : float or None
+        Standard deviation of a star's spot; estimated from the frame if None.
+    gain_e_per_dn : float or None
+        Electrons a count; with it, shot noise counts in the errors and fluxes are in electrons.
+    saturation_dn : int or None
+        Count from which a pixel is saturated; the largest the image's type can hold if None.
+    model_error : float
+        Share of a star's light in a pixel that the model of the spot may be wrong by.
+    max_stars : int
+        Brightest stars that are kept.
+    block_px : int
+        Side of the blocks in which the background is estimated.
+    follow_trails : bool
+        Whether trails of a turning sensor are looked for.
+    blend_px : float
+        Stars closer to each other than this count as one, at their common centre of light.
+    pixel_sigma : float
+        Excess over the sky, in sigmas of the noise, from which a pixel counts as lit by a star.
+    min_star_pixels, max_star_pixels : int
+        Fewest and most lit pixels of a star; candidates with others are refused.
+    """
+
+    threshold_sigma: float = 5.5
+    psf_sigma_px: float | None = None
+    gain_e_per_dn: float | None = None
+    saturation_dn: int | None = None
+    model_error: float = 0.01
+    max_stars: int = 500
+    block_px: int = 32
+    follow_trails: bool = True
+    blend_px: float = 2.0
+    pixel_sigma: float = 3.0
+    min_star_pixels: int = 1
+    max_star_pixels: int = 10000
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "threshold_sigma": (1.0, 1000.0),
+            "psf_sigma_px": (0.3, 12.0),
+            "gain_e_per_dn": (1e-6, 1e9),
+            "saturation_dn": (1, 65535),
+            "model_error": (0.0, 1.0),
+            "max_stars": (1, 5000),
+            "block_px": (8, 1024),
+            "blend_px": (0.0, 100.0),
+            "pixel_sigma": (0.0, 1000.0),
+            "min_star_pixels": (0, 1000000),
+            "max_star_pixels": (1, 1000000),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise StaridError(f"detection {name}: {value!r} given, {low:g}…{high:g} needed")
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Stars found on a frame, brightest first.
+
+    Attributes
+    ----------
+    xy_px : ndarray (n, 2)
+        Positions; pixel centres are integers. On a trail, its middle.
+    flux, flux_sigma : ndarray (n,)
+        Light and its error, in electrons if the gain was given, else in counts.
+    xy_sigma_px : ndarray (n, 2)
+        Errors of the position along x and y, one standard deviation.
+    saturated, edge : ndarray (n,) of bool
+        The star has saturated pixels; its light is cut by the image's edge.
+    background, noise : float
+        Typical sky level and noise of a pixel, counts.
+    psf_sigma_px : float
+        Width of the spot that was used.
+    trail_px : float
+        Median length of the stars' trails; 0 where they are round.
+    refused : int
+        Candidates that stood out of the noise and are no stars: hot pixels, bodies, edges.
+    reason : str
+        Why there is no star; empty where there is one.
+    """
+
+    xy_px: npt.NDArray[np.float64]
+    flux: npt.NDArray[np.float64]
+    flux_sigma: npt.NDArray[np.float64]
+    xy_sigma_px: npt.NDArray[np.float64]
+    saturated: npt.NDArray[np.bool_]
+    edge: npt.NDArray[np.bool_]
+    background: float
+    noise: float
+    psf_sigma_px: float
+    trail_px: float
+    refused: int
+    reason: str
+
+    @property
+    def sigma_px(self) -> npt.NDArray[np.float64]:
+        """Errors (n,) of the position, root mean square of both axes."""
+        return np.asarray(np.sqrt(np.mean(self.xy_sigma_px**2, axis=1)), dtype=np.float64)
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.flux)
+
+
+def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = None) -> Detections:
+    """Find the stars of an image.
+
+    Parameters
+    ----------
+    image : ndarray (h, w), uint8 or uint16
+        Counts, one channel, at least 16 × 16 pixels.
+    settings : DetectionSettings, optional
+        What is known of the image.
+
+    Returns
+    -------
+    Detections
+        Empty, with a reason, where nothing stands out.
+
+    Raises
+    ------
+    StaridError
+        The image is not one of the above.
+    """
+    chosen = DetectionSettings() if settings is None else settings
+    counts = _checked(image)
+    saturation = chosen.saturation_dn if chosen.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
+    background = estimate_background(counts, chosen.block_px)
+    if background.median_level >= saturation:
+        return _nothing(background, "image is saturated all over: shorten the exposure")
+    sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
+    peaks, heights = _peaks(counts, background, sigma, chosen.threshold_sigma)
+    shape = _shape(counts, background, peaks, chosen, saturation)
+    if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
+        peaks, heights = _peaks(counts, background, shape.sigma_px, chosen.threshold_sigma)
+        shape = _shape(counts, background, peaks, chosen, saturation, shape.sigma_px)
+    if shape.trail_px > _TRAIL_FILTER_PX:
+        peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
+    if len(peaks) == 0:
+        flat = float(counts.min()) == float(counts.max())
+        return _nothing(
+            background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
+        )
+    return _measured(counts, background, peaks[: 2 * chosen.max_stars], heights, shape, chosen, saturation)
+
+
+def _checked(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """Refuse what is no grey image of counts; give the rest in the processor's own byte order, rows unbroken."""
+    if not isinstance(image, np.ndarray):
+        raise StaridError(f"image: a {type(image).__name__} given, an array (h, w) of uint8 or uint16 needed")
+    if image.ndim != 2:
+        colour = " (colour: convert it to grey first)" if image.ndim == 3 else ""
+        raise StaridError(f"image: shape {image.shape} given, (h, w) needed{colour}")
+    if image.dtype.kind != "u" or image.dtype.itemsize > 2:
+        raise StaridError(
+            f"image: type {image.dtype} given, uint8 or uint16 needed; scale it to counts first"
+        )
+    if min(image.shape) < LEAST_SIDE_PX:
+        raise StaridError(f"image: {image.shape[1]}×{image.shape[0]} pixels given, at least 16×16 needed")
+    return np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
+
+
+def _nothing(background: Background, reason: str, refused: int = 0) -> Detections:
+    """Detections without a star."""
+    none = np.zeros(0)
+    pairs = np.zeros((0, 2))
+    no = np.zeros(0, dtype=bool)
+    level, noise = background.median_level, background.median_noise
+    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, refused, reason)
+
+
+def _peaks(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    sigma_px: float,
+    threshold_sigma: float,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+    """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
+    bytes_taps = integer_taps(sigma_px)
+    if counts.dtype == np.uint8 and bytes_taps is not None:
+        taps8, image8 = bytes_taps, counts.view(np.uint8)
+
+        def search_bytes(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+            return find_peaks_in_bytes(image8, threshold, background.block_px, taps8, peaks, heights)
+
+        factor = noise_factor(taps8 / INTEGER_TAPS_SUM)
+        return _search(search_bytes, background, threshold_sigma * factor)
+    taps = spot_taps(sigma_px)
+
+    def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+        return find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
+
+    return _search(search, background, threshold_sigma * noise_factor(taps))
+
+
+def _trail_peaks(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    shape: SpotShape,
+    threshold_sigma: float,
+) -> tuple[npt.NDArray[np.int32], Grid]:
+    """As `_peaks`, with the filter for the frame's trails."""
+    smooth = smooth_along_trails(counts, shape.sigma_px, shape.flow)
+
+    def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+        return find_peaks_in_smooth(smooth, threshold, background.block_px, peaks, heights)
+
+    return _search(search, background, threshold_sigma * trail_noise_factor(shape.sigma_px, shape.trail_px))
+
+
+def _search(
+    search: Callable[[Grid, npt.NDArray[np.int32], Grid], int], background: Background, factor: float
+) -> tuple[npt.NDArray[np.int32], Grid]:
+    """Search for peaks above `factor` times the noise, or above more where there are too many to list."""
+    peaks = np.empty((_MOST_PEAKS, 2), dtype=np.int32)
+    heights = np.empty(_MOST_PEAKS, dtype=np.float32)
+    while True:
+        threshold = (background.level + np.float32(factor) * background.noise).astype(np.float32)
+        count = search(threshold, peaks, heights)
+        if count < _MOST_PEAKS:
+            break
+        factor *= _HIGHER
+    peaks, heights = peaks[:count], heights[:count]
+    rows, columns = background.level.shape
+    blocks = peaks // background.block_px
+    heights -= background.level[np.minimum(blocks[:, 1], rows - 1), np.minimum(blocks[:, 0], columns - 1)]
+    order = np.argsort(-heights, kind="stable")
+    return peaks[order], heights[order]
+
+
+def _shape(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    peaks: npt.NDArray[np.int32],
+    settings: DetectionSettings,
+    saturation: int,
+    assumed: float = _ASSUMED_SIGMA_PX,
+) -> SpotShape:
+    """Spot and trail from the brightest stars that are not saturated."""
+    height, width = counts.shape
+    start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
+    tries = peaks[: 4 * _STARS_FOR_SHAPE]
+    grid = (background.level, float(background.block_px))
+    # a few stars tell whether there are trails at all; more are needed only to follow them
+    for wanted in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
+        table = np.empty((wanted, MOMENT_COLUMNS))
+        count = moments_of(counts, tries, *grid, start, _SHAPE_WINDOW_PX, float(saturation), table)
+        shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
+        if shape.trail_px == 0.0 or count < wanted:
+            break
+    if settings.psf_sigma_px is None and shape.trail_px == 0.0:
+        widths = np.empty(_STARS_FOR_WIDTH)
+        levels = (background.level, background.noise, float(background.block_px))
+        fitted = spot_widths(counts, tries, *levels, start, float(saturation), widths)
+        if fitted >= _LEAST_FOR_WIDTH:
+            shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
+    if settings.follow_trails:
+        return shape
+    return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
+
+
+def _fitted(
+    windows: Table,
+    pixels: Grid,
+    sensor: tuple[float, float, float, float, float],
+    lit: tuple[float, float, float],
+    size: tuple[int, int],
+    blend_px: float,
+) -> tuple[Table, Table, npt.NDArray[np.uint8]]:
+    """Windows, fits and flags of the candidates, and of the companions that bad fits betray."""
+    count = len(windows)
+    stars, flags = np.zeros((count, FIT_COLUMNS)), np.zeros(count, dtype=np.uint8)
+    first = np.empty(count + 1, dtype=np.int32)
+    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
+    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
+    measure(
+        windows, pixels, first, neighbours, sensor, lit, size, np.ones(count, dtype=bool), FRESH, stars, flags
+    )
+    bad = (stars[:, STATE] == GOOD) & (stars[:, CHI2] > BAD_FIT * (stars[:, PIXELS] - FIT_PARAMETERS))
+    if not bad.any():
+        return windows, stars, flags
+    suspects = np.flatnonzero(bad & ((flags & SATURATED) == 0))
+    partners, owners = np.empty((len(suspects), FIT_COLUMNS)), np.empty(len(suspects), dtype=np.int64)
+    found = split_pairs(
+        windows, pixels, first, neighbours, sensor[:3], stars, suspects, blend_px, partners, owners, bad
+    )
+    owners = owners[:found]
+    measure(windows, pixels, first, neighbours, sensor, lit, size, bad, AGAIN, stars, flags)
+    return (
+        np.concatenate([windows, windows[owners]]),
+        np.concatenate([stars, partners[:found]]),
+        np.concatenate([flags, flags[owners]]),
+    )
+    return windows, stars, flags
+
+
+def _measured(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    peaks: npt.NDArray[np.int32],
+    heights: npt.NDArray[np.float32],
+    shape: SpotShape,
+    settings: DetectionSettings,
+    saturation: int,
+) -> Detections:
+    """Fit the candidates and keep the stars."""
+    gain = settings.gain_e_per_dn
+    per_dn = 0.0 if gain is None else 1.0 / gain
+    typical = background.median_noise
+    spot = (shape.sigma_px, float(saturation), typical)
+    grid = (background.level, background.noise, float(background.block_px))
+    flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
+    count = len(peaks)
+    windows = np.zeros((count, WINDOW_COLUMNS))
+    pixels = np.empty(lay_windows(counts, peaks, flux, *grid, spot, shape.flow, windows), dtype=np.float32)
+    cut_windows(counts, windows, background.level, grid[2], float(saturation), pixels)
+    ratio = _RELAX * settings.threshold_sigma
+    sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, saturation - background.median_level)
+    lit = (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels))
+    size = (counts.shape[1], counts.shape[0])
+    windows, stars, flags = _fitted(windows, pixels, sensor, lit, size, settings.blend_px)
+    good = np.flatnonzero(stars[:, STATE] == GOOD)
+    if good.size == 0:
+        return _nothing(background, "nothing on the image has the shape of a star", count)
+    again = (stars[:, STATE] == TWICE) | (windows[:, COLUMNS] == SEEN_BEFORE)
+    refused = len(stars) - good.size - int(np.count_nonzero(again))
+    good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
+    fits, marks = stars[good], flags[good]
+    freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
+    misfit = fits[:, CHI2] / freedom
+    inflation = np.sqrt(np.where(misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom), misfit, 1.0))
+    unit = 1.0 if gain is None else gain
+    return Detections(
+        fits[:, [X, Y]],
+        fits[:, FLUX] * unit,
+        np.sqrt(fits[:, VAR_FLUX]) * inflation * unit,
+        np.sqrt(fits[:, [VAR_X, VAR_Y]]) * inflation[:, None],
+        (marks & SATURATED) != 0,
+        (marks & AT_EDGE) != 0,
+        background.median_level,
+        typical,
+        shape.sigma_px,
+        shape.trail_px,
+        refused,
+        "",
+    )

@@ -1,0 +1,363 @@
+"""From candidates to stars: each is fitted in its own window without its neighbours' light, and judged."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.centroid import (
+    CHI2,
+    FLUX,
+    GOOD,
+    HOT_PIXEL,
+    NO_FIT,
+    PIXELS,
+    STATE,
+    UNUSABLE,
+    WANDERED,
+    X,
+    Y,
+    explained,
+    fit_star,
+    star_model,
+)
+from starid.imaging.jit_loops import compiled_loops
+from starid.imaging.windows import (
+    COLUMNS,
+    LEFT,
+    NOISE,
+    OFFSET,
+    PATCH,
+    RADIUS_X,
+    RADIUS_Y,
+    ROWS,
+    START_X,
+    START_Y,
+    TOP,
+    TRAIL_X,
+    TRAIL_Y,
+)
+
+SATURATED, AT_EDGE = 1, 2
+"""Bits of a star's flags."""
+
+FRESH: Final = (0, 3)
+AGAIN: Final = (1, 4)
+"""First and last round of `measure`: from the candidates, and on from fits that are there."""
+
+FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
+"""Further reasons, beside those of `starid.imaging.centroid`, for which a candidate is no star."""
+
+_LEAST_EXPLAINED: Final = 0.55
+_SHARP_SIGMA_PX: Final = 0.5
+_WANDER_PX: Final = 1.5
+_WING_SHARE: Final = 0.6
+_EDGE_SIGMA: Final = 2.5
+BAD_FIT: Final = 4.0
+"""Sum of weighted squares, per degree of freedom, from which a fit is bad."""
+
+_STRAY_SIGMA: Final = 7.0
+_STRAY_DISTANCE_SIGMA: Final = 2.0
+FIT_PARAMETERS: Final = 3
+_LEAST_SIDE: Final = 11
+
+
+@compiled_loops
+def find_neighbours(
+    windows: npt.NDArray[np.float64],
+    order: npt.NDArray[np.int64],
+    first: npt.NDArray[np.int32],
+    neighbours: npt.NDArray[np.int32],
+) -> int:
+    """List for every window the others whose stars' light may reach into it.
+
+    Parameters
+    ----------
+    windows : ndarray (n, WINDOW_COLUMNS)
+        From `lay_windows`.
+    order : ndarray (n,)
+        Their numbers in the order of START_Y.
+    first : ndarray (n + 1,)
+        Filled: the neighbours of k are ``neighbours[first[k]:first[k + 1]]``.
+    neighbours : ndarray (m,)
+        Filled as far as it goes.
+
+    Returns
+    -------
+    int
+        How many there are; more than m says that there was no room for all.
+    """
+    count = 0
+    place = np.empty(order.size, np.int32)
+    for rank in range(order.size):
+        place[order[rank]] = rank
+    tallest = 0.0
+    for k in range(windows.shape[0]):
+        if windows[k, COLUMNS] > 0.0:
+            tallest = max(tallest, windows[k, RADIUS_Y])
+    for k in range(windows.shape[0]):
+        first[k] = min(count, neighbours.size)
+        if windows[k, COLUMNS] <= 0.0:
+            continue
+        for step in (-1, 1):
+            rank = place[k] + step
+            while 0 <= rank < order.size:
+                other = order[rank]
+                rank += step
+                off_y = abs(windows[other, START_Y] - windows[k, START_Y])
+                if off_y > tallest + windows[k, RADIUS_Y]:
+                    break
+                if (
+                    windows[other, COLUMNS] > 0.0
+                    and off_y <= windows[other, RADIUS_Y] + windows[k, RADIUS_Y]
+                    and abs(windows[other, START_X] - windows[k, START_X])
+                    <= windows[other, RADIUS_X] + windows[k, RADIUS_X]
+                ):
+                    if count < neighbours.size:
+                        neighbours[count] = other
+                    count += 1
+    first[windows.shape[0]] = min(count, neighbours.size)
+    return count
+
+
+@compiled_loops
+def _mask_stray_pixel(
+    pixels: npt.NDArray[np.float32],
+    model: npt.NDArray[np.float64],
+    star: npt.NDArray[np.float64],
+    window: npt.NDArray[np.float64],
+    sigma: float,
+    per_dn: float,
+    model_error: float,
+) -> bool:
+    """Take the pixel that contradicts the fit most, if one does and is off the star's core, out of the fit."""
+    worst = _STRAY_SIGMA * _STRAY_SIGMA
+    stray = -1
+    variance = window[NOISE] * window[NOISE]
+    columns = int(window[COLUMNS])
+    for k in range(pixels.size):
+        off_x = abs(window[LEFT] + k % columns - star[X]) - 0.5 * abs(window[TRAIL_X])
+        off_y = abs(window[TOP] + k // columns - star[Y]) - 0.5 * abs(window[TRAIL_Y])
+        if max(off_x, off_y) < _STRAY_DISTANCE_SIGMA * sigma or not pixels[k] < UNUSABLE:
+            continue
+        light = star[FLUX] * model[0, k]
+        off = pixels[k] - light
+        error = model_error * light
+        chi2 = off * off / (variance + light * per_dn + error * error)
+        if off > 0.0 and chi2 > worst:
+            worst, stray = chi2, k
+    if stray >= 0:
+        pixels[stray] = np.float32(math.inf)
+    return stray >= 0
+
+
+@compiled_loops
+def _judge(
+    pixels: npt.NDArray[np.float32],
+    model: npt.NDArray[np.float64],
+    star: npt.NDArray[np.float64],
+    window: npt.NDArray[np.float64],
+    sigma: float,
+    least_ratio: float,
+    saturation_dn: float,
+    lit: tuple[float, float, float],
+    size: tuple[int, int],
+) -> float:
+    """Decide whether a fit is a star: GOOD, or why it is not."""
+    width, height = size
+    noise, patch = window[NOISE], window[PATCH]
+    length = math.hypot(window[TRAIL_X], window[TRAIL_Y])
+    if not star[FLUX] > 0.0:
+        return float(FAINT)
+    if not (-0.5 <= star[X] < width - 0.5 and -0.5 <= star[Y] < height - 0.5):
+        return float(OUTSIDE)
+    squares = 0.0
+    for k in range(pixels.size):
+        squares += model[0, k] * model[0, k]
+    if patch == 0.0 and star[FLUX] * math.sqrt(squares) < least_ratio * noise:
+        return float(FAINT)
+    bright = 0
+    for k in range(pixels.size):
+        bright += pixels[k] > lit[0] * noise
+    if not lit[1] <= bright <= lit[2]:
+        return float(WRONG_SIZE)
+    allowed = _WANDER_PX * max(sigma, 1.0) + patch + 0.5 * length
+    if math.hypot(star[X] - window[START_X], star[Y] - window[START_Y]) > allowed:
+        return float(WANDERED)
+    if patch > 0.0:
+        # the wings must call for a core that saturates
+        return (
+            float(GOOD)
+            if star[FLUX] * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn
+            else float(HOT_PIXEL)
+        )
+    by_shape, by_pixel, total, used = explained(pixels, model)
+    if sigma > _SHARP_SIGMA_PX and by_pixel > by_shape:
+        return float(HOT_PIXEL)
+    if by_shape < _LEAST_EXPLAINED * (total - 2.0 * used * noise * noise):
+        return float(NOT_A_STAR)
+    return float(GOOD)
+
+
+@compiled_loops
+def _flags(
+    star: npt.NDArray[np.float64],
+    window: npt.NDArray[np.float64],
+    pixels: npt.NDArray[np.float32],
+    sigma: float,
+    size: tuple[int, int],
+) -> int:
+    """Flags of a star: whether pixels of its core are saturated, whether the image's edge cuts its light."""
+    flags = 0
+    reach_x = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_X])
+    reach_y = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_Y])
+    if (
+        min(star[X] - reach_x, star[Y] - reach_y) < -0.5
+        or star[X] + reach_x > size[0] - 0.5
+        or star[Y] + reach_y > size[1] - 0.5
+    ):
+        flags |= AT_EDGE
+    if window[PATCH] > 0.0:
+        flags |= SATURATED
+    column, row = round(star[X] - window[LEFT]), round(star[Y] - window[TOP])
+    inside = 0 <= row < window[ROWS] and 0 <= column < window[COLUMNS]
+    if inside and not pixels[row * int(window[COLUMNS]) + column] < UNUSABLE:
+        flags |= SATURATED
+    return flags
+
+
+@compiled_loops
+def _take_away(
+    star: npt.NDArray[np.float64],
+    shape: tuple[float, float, float],
+    place: tuple[int, int, int, int],
+    lights: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+    target: npt.NDArray[np.float32],
+) -> None:
+    """Take the light of a star, if it is one, out of a window."""
+    if star[STATE] != GOOD:
+        return
+    star_model(star[X], star[Y], shape, place, lights, work)
+    for i in range(target.size):
+        target[i] -= np.float32(star[FLUX] * lights[0, i])
+
+
+@compiled_loops
+def measure(
+    windows: npt.NDArray[np.float64],
+    pixels: npt.NDArray[np.float32],
+    first: npt.NDArray[np.int32],
+    neighbours: npt.NDArray[np.int32],
+    sensor: tuple[float, float, float, float, float],
+    lit: tuple[float, float, float],
+    size: tuple[int, int],
+    todo: npt.NDArray[np.bool_],
+    turns: tuple[int, int],
+    stars: npt.NDArray[np.float64],
+    flags: npt.NDArray[np.uint8],
+) -> None:
+    """Fit and judge candidates.
+
+    The brightest come first, and each is fitted after the light of its brighter neighbours is taken away; those
+    with neighbours are then fitted again without the light of all of them.
+
+    Parameters
+    ----------
+    windows, pixels
+        From `lay_windows` and `cut_windows`, the brightest star first.
+    first, neighbours
+        From `find_neighbours`.
+    sensor : (float, float, float, float, float)
+        Standard deviation of the spot, pixels; variance in counts² that a count of star light brings; model error;
+        least signal-to-noise ratio of a star; counts above the sky that saturate.
+    lit : (float, float, float)
+        Sigmas from which a pixel is lit; fewest and most lit pixels of a star.
+    size : (int, int)
+        Columns and rows of the image.
+    todo : ndarray (n,) of bool
+        Which candidates to fit; the others' fits count as they are.
+    turns : (int, int)
+        `FRESH`, or `AGAIN` to go on from fits that are there already: more rounds, in which neighbours yield to each
+        other, and in the last of which a fit that stays bad is made again without the pixel that contradicts it most.
+    stars : ndarray (n, FIT_COLUMNS)
+        Filled with the fits.
+    flags : ndarray (n,)
+        Filled with bits `SATURATED`, `AT_EDGE`.
+    """
+    sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
+    largest, side = 1, _LEAST_SIDE
+    for k in range(windows.shape[0]):
+        if todo[k] and turns[0] == 0:
+            stars[k, STATE] = NO_FIT
+            flags[k] = 0
+        if windows[k, COLUMNS] > 0.0:
+            largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
+            side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
+    models = np.empty((3, largest))
+    lights = np.empty((3, largest))
+    work = np.empty((5, side))
+    cleaned = np.empty(largest, np.float32)
+    for turn in range(turns[0], turns[1]):
+        last = turns[0] > 0 and turn == turns[1] - 1
+        for k in range(windows.shape[0]):
+            window, star = windows[k], stars[k]
+            alone = first[k] == first[k + 1]
+            if not todo[k] or window[COLUMNS] <= 0.0:
+                continue
+            if turn > 0 and (star[STATE] != GOOD or (alone and not last)):
+                continue
+            place = (int(window[LEFT]), int(window[TOP]), int(window[COLUMNS]), int(window[ROWS]))
+            count = place[2] * place[3]
+            begin = int(window[OFFSET])
+            own = pixels[begin : begin + count]
+            model = models[:, :count]
+            shape = (sigma, window[TRAIL_X], window[TRAIL_Y])
+            target = own
+            if not alone:
+                target = cleaned[:count]
+                target[:] = own
+                for entry in range(first[k], first[k + 1]):
+                    _take_away(stars[neighbours[entry]], shape, place, lights, work, target)
+            noise = (window[NOISE] * window[NOISE], per_dn, model_error)
+            guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
+            fit_star(target, place, guess, shape, noise, model, work, star)
+            if (
+                last
+                and star[STATE] == GOOD
+                and star[CHI2] > BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
+                and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
+            ):
+                fit_star(target, place, (star[X], star[Y]), shape, noise, model, work, star)
+            if star[STATE] == GOOD:
+                star[STATE] = _judge(
+                    target, model, star, window, sigma, least_ratio, saturation_dn, lit, size
+                )
+            if star[STATE] == GOOD:
+                flags[k] = _flags(star, window, own, sigma, size)
+        _drop_doubles(stars, first, neighbours, sigma)
+
+
+@compiled_loops
+def _drop_doubles(
+    stars: npt.NDArray[np.float64],
+    first: npt.NDArray[np.int32],
+    neighbours: npt.NDArray[np.int32],
+    sigma: float,
+) -> None:
+    """Mark the fainter of two fits that have come to the same place."""
+    reach = max(0.7 * sigma, 0.5)
+    for k in range(stars.shape[0]):
+        for place in range(first[k], first[k + 1]):
+            other = neighbours[place]
+            if (
+                other > k
+                and stars[k, STATE] == GOOD
+                and stars[other, STATE] == GOOD
+                and abs(stars[other, X] - stars[k, X]) < reach
+                and abs(stars[other, Y] - stars[k, Y]) < reach
+            ):
+                stars[other, STATE] = TWICE

@@ -1,0 +1,311 @@
+"""Stars too close for a peak each: a badly fitted star is tried as two, fitted together."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.centroid import (
+    CHI2,
+    FLUX,
+    GOOD,
+    PIXELS,
+    STATE,
+    UNUSABLE,
+    VAR_FLUX,
+    VAR_X,
+    VAR_Y,
+    X,
+    Y,
+    star_model,
+)
+from starid.imaging.jit_loops import compiled_loops
+from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y
+
+Array = npt.NDArray[np.float64]
+
+_UNKNOWNS: Final = 6
+_ITERATIONS: Final = 25
+_CONVERGED_PX: Final = 2e-3
+_MOST_STEP_PX: Final = 0.4
+_MOST_CHANGE: Final = 0.5
+_BETTER: Final = 0.5
+_LEAST_SIGNAL: Final = 6.0
+_LEAST_SHARE: Final = 0.03
+_CLOSEST_SIGMA: Final = 1.0
+_LEAST_SIDE: Final = 11
+_PAIR_SIGMA: Final = 2.5
+_FAR_SIGMA: Final = 4.0
+_CORE_SIGMA: Final = 1.0
+_ONE_PIXEL: Final = 0.5
+
+
+@compiled_loops
+def _invert(matrix: Array, inverse: Array) -> bool:
+    """Invert a small positive matrix by Gauss–Jordan elimination, destroying it; False if it is singular."""
+    size = matrix.shape[0]
+    inverse[:] = 0.0
+    for i in range(size):
+        inverse[i, i] = 1.0
+    for i in range(size):
+        pivot = matrix[i, i]
+        if not pivot > 0.0:
+            return False
+        for k in range(size):
+            matrix[i, k] /= pivot
+            inverse[i, k] /= pivot
+        for j in range(size):
+            if j != i:
+                factor = matrix[j, i]
+                for k in range(size):
+                    matrix[j, k] -= factor * matrix[i, k]
+                    inverse[j, k] -= factor * inverse[i, k]
+    return True
+
+
+@compiled_loops
+def fit_pair(
+    pixels: npt.NDArray[np.float32],
+    window: tuple[int, int, int, int],
+    shape: tuple[float, float, float],
+    noise: tuple[float, float, float],
+    models: Array,
+    work: Array,
+    pair: Array,
+) -> bool:
+    """Fit two stars at once to a window by Gauss–Newton steps, weighted as in `starid.imaging.centroid.fit_star`.
+
+    Parameters
+    ----------
+    pixels, window, shape, noise, work
+        As in `fit_star`.
+    models : ndarray (6, rows·columns)
+        Left with both stars' models.
+    pair : ndarray (2, FIT_COLUMNS)
+        Holds first guesses of X, Y and FLUX; filled with the fits. CHI2 and PIXELS are those of the whole.
+
+    Returns
+    -------
+    bool
+        Whether the fit has come to rest.
+    """
+    variance, per_dn, model_error = noise
+    error2 = model_error * model_error
+    matrix = np.empty((_UNKNOWNS, _UNKNOWNS))
+    inverse = np.empty((_UNKNOWNS, _UNKNOWNS))
+    right = np.empty(_UNKNOWNS)
+    slopes = np.empty(_UNKNOWNS)
+    step = np.empty(_UNKNOWNS)
+    for _ in range(_ITERATIONS):
+        for star in range(2):
+            star_model(pair[star, X], pair[star, Y], shape, window, models[3 * star : 3 * star + 3], work)
+        matrix[:] = 0.0
+        right[:] = 0.0
+        chi2 = used = 0.0
+        for k in range(pixels.size):
+            if not pixels[k] < UNUSABLE:
+                continue
+            first, second = pair[0, FLUX] * models[0, k], pair[1, FLUX] * models[3, k]
+            light = first + second
+            weight = 1.0 / (variance + light * per_dn + error2 * light * light)
+            off = pixels[k] - light
+            slopes[0], slopes[1], slopes[2] = (
+                pair[0, FLUX] * models[1, k],
+                pair[0, FLUX] * models[2, k],
+                models[0, k],
+            )
+            slopes[3], slopes[4], slopes[5] = (
+                pair[1, FLUX] * models[4, k],
+                pair[1, FLUX] * models[5, k],
+                models[3, k],
+            )
+            for i in range(_UNKNOWNS):
+                right[i] += weight * slopes[i] * off
+                for j in range(i + 1):
+                    matrix[i, j] += weight * slopes[i] * slopes[j]
+            chi2 += weight * off * off
+            used += 1.0
+        for i in range(_UNKNOWNS):
+            for j in range(i):
+                matrix[j, i] = matrix[i, j]
+        if used <= _UNKNOWNS or not _invert(matrix, inverse):
+            return False
+        for i in range(_UNKNOWNS):
+            step[i] = 0.0
+            for j in range(_UNKNOWNS):
+                step[i] += inverse[i, j] * right[j]
+        longest = max(abs(step[0]), abs(step[1]), abs(step[3]), abs(step[4]))
+        shrink = min(1.0, _MOST_STEP_PX / max(longest, 1e-12))
+        for star in range(2):
+            pair[star, X] += shrink * step[3 * star]
+            pair[star, Y] += shrink * step[3 * star + 1]
+            flux = pair[star, FLUX]
+            change = shrink * step[3 * star + 2]
+            pair[star, FLUX] = flux + min(max(change, -_MOST_CHANGE * flux), max(flux, -change))
+            pair[star, VAR_X] = inverse[3 * star, 3 * star]
+            pair[star, VAR_Y] = inverse[3 * star + 1, 3 * star + 1]
+            pair[star, VAR_FLUX] = inverse[3 * star + 2, 3 * star + 2]
+            pair[star, CHI2] = chi2
+            pair[star, PIXELS] = used
+        if longest < _CONVERGED_PX:
+            return True
+    return False
+
+
+@compiled_loops
+def _start(
+    left_over: Array, window: tuple[int, int, int, int], star: Array, sigma: float, pair: Array
+) -> bool:
+    """First guesses of two stars in place of one, from the light that its fit leaves; False if it leaves none."""
+    left, top, columns, rows = window
+    best = 0.0
+    best_x = best_y = 0.0
+    for j in range(1, rows - 1):
+        for i in range(1, columns - 1):
+            off_x, off_y = left + i - star[X], top + j - star[Y]
+            if math.hypot(off_x, off_y) < _CORE_SIGMA * sigma:
+                continue
+            total = 0.0
+            for b in range(-1, 2):
+                for a in range(-1, 2):
+                    total += left_over[(j + b) * columns + i + a] * (2 - abs(a)) * (2 - abs(b)) / 16.0
+            if total > best:
+                best, best_x, best_y = total, off_x, off_y
+    if best <= 0.0:
+        return False
+    distance = math.hypot(best_x, best_y)
+    pair[0] = star
+    pair[1] = star
+    if distance > _FAR_SIGMA * sigma:
+        pair[1, X] += best_x
+        pair[1, Y] += best_y
+        pair[1, FLUX] = min(best * 2.0 * math.pi * sigma * sigma, star[FLUX])
+        return True
+    # hardly apart: both share the light, on either side of where one was fitted
+    half = 0.5 * _PAIR_SIGMA * sigma / distance
+    for k in range(2):
+        sense = 1.0 if k == 1 else -1.0
+        pair[k, X] += sense * half * best_x
+        pair[k, Y] += sense * half * best_y
+        pair[k, FLUX] *= 0.5
+    return True
+
+
+@compiled_loops
+def _is_better(
+    pair: Array, chi2: float, sigma: float, models: Array, pixels: npt.NDArray[np.float32]
+) -> bool:
+    """Whether two stars explain a window much better than one did, and neither is noise or a single pixel."""
+    apart = math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y])
+    if pair[0, CHI2] > _BETTER * chi2 or apart < _CLOSEST_SIGMA * sigma:
+        return False
+    total = pair[0, FLUX] + pair[1, FLUX]
+    for k in range(2):
+        flux = pair[k, FLUX]
+        if flux < _LEAST_SHARE * total or flux < _LEAST_SIGNAL * math.sqrt(pair[k, VAR_FLUX]):
+            return False
+    # the fainter one's own light, all but one pixel's
+    highest = everything = 0.0
+    faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
+    for k in range(pixels.size):
+        if pixels[k] < UNUSABLE:
+            value = pixels[k] - pair[1 - faint, FLUX] * models[3 * (1 - faint), k]
+            highest = max(highest, value)
+            everything += pair[faint, FLUX] * models[3 * faint, k]
+    return highest < _ONE_PIXEL * everything
+
+
+@compiled_loops
+def _merge(pair: Array, star: Array) -> None:
+    """Put one star in place of two: all their light at its centre, with the errors of the fit of one."""
+    total = pair[0, FLUX] + pair[1, FLUX]
+    for axis in (X, Y):
+        star[axis] = (pair[0, FLUX] * pair[0, axis] + pair[1, FLUX] * pair[1, axis]) / total
+    star[FLUX] = total
+    star[CHI2], star[PIXELS] = pair[0, CHI2], pair[0, PIXELS]
+
+
+@compiled_loops
+def split_pairs(
+    windows: Array,
+    pixels: npt.NDArray[np.float32],
+    first: npt.NDArray[np.int32],
+    neighbours: npt.NDArray[np.int32],
+    noise: tuple[float, float, float],
+    stars: Array,
+    suspects: npt.NDArray[np.int64],
+    blend_px: float,
+    partners: Array,
+    owners: npt.NDArray[np.int64],
+    todo: npt.NDArray[np.bool_],
+) -> int:
+    """Try badly fitted stars as pairs; the brighter one takes the place of the star that was fitted.
+
+    Parameters
+    ----------
+    windows, pixels, first, neighbours, stars
+        As in `starid.imaging.measurement.measure`, after it.
+    noise : (float, float, float)
+        Standard deviation of the spot, pixels; variance in counts² that a count of star light brings; model error.
+    suspects : ndarray (m,)
+        Numbers of the stars to try.
+    blend_px : float
+        Pairs closer than this stay one star, at their common centre of light.
+    partners : ndarray (m, FIT_COLUMNS)
+        Filled with the fits of the fainter stars.
+    owners : ndarray (m,)
+        Filled with the numbers of the stars they stood beside.
+    todo : ndarray (n,) of bool
+        Cleared for the stars that turn out to be pairs.
+
+    Returns
+    -------
+    int
+        How many pairs there are that are two stars.
+    """
+    sigma, per_dn, model_error = noise
+    largest, side = 1, _LEAST_SIDE
+    for k in suspects:
+        largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
+        side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
+    models = np.empty((6, largest))
+    work = np.empty((5, side))
+    cleaned = np.empty(largest, np.float32)
+    left_over = np.empty(largest)
+    pair = np.empty((2, stars.shape[1]))
+    found = 0
+    for k in suspects:
+        place = (int(windows[k, LEFT]), int(windows[k, TOP]), int(windows[k, COLUMNS]), int(windows[k, ROWS]))
+        count = place[2] * place[3]
+        begin = int(windows[k, OFFSET])
+        shape = (sigma, windows[k, TRAIL_X], windows[k, TRAIL_Y])
+        target = cleaned[:count]
+        target[:] = pixels[begin : begin + count]
+        for entry in range(first[k], first[k + 1]):
+            other = stars[neighbours[entry]]
+            if other[STATE] == GOOD:
+                star_model(other[X], other[Y], shape, place, models[:3], work)
+                for i in range(count):
+                    target[i] -= np.float32(other[FLUX] * models[0, i])
+        star_model(stars[k, X], stars[k, Y], shape, place, models[:3], work)
+        for i in range(count):
+            left_over[i] = target[i] - stars[k, FLUX] * models[0, i] if target[i] < UNUSABLE else 0.0
+        if not _start(left_over, place, stars[k], sigma, pair):
+            continue
+        noises = (windows[k, NOISE] ** 2, per_dn, model_error)
+        fitted = fit_pair(target, place, shape, noises, models[:, :count], work, pair)
+        if not fitted or not _is_better(pair, stars[k, CHI2], sigma, models, target):
+            continue
+        todo[k] = False
+        faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
+        if math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y]) < blend_px:
+            _merge(pair, stars[k])
+            continue
+        stars[k] = pair[1 - faint]
+        partners[found] = pair[faint]
+        owners[found] = k
+        found += 1
+    return found

@@ -1,0 +1,229 @@
+"""Shape of the stars of a frame: width of the spot, and the trails that a turning sensor draws.
+
+Second moments of bright stars under a Gaussian weight that is adapted to the star itself (Bernstein & Jarvis 2002)
+give each star's covariance: across a trail that of the spot, along it more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.background import interpolate_at
+from starid.imaging.jit_loops import compiled_loops
+from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, typical_trail
+
+Array = npt.NDArray[np.float64]
+
+MOMENT_COLUMNS: Final = 5
+_PIXEL_VARIANCE: Final = 1.0 / 12.0
+_ITERATIONS: Final = 30
+_SETTLED: Final = 1e-2
+_WEIGHT_END: Final = 12.0
+_LEAST_FOR_SPOT: Final = 3
+_ROUND_BELOW_PX: Final = 1.0
+_LEAST_SIGMA_PX: Final = 0.3
+_UNEXPLAINED: Final = 0.4
+
+
+@dataclass(frozen=True)
+class SpotShape:
+    """Spot and trails of a frame.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of the spot, pixels.
+    flow : ndarray (5,)
+        Flow of the trails (`starid.imaging.trail_flow`); all zero where stars are round.
+    trail_px : float
+        Median length of the trails, pixels.
+    stars : int
+        Stars that the estimate rests on; 0 if it is only assumed.
+    """
+
+    sigma_px: float
+    flow: Array
+    trail_px: float
+    stars: int
+
+
+@compiled_loops
+def adaptive_moments(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    x0: float,
+    y0: float,
+    background: float,
+    start_sigma: float,
+    largest: int,
+    saturation: float,
+    moments: Array,
+) -> bool:
+    """Centre and covariance of a bright star: (x, y, c_xx, c_xy, c_yy) into `moments`; False if there is none.
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts.
+    x0, y0, background, start_sigma
+        First guess of the place, background under it, first guess of the width.
+    largest : int
+        Half-width of the window at most; a star that needs more is given up.
+    saturation : float
+        Counts from which a star is saturated and given up.
+    """
+    height, width = image.shape
+    x, y = x0, y0
+    c_xx = c_yy = start_sigma * start_sigma
+    c_xy = 0.0
+    for _ in range(_ITERATIONS):
+        reach_x = math.ceil(3.0 * math.sqrt(c_xx))
+        reach_y = math.ceil(3.0 * math.sqrt(c_yy))
+        if max(reach_x, reach_y) > largest:
+            return False
+        left, right = round(x) - reach_x, round(x) + reach_x
+        top, bottom = round(y) - reach_y, round(y) + reach_y
+        if left < 0 or top < 0 or right >= width or bottom >= height:
+            return False
+        determinant = c_xx * c_yy - c_xy * c_xy
+        if not determinant > 1e-4:  # a line has no inverse
+            return False
+        i_xx, i_xy, i_yy = c_yy / determinant, -c_xy / determinant, c_xx / determinant
+        total = m_x = m_y = m_xx = m_xy = m_yy = 0.0
+        for row in range(top, bottom + 1):
+            dy = row - y
+            for column in range(left, right + 1):
+                dx = column - x
+                distance2 = i_xx * dx * dx + 2.0 * i_xy * dx * dy + i_yy * dy * dy
+                if distance2 > _WEIGHT_END:
+                    continue
+                if image[row, column] >= saturation:
+                    return False
+                light = math.exp(-0.5 * distance2) * (image[row, column] - background)
+                total += light
+                m_x += light * dx
+                m_y += light * dy
+                m_xx += light * dx * dx
+                m_xy += light * dx * dy
+                m_yy += light * dy * dy
+        if not total > 0.0:
+            return False
+        m_x /= total
+        m_y /= total
+        x += 2.0 * m_x
+        y += 2.0 * m_y
+        n_xx = 2.0 * (m_xx / total - m_x * m_x)
+        n_xy = 2.0 * (m_xy / total - m_x * m_y)
+        n_yy = 2.0 * (m_yy / total - m_y * m_y)
+        change = abs(n_xx - c_xx) + abs(n_yy - c_yy) + abs(n_xy - c_xy)
+        settled = change < _SETTLED * (c_xx + c_yy)
+        c_xx, c_xy, c_yy = max(n_xx, 0.05), n_xy, max(n_yy, 0.05)
+        if abs(x - x0) > largest or abs(y - y0) > largest:
+            return False
+        if settled:
+            moments[0], moments[1] = x, y
+            moments[2], moments[3], moments[4] = c_xx, c_xy, c_yy
+            return True
+    return False
+
+
+@compiled_loops
+def moments_of(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    peaks: npt.NDArray[np.int32],
+    level: npt.NDArray[np.float32],
+    block: float,
+    start_sigma: float,
+    largest: int,
+    saturation: float,
+    table: Array,
+) -> int:
+    """Fill `table` (n, 5) with the moments of the first peaks that have them; return how many.
+
+    Peaks that come to the place of an earlier one (several on one trail) count once.
+    """
+    count = 0
+    for k in range(peaks.shape[0]):
+        if count == table.shape[0]:
+            break
+        x, y = float(peaks[k, 0]), float(peaks[k, 1])
+        background = interpolate_at(level, block, x, y)
+        if not adaptive_moments(image, x, y, background, start_sigma, largest, saturation, table[count]):
+            continue
+        again = False
+        for earlier in range(count):
+            off = abs(table[earlier, 0] - table[count, 0]) + abs(table[earlier, 1] - table[count, 1])
+            again = again or off < 2.0  # pixels
+        if not again:
+            count += 1
+    return count
+
+
+def shape_from_moments(
+    table: Array, width: int, height: int, known_sigma_px: float | None, assumed_sigma_px: float
+) -> SpotShape:
+    """Spot and trails from the moments of bright stars.
+
+    Parameters
+    ----------
+    table : ndarray (n, 5)
+        (x, y, c_xx, c_xy, c_yy) of each star.
+    width, height : int
+        Size of the image.
+    known_sigma_px : float or None
+        Width of the spot, where it is known.
+    assumed_sigma_px : float
+        Width to assume where too few stars tell.
+    """
+    still = np.zeros(FLOW_TERMS)
+    if len(table) < _LEAST_FOR_SPOT:
+        return SpotShape(known_sigma_px or assumed_sigma_px, still, 0.0, 0)
+    c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
+    mean, split = 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
+    across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else float(np.median(mean - split))
+    across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
+    # a short trail of length L makes the split L²/24
+    if math.sqrt(24.0 * float(np.median(split))) > _ROUND_BELOW_PX:
+        length = trail_length(mean + split, across)
+        angle = 0.5 * np.arctan2(2.0 * c_xy, c_xx - c_yy)
+        trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        half = 0.5 * max(width, height)
+        places = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / half
+        flow = np.zeros(FLOW_TERMS)
+        fit_flow(places, trails, flow)
+        typical, off = typical_trail(flow, places, trails)
+        if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * float(np.median(length)):
+            return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
+    return SpotShape(_sigma(float(np.median(mean)), known_sigma_px), still, 0.0, len(table))
+
+
+def _sigma(variance: float, known: float | None) -> float:
+    """Standard deviation of the spot from its variance on pixels."""
+    return known or math.sqrt(max(variance - _PIXEL_VARIANCE, _LEAST_SIGMA_PX**2))
+
+
+@lru_cache(maxsize=1)
+def _box_share() -> tuple[Array, Array]:
+    """Half-length z of a box in sigmas of a Gaussian weight, and 1 − 2zφ(z)/(2Φ(z) − 1) for it."""
+    z = np.linspace(1e-3, 4.0, 2000)
+    bell = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    inside = np.array([math.erf(value / math.sqrt(2.0)) for value in z])
+    return z, 1.0 - 2.0 * z * bell / inside
+
+
+def trail_length(along: Array, across: float) -> Array:
+    """Lengths (n,) of trails from the adaptive variance along them (n,) and that across.
+
+    A trail is a box of half-length h convolved with the spot. Under a Gaussian weight of variance C (in units of the
+    spot's) its second moment is C/(C + 1) + (C/(C + 1))²·(C + 1)·s, s being the share by which a Gaussian of
+    variance C + 1 is cut down on (−h, h); adapted moments have the moment C/2, so that s = (C − 1)/2C.
+    """
+    ratio = np.maximum(along / across, 1.0)
+    z, share = _box_share()
+    cut = np.interp((ratio - 1.0) / (2.0 * ratio), share, z, left=0.0)
+    return np.asarray(2.0 * cut * np.sqrt(ratio + 1.0) * math.sqrt(across), dtype=np.float64)

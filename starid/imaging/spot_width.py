@@ -1,0 +1,133 @@
+"""Width of the spot, fitted to bright stars together with place and flux."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.background import interpolate_at
+from starid.imaging.centroid import FIT_COLUMNS, FLUX, GOOD, STATE, X, Y, fit_star, spot_model
+from starid.imaging.jit_loops import compiled_loops
+
+Array = npt.NDArray[np.float64]
+
+NARROWEST_PX: Final = 0.25
+WIDEST_PX: Final = 8.0
+_REACH_SIGMA: Final = 3.5
+_LARGEST_HALF_WIDTH: Final = 28
+_ROUNDS: Final = 8
+_STEP: Final = 0.02
+_MOST_CHANGE: Final = 0.3
+_SETTLED: Final = 0.01
+_MODEL_ERROR: Final = 0.02
+
+
+@compiled_loops
+def _one_width(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    column: int,
+    row: int,
+    sky: float,
+    noise: float,
+    start: float,
+    saturation: float,
+    result: Array,
+) -> float:
+    """Width of the star at a peak; NaN if there is none to be had."""
+    height, width = image.shape
+    sigma = start
+    for _ in range(_ROUNDS):
+        half = min(max(math.ceil(_REACH_SIGMA * sigma), 3), _LARGEST_HALF_WIDTH)
+        left, top, side = column - half, row - half, 2 * half + 1
+        if left < 0 or top < 0 or left + side > width or top + side > height:
+            return math.nan
+        pixels = np.empty(side * side, np.float32)
+        for j in range(side):
+            for i in range(side):
+                value = image[top + j, left + i]
+                if value >= saturation:
+                    return math.nan
+                pixels[j * side + i] = value - sky
+        window = (left, top, side, side)
+        model = np.empty((3, side * side))
+        wider = np.empty((3, side * side))
+        narrower = np.empty((3, side * side))
+        work = np.empty((5, max(side, 11)))
+        place = (float(column), float(row))
+        noises = (noise * noise, 0.0, _MODEL_ERROR)
+        fit_star(pixels, window, place, (sigma, 0.0, 0.0), noises, model, work, result)
+        if result[STATE] != GOOD or not result[FLUX] > 0.0:
+            return math.nan
+        x, y, flux = result[X], result[Y], result[FLUX]
+        spot_model(x, y, sigma, window, model, work)
+        spot_model(x, y, sigma * (1.0 + _STEP), window, wider, work)
+        spot_model(x, y, sigma * (1.0 - _STEP), window, narrower, work)
+        # least squares for changes of flux and width; place does not mix with either
+        ff = fs = ss = bf = bs = 0.0
+        for k in range(pixels.size):
+            share = model[0, k]
+            slope = flux * (wider[0, k] - narrower[0, k]) / (2.0 * _STEP * sigma)
+            light = flux * share
+            weight = 1.0 / (noise * noise + _MODEL_ERROR * _MODEL_ERROR * light * light)
+            off = pixels[k] - light
+            ff += weight * share * share
+            fs += weight * share * slope
+            ss += weight * slope * slope
+            bf += weight * share * off
+            bs += weight * slope * off
+        determinant = ff * ss - fs * fs
+        if not determinant > 0.0:
+            return math.nan
+        change = (ff * bs - fs * bf) / determinant
+        change = min(max(change, -_MOST_CHANGE * sigma), _MOST_CHANGE * sigma)
+        sigma += change
+        if not NARROWEST_PX <= sigma <= WIDEST_PX:
+            return math.nan
+        if abs(change) < _SETTLED * sigma:
+            return sigma
+    return math.nan
+
+
+@compiled_loops
+def spot_widths(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    peaks: npt.NDArray[np.int32],
+    level: npt.NDArray[np.float32],
+    noise: npt.NDArray[np.float32],
+    block: float,
+    start: float,
+    saturation: float,
+    widths: Array,
+) -> int:
+    """Fill `widths` (m,) with the spot widths of the first peaks that have one; return how many.
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts.
+    peaks : ndarray (n, 2)
+        Column and row of each, the brightest first.
+    level, noise, block
+        Grid of the background, and the side of its blocks.
+    start : float
+        First guess, pixels.
+    saturation : float
+        Counts from which a star is saturated and given up.
+    """
+    count = 0
+    result = np.empty(FIT_COLUMNS)
+    for k in range(peaks.shape[0]):
+        if count == widths.size:
+            break
+        column, row = peaks[k, 0], peaks[k, 1]
+        x, y = float(column), float(row)
+        sky = interpolate_at(level, block, x, y)
+        spread = interpolate_at(noise, block, x, y)
+        width = _one_width(image, column, row, sky, max(spread, 1e-3), start, saturation, result)
+        if width == width:
+            widths[count] = width
+            count += 1
+    return count

@@ -1,0 +1,199 @@
+"""The trails that a turning sensor draws: one flow over the whole field.
+
+Through a lens that keeps straight lines straight, trails follow, with (u, v) measured from the image's centre,
+
+    dx = t_x + a·u² + b·u·v − r·v,    dy = t_y + a·u·v + b·v² + r·u,
+
+and nearly so through any other: t is the turn across the boresight, r that about it, a and b the perspective. The
+five numbers are fitted to the trails of bright stars, whose senses are not seen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.jit_loops import compiled_loops
+
+Array = npt.NDArray[np.float64]
+
+FLOW_TERMS: Final = 5
+_TRANSLATION: Final = 2
+_WITH_ROLL: Final = 3
+_LEAST_FOR_ROLL: Final = 5
+_LEAST_FOR_FLOW: Final = 12
+_STARTS_FROM: Final = 7
+_CLIP: Final = 3.0
+_LEAST_CLIP_PX: Final = 0.1
+_ROUNDS: Final = 4
+_SINGULAR: Final = 1e-12
+
+
+@compiled_loops
+def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
+    """Trail (dx, dy) in pixels at an image position, up to its sense.
+
+    Parameters
+    ----------
+    flow : ndarray (5,)
+        t_x, t_y, r, a, b in pixels, for (u, v) in halves of the image's longer side.
+    x, y : float
+        Position, pixels.
+    width, height : int
+        Size of the image.
+    """
+    half = 0.5 * max(width, height)
+    u = (x - 0.5 * (width - 1)) / half
+    v = (y - 0.5 * (height - 1)) / half
+    inward = flow[3] * u + flow[4] * v
+    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
+
+
+@compiled_loops
+def _rows(u: float, v: float, rows: Array) -> None:
+    """Factors (2, 5) of a flow in dx and in dy at a place."""
+    rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3], rows[0, 4] = 1.0, 0.0, -v, u * u, u * v
+    rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3], rows[1, 4] = 0.0, 1.0, u, u * v, v * v
+
+
+@compiled_loops
+def _drawn(flow: Array, u: float, v: float) -> tuple[float, float]:
+    """Trail of a flow at a place."""
+    inward = flow[3] * u + flow[4] * v
+    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
+
+
+@compiled_loops
+def mismatch(flow: Array, places: Array, trails: Array, k: int) -> tuple[float, float]:
+    """Distance between the seen trail k and the flow's, and the sense (±1) in which it is the smaller."""
+    dx, dy = _drawn(flow, places[k, 0], places[k, 1])
+    forth = math.hypot(trails[k, 0] - dx, trails[k, 1] - dy)
+    back = math.hypot(trails[k, 0] + dx, trails[k, 1] + dy)
+    return (forth, 1.0) if forth <= back else (back, -1.0)
+
+
+@compiled_loops
+def _solve(matrix: Array, right: Array, used: int, out: Array) -> bool:
+    """Solve the first `used` equations of a positive system by elimination; False if it is singular."""
+    for column in range(used):
+        pivot = column
+        for row in range(column + 1, used):
+            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
+                pivot = row
+        if abs(matrix[pivot, column]) < _SINGULAR:
+            return False
+        for k in range(used):
+            matrix[column, k], matrix[pivot, k] = matrix[pivot, k], matrix[column, k]
+        right[column], right[pivot] = right[pivot], right[column]
+        for row in range(column + 1, used):
+            factor = matrix[row, column] / matrix[column, column]
+            for k in range(column, used):
+                matrix[row, k] -= factor * matrix[column, k]
+            right[row] -= factor * right[column]
+    out[:] = 0.0
+    for row in range(used - 1, -1, -1):
+        value = right[row]
+        for k in range(row + 1, used):
+            value -= matrix[row, k] * out[k]
+        out[row] = value / matrix[row, row]
+    return True
+
+
+@compiled_loops
+def _least_squares(
+    places: Array,
+    trails: Array,
+    senses: Array,
+    used: int,
+    matrix: Array,
+    right: Array,
+    rows: Array,
+    out: Array,
+) -> bool:
+    """Flow of `used` terms through the trails, each in its sense (0: left out)."""
+    matrix[:] = 0.0
+    right[:] = 0.0
+    for k in range(places.shape[0]):
+        if senses[k] == 0.0:
+            continue
+        _rows(places[k, 0], places[k, 1], rows)
+        for axis in range(2):
+            seen = senses[k] * trails[k, axis]
+            for i in range(used):
+                right[i] += rows[axis, i] * seen
+                for j in range(used):
+                    matrix[i, j] += rows[axis, i] * rows[axis, j]
+    return _solve(matrix, right, used, out)
+
+
+@compiled_loops
+def _left_over(flow: Array, places: Array, trails: Array) -> float:
+    """Mean distance between seen and drawn trails, each counted as at most half its length."""
+    total = 0.0
+    for k in range(places.shape[0]):
+        off, _ = mismatch(flow, places, trails, k)
+        total += min(off, 0.5 * math.hypot(trails[k, 0], trails[k, 1]))
+    return float(total / places.shape[0])
+
+
+@compiled_loops
+def fit_flow(places: Array, trails: Array, flow: Array) -> None:
+    """Fit a flow (5,) to trails (n, 2) at places (n, 2), whatever their senses.
+
+    Starts are translations along one of the brightest stars' trails, and translation with roll through two of them
+    in either relative sense; the one that leaves least is refined by least squares without outliers. Few stars get
+    fewer terms: below 5 only the translation, below 12 no perspective.
+    """
+    count = places.shape[0]
+    senses = np.zeros(count)
+    matrix = np.empty((FLOW_TERMS, FLOW_TERMS))
+    right = np.empty(FLOW_TERMS)
+    rows = np.empty((2, FLOW_TERMS))
+    start = np.zeros(FLOW_TERMS)
+    few = min(count, _STARTS_FROM)
+    flow[:] = 0.0
+    least = math.inf
+    for i in range(few):
+        for j in range(i, few):
+            for sense in (1.0, -1.0):
+                senses[:] = 0.0
+                senses[i] = 1.0
+                if j > i:
+                    senses[j] = sense
+                terms = _WITH_ROLL if j > i else _TRANSLATION
+                if not _least_squares(places, trails, senses, terms, matrix, right, rows, start):
+                    continue
+                left = _left_over(start, places, trails)
+                if left < least:
+                    least = left
+                    flow[:] = start
+    used = _TRANSLATION if count < _LEAST_FOR_ROLL else _WITH_ROLL if count < _LEAST_FOR_FLOW else FLOW_TERMS
+    off = np.empty(count)
+    for _ in range(_ROUNDS):
+        for k in range(count):
+            off[k], senses[k] = mismatch(flow, places, trails, k)
+        limit = max(_CLIP * np.median(off), _LEAST_CLIP_PX)
+        kept = 0
+        for k in range(count):
+            if off[k] > limit:
+                senses[k] = 0.0
+            else:
+                kept += 1
+        if kept < used or not _least_squares(places, trails, senses, used, matrix, right, rows, start):
+            return
+        flow[:] = start
+
+
+@compiled_loops
+def typical_trail(flow: Array, places: Array, trails: Array) -> tuple[float, float]:
+    """Median length of a flow's trails at places (n, 2), and median distance from the seen ones (n, 2), pixels."""
+    lengths = np.empty(places.shape[0])
+    off = np.empty(places.shape[0])
+    for k in range(places.shape[0]):
+        dx, dy = _drawn(flow, places[k, 0], places[k, 1])
+        lengths[k] = math.hypot(dx, dy)
+        off[k], _ = mismatch(flow, places, trails, k)
+    return float(np.median(lengths)), float(np.median(off))

@@ -1,0 +1,352 @@
+"""Windows around candidates: how large each must be, what the sky is under it, and its pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.imaging.background import LEAST_NOISE_DN, interpolate_at
+from starid.imaging.jit_loops import compiled_loops
+from starid.imaging.trail_flow import trail_at
+
+WINDOW_COLUMNS: Final = 14
+(
+    LEFT,
+    TOP,
+    COLUMNS,
+    ROWS,
+    OFFSET,
+    START_X,
+    START_Y,
+    BASE,
+    NOISE,
+    PATCH,
+    TRAIL_X,
+    TRAIL_Y,
+    RADIUS_X,
+    RADIUS_Y,
+) = range(WINDOW_COLUMNS)
+"""Columns of a table of windows: place and size; where the pixels begin in the packed array; first guess of the star;
+sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
+
+LARGEST_HALF_WIDTH: Final = 40
+"""Half-width of a window at most, pixels."""
+
+MOST_SATURATED: Final = 400
+"""Connected saturated pixels from which on an object is no star."""
+
+PATCH_REACH: Final = 40
+"""So far from its peak the saturated patch of a star reaches at most, pixels."""
+
+EXTENDED: Final = -1.0
+SEEN_BEFORE: Final = -2.0
+NO_ROOM: Final = -3.0
+ONE_PIXEL: Final = -4.0
+"""Values of COLUMNS that say why a candidate has no window."""
+
+_MOST_PATCHES: Final = 1000
+_RING_PIXELS: Final = 48
+_RING_SHIFT_SIGMA: Final = 0.6
+_BLOCK_OF_MORE_THAN_SKY: Final = 1.5
+_RING_OF_MORE_THAN_SKY: Final = 2.0
+_QUARTILE_SIGMA: Final = 1.349
+_LEAST_REACH_SIGMA: Final = 2.5
+_MOST_REACH_SIGMA: Final = 6.0
+_VISIBLE_NOISE: Final = 0.33
+_LEAST_SPREAD_PX: Final = 0.5
+_ALONE_SIGMA: Final = 8.0
+_ALONE_SHARE: Final = 0.125
+
+
+@compiled_loops
+def light_radius(sigma: float, flux: float, noise: float) -> int:
+    """Half-width of the square in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
+    peak = flux / (2.0 * math.pi * sigma * sigma)
+    ratio = max(peak / (_VISIBLE_NOISE * noise), 1.0)
+    reach = max(_LEAST_REACH_SIGMA, min(math.sqrt(2.0 * math.log(ratio)), _MOST_REACH_SIGMA))
+    return min(max(math.ceil(reach * sigma + 0.5), 2), LARGEST_HALF_WIDTH)
+
+
+@compiled_loops
+def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) -> tuple[float, float]:
+    """Slopes of the background along x and y, counts a pixel."""
+    return (
+        0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y)),
+        0.5 * (interpolate_at(level, block, x, y + 1.0) - interpolate_at(level, block, x, y - 1.0)),
+    )
+
+
+@compiled_loops
+def _ring(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    x: int,
+    y: int,
+    radius_x: int,
+    radius_y: int,
+    slopes: tuple[float, float],
+    circle: npt.NDArray[np.float64],
+    values: npt.NDArray[np.float64],
+) -> tuple[float, float]:
+    """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
+
+    The sky's slopes along x and y are taken off first.
+    """
+    height, width = image.shape
+    count = 0
+    for k in range(_RING_PIXELS):
+        out = 1.5 if k % 2 == 0 else 3.0
+        column = x + math.floor((radius_x + out) * circle[0, k] + 0.5)
+        row = y + math.floor((radius_y + out) * circle[1, k] + 0.5)
+        if 0 <= column < width and 0 <= row < height:
+            key = image[row, column] - slopes[0] * (column - x) - slopes[1] * (row - y)
+            j = count - 1
+            while j >= 0 and values[j] > key:
+                values[j + 1] = values[j]
+                j -= 1
+            values[j + 1] = key
+            count += 1
+    if count < _RING_PIXELS // 4:
+        return math.nan, math.nan
+    low, high = count // 4, (3 * count) // 4
+    total = 0.0
+    for k in range(low, high):
+        total += values[k]
+    return total / (high - low), (values[high] - values[low]) / _QUARTILE_SIGMA
+
+
+@compiled_loops
+def _saturated_patch(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    x: int,
+    y: int,
+    saturation: float,
+    seen: npt.NDArray[np.uint8],
+    stack: npt.NDArray[np.int32],
+    patch: npt.NDArray[np.float64],
+) -> bool:
+    """Follow the connected saturated pixels from (x, y); False if there are too many, or too far, for a star.
+
+    Fills `patch` (7,) with their mean column and row, half their larger extent, and their first and last column and
+    row. `seen` is scratch of (2·PATCH_REACH + 1)².
+    """
+    height, width = image.shape
+    seen[:] = 0
+    seen[PATCH_REACH, PATCH_REACH] = 1
+    stack[0, 0], stack[0, 1] = x, y
+    waiting, count = 1, 0
+    total_x = total_y = 0.0
+    left, right, top, bottom = x, x, y, y
+    while waiting > 0:
+        waiting -= 1
+        column, row = stack[waiting, 0], stack[waiting, 1]
+        count += 1
+        if count >= MOST_SATURATED or max(abs(column - x), abs(row - y)) >= PATCH_REACH:
+            return False
+        total_x += column
+        total_y += row
+        left, right = min(left, column), max(right, column)
+        top, bottom = min(top, row), max(bottom, row)
+        for b in range(max(row - 1, 0), min(row + 2, height)):
+            for a in range(max(column - 1, 0), min(column + 2, width)):
+                i, j = a - x + PATCH_REACH, b - y + PATCH_REACH
+                if seen[j, i] == 0 and image[b, a] >= saturation and waiting < stack.shape[0]:
+                    seen[j, i] = 1
+                    stack[waiting, 0], stack[waiting, 1] = a, b
+                    waiting += 1
+    patch[0], patch[1] = total_x / count, total_y / count
+    patch[2] = 0.5 * (max(right - left, bottom - top) + 1)
+    patch[3], patch[4], patch[5], patch[6] = left, right, top, bottom
+    return True
+
+
+@compiled_loops
+def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: int) -> bool:
+    """Whether a pixel lies in the box around a patch that was followed before."""
+    for k in range(count):
+        if patches[k, 3] <= column <= patches[k, 4] and patches[k, 5] <= row <= patches[k, 6]:
+            return True
+    return False
+
+
+@compiled_loops
+def _sky(
+    around: float, spread: float, base: float, noise: float, typical_noise: float
+) -> tuple[float, float]:
+    """Sky and noise under a star, from its ring (NaN if there is none) and from the grid of blocks.
+
+    The grid has the smaller error; the ring wins where it contradicts the grid, as in glare or by a bright limb.
+    """
+    if spread != spread:
+        return base, noise
+    if noise > _BLOCK_OF_MORE_THAN_SKY * typical_noise:
+        noise = max(spread, typical_noise)
+    elif spread > _RING_OF_MORE_THAN_SKY * noise:
+        noise = spread
+    if abs(around - base) > _RING_SHIFT_SIGMA * noise + 0.5 * LEAST_NOISE_DN:
+        base = around
+    return base, noise
+
+
+@compiled_loops
+def _middle(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float
+) -> tuple[float, float]:
+    """First guess of a star's place: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
+    height, width = image.shape
+    if not (0 < column < width - 1 and 0 < row < height - 1):
+        return float(column), float(row)
+    total = 1e-6
+    x = y = 0.0
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            light = max(float(image[row + dy, column + dx]) - sky, 0.0)
+            total += light
+            x += light * dx
+            y += light * dy
+    return column + min(max(1.5 * x / total, -0.7), 0.7), row + min(max(1.5 * y / total, -0.7), 0.7)
+
+
+@compiled_loops
+def _stands_alone(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float, noise: float
+) -> bool:
+    """Whether a pixel is bright and none of its neighbours has even an eighth of its light: a hot pixel."""
+    height, width = image.shape
+    peak = image[row, column] - sky
+    if peak < _ALONE_SIGMA * noise:
+        return False
+    for b in range(max(row - 1, 0), min(row + 2, height)):
+        for a in range(max(column - 1, 0), min(column + 2, width)):
+            if (a != column or b != row) and image[b, a] - sky > _ALONE_SHARE * peak:
+                return False
+    return True
+
+
+@compiled_loops
+def lay_windows(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    peaks: npt.NDArray[np.int32],
+    flux: npt.NDArray[np.float32],
+    level: npt.NDArray[np.float32],
+    noise: npt.NDArray[np.float32],
+    block: float,
+    spot: tuple[float, float, float],
+    flow: npt.NDArray[np.float64],
+    windows: npt.NDArray[np.float64],
+) -> int:
+    """Lay a window around every candidate.
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts.
+    peaks : ndarray (n, 2)
+        Column and row of each candidate, the brightest first.
+    flux : ndarray (n,)
+        First guess of their light, counts.
+    level, noise, block
+        Grid of the background, and the side of its blocks.
+    spot : (float, float, float)
+        Standard deviation of the spot, pixels; saturation and the typical noise of a pixel, counts.
+    flow : ndarray (5,)
+        Flow of the trails (`starid.imaging.trail_flow`).
+    windows : ndarray (n, WINDOW_COLUMNS)
+        Filled; COLUMNS tells where there is none, and why.
+
+    Returns
+    -------
+    int
+        Pixels in all windows together.
+    """
+    height, width = image.shape
+    sigma, saturation, typical_noise = spot
+    ring = np.empty(_RING_PIXELS)
+    circle = np.empty((2, _RING_PIXELS))
+    for k in range(_RING_PIXELS):
+        circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
+        circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
+    seen = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
+    stack = np.empty((2 * MOST_SATURATED, 2), np.int32)
+    patches = np.empty((_MOST_PATCHES, 7))
+    patch_count = 0
+    total = 0
+    for k in range(peaks.shape[0]):
+        window = windows[k]
+        column, row = peaks[k, 0], peaks[k, 1]
+        patch = patches[patch_count]
+        patch[0], patch[1], patch[2] = column, row, 0.0
+        if image[row, column] >= saturation:
+            if _in_patches(column, row, patches, patch_count):
+                window[COLUMNS] = SEEN_BEFORE
+                continue
+            if not _saturated_patch(image, column, row, saturation, seen, stack, patch):
+                window[COLUMNS] = EXTENDED
+                continue
+            patch_count = min(patch_count + 1, _MOST_PATCHES - 1)
+        x, y, extra = patch[0], patch[1], patch[2]
+        trail_x, trail_y = trail_at(flow, x, y, width, height)
+        radius = light_radius(sigma, float(flux[k]), typical_noise)
+        radius_x = min(math.ceil(radius + 0.5 * abs(trail_x) + extra), LARGEST_HALF_WIDTH)
+        radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
+        centre_x, centre_y = round(x), round(y)
+        slopes = _slopes(level, block, x, y)
+        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
+        sky_level, window[NOISE] = _sky(
+            around,
+            spread,
+            interpolate_at(level, block, x, y),
+            interpolate_at(noise, block, x, y),
+            typical_noise,
+        )
+        window[BASE] = sky_level
+        if sigma >= _LEAST_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
+            window[COLUMNS] = ONE_PIXEL
+            continue
+        left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)
+        columns = min(centre_x + radius_x, width - 1) - left + 1
+        rows = min(centre_y + radius_y, height - 1) - top + 1
+        window[LEFT], window[TOP] = left, top
+        if extra == 0.0:
+            x, y = _middle(image, column, row, sky_level)
+        window[START_X], window[START_Y], window[PATCH] = x, y, extra
+        window[TRAIL_X], window[TRAIL_Y] = trail_x, trail_y
+        window[RADIUS_X], window[RADIUS_Y] = radius_x, radius_y
+        window[OFFSET] = total
+        if min(columns, rows) < 3:
+            window[COLUMNS] = NO_ROOM
+            continue
+        window[COLUMNS], window[ROWS] = columns, rows
+        total += columns * rows
+    return total
+
+
+@compiled_loops
+def cut_windows(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    windows: npt.NDArray[np.float64],
+    level: npt.NDArray[np.float32],
+    block: float,
+    saturation: float,
+    pixels: npt.NDArray[np.float32],
+) -> None:
+    """Copy the windows' pixels, one window after the other, less the sky; saturated ones become infinite.
+
+    The sky is a plane: `BASE` at the first guess of the star, sloped as the grid of blocks.
+    """
+    position = 0
+    for k in range(windows.shape[0]):
+        window = windows[k]
+        if window[COLUMNS] <= 0.0:
+            continue
+        x, y, base = window[START_X], window[START_Y], window[BASE]
+        slope_x, slope_y = _slopes(level, block, x, y)
+        left, top = int(window[LEFT]), int(window[TOP])
+        for j in range(top, top + int(window[ROWS])):
+            for i in range(left, left + int(window[COLUMNS])):
+                value = float(image[j, i])
+                sky = base + slope_x * (i - x) + slope_y * (j - y)
+                pixels[position] = np.float32(value - sky if value < saturation else math.inf)
+                position += 1

@@ -1,0 +1,238 @@
+"""From a coarse boresight to matched stars: distances from the centre vote for the roll, then the stars are paired.
+
+A cell of the database says where the boresight is to half a cell and nothing certain about roll. A star's distance from
+the centre does not change with roll, so that every pair of an observed and a catalogue star alike in that distance and
+in brightness votes for the roll between them. The true cell makes a peak that chance does not.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.jit import compiled
+from starid.thesis.frame_sky import BIN_DEG, BRIGHTNESS, DEC_BINS, FOCAL, HALF_WIDTH, RA_BINS, UX, UY, UZ
+
+MAX_STARS: Final = 256
+"""Most catalogue stars of a cell that are considered."""
+
+ROLL_BINS: Final = 180
+"""Bins of 2° that the votes for the roll fall into."""
+
+_REFITS: Final = 4
+_INNERMOST: Final = 4.0
+
+
+@compiled
+def stars_near(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    ra_deg: float,
+    dec_deg: float,
+    margin: float,
+    found: NDArray[np.float64],
+    rows: NDArray[np.int64],
+) -> int:
+    """List the stars of a frame on the sphere with north up and a margin around it; return how many.
+
+    `found` (n, 3) receives x, y in pixels and the magnitude, `rows` (n,) the stars' rows in the table.
+    """
+    limit = (frame[HALF_WIDTH] + margin) ** 2
+    reach = math.degrees(math.atan((frame[HALF_WIDTH] + margin) / frame[FOCAL]))
+    a, d = math.radians(ra_deg), math.radians(dec_deg)
+    cos_a, sin_a, cos_d, sin_d = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
+    window = 180.0
+    if abs(dec_deg) + reach < 90.0:
+        window = math.degrees(math.asin(min(math.sin(math.radians(reach)) / cos_d, 1.0)))
+    low = max(math.floor((dec_deg - reach + 90.0) / BIN_DEG), 0)
+    high = min(math.floor((dec_deg + reach + 90.0) / BIN_DEG), DEC_BINS - 1)
+    first = math.floor((ra_deg - window) / BIN_DEG)
+    last = min(math.floor((ra_deg + window) / BIN_DEG), first + RA_BINS - 1)
+    count = 0
+    for band in range(low, high + 1):
+        for place in range(first, last + 1):
+            b = band * RA_BINS + place % RA_BINS
+            for i in range(bin_start[b], bin_start[b + 1]):
+                east = cos_a * stars[i, UY] - sin_a * stars[i, UX]
+                level = cos_a * stars[i, UX] + sin_a * stars[i, UY]
+                depth = cos_d * level + sin_d * stars[i, UZ]
+                if depth <= 0.0:
+                    continue
+                x = -frame[FOCAL] * east / depth
+                y = -frame[FOCAL] * (cos_d * stars[i, UZ] - sin_d * level) / depth
+                if x * x + y * y <= limit and count < found.shape[0]:
+                    found[count, 0] = x
+                    found[count, 1] = y
+                    found[count, 2] = stars[i, BRIGHTNESS]
+                    rows[count] = i
+                    count += 1
+    return count
+
+
+@compiled
+def vote_roll(
+    observed: NDArray[np.float64],
+    polar: NDArray[np.float64],
+    near: NDArray[np.float64],
+    count: int,
+    offset_px: float,
+    magnitude_gate: float,
+    votes: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Let the stars vote; return the best turn from catalogue to image in radians, and its votes.
+
+    Parameters
+    ----------
+    observed, polar
+        Observed stars: x, y, magnitude (n, 3), and distance and angle from the centre (n, 2).
+    near, count
+        Catalogue stars with north up as `stars_near` lists them.
+    offset_px
+        Greatest error of the boresight, pixels.
+    magnitude_gate
+        Greatest difference of magnitudes.
+    votes
+        Work space (`ROLL_BINS`,).
+    """
+    votes[:] = 0.0
+    width = 2.0 * math.pi / ROLL_BINS
+    for j in range(count):
+        r = math.sqrt(near[j, 0] ** 2 + near[j, 1] ** 2)
+        angle = math.atan2(near[j, 1], near[j, 0])
+        for i in range(observed.shape[0]):
+            if abs(polar[i, 0] - r) > offset_px or polar[i, 0] < _INNERMOST * offset_px:
+                continue
+            if abs(observed[i, 2] - near[j, 2]) > magnitude_gate:
+                continue
+            bin_of = math.floor((polar[i, 1] - angle) / width) % ROLL_BINS
+            votes[bin_of] += 1.0
+    best = -1.0
+    peak = 0
+    for b in range(ROLL_BINS):
+        total = votes[b - 1] + votes[b] + votes[(b + 1) % ROLL_BINS]
+        if total > best:
+            best = total
+            peak = b
+    shift = votes[(peak + 1) % ROLL_BINS] - votes[peak - 1]
+    turn = (peak + 0.5 + shift / max(best, 1.0)) * width
+    return turn, best
+
+
+@compiled
+def pair_stars(
+    observed: NDArray[np.float64],
+    near: NDArray[np.float64],
+    count: int,
+    turn: float,
+    tolerance_px: float,
+    magnitude_gate: float,
+    pairs: NDArray[np.int64],
+) -> int:
+    """Pair observed and catalogue stars from a first turn on, refitting turn and shift; return the number of pairs.
+
+    `pairs` (n, 2) receives the observed star and the place in `near`.
+    """
+    c, s, x, y = math.cos(turn), math.sin(turn), 0.0, 0.0
+    found = 0
+    tolerance = tolerance_px
+    for _ in range(_REFITS):
+        found = 0
+        sums = np.zeros(4)
+        along = 0.0
+        across = 0.0
+        for i in range(observed.shape[0]):
+            best = tolerance * tolerance
+            partner = -1
+            for j in range(count):
+                if abs(observed[i, 2] - near[j, 2]) > magnitude_gate:
+                    continue
+                dx = c * near[j, 0] - s * near[j, 1] + x - observed[i, 0]
+                dy = s * near[j, 0] + c * near[j, 1] + y - observed[i, 1]
+                square = dx * dx + dy * dy
+                if square < best:
+                    best = square
+                    partner = j
+            if partner >= 0:
+                pairs[found, 0] = i
+                pairs[found, 1] = partner
+                sums[0] += near[partner, 0]
+                sums[1] += near[partner, 1]
+                sums[2] += observed[i, 0]
+                sums[3] += observed[i, 1]
+                found += 1
+        if found < 3:
+            return found
+        sums /= found
+        for k in range(found):
+            u = near[pairs[k, 1], 0] - sums[0]
+            v = near[pairs[k, 1], 1] - sums[1]
+            p = observed[pairs[k, 0], 0] - sums[2]
+            q = observed[pairs[k, 0], 1] - sums[3]
+            along += u * p + v * q
+            across += u * q - v * p
+        length = math.hypot(along, across)
+        if length <= 0.0:
+            return 0
+        c, s = along / length, across / length
+        x = sums[2] - c * sums[0] + s * sums[1]
+        y = sums[3] - s * sums[0] - c * sums[1]
+        tolerance = max(0.55 * tolerance, 0.15 * tolerance_px)
+    return found
+
+
+@compiled
+def next_candidate(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    observed: NDArray[np.float64],
+    candidates: NDArray[np.float64],
+    start: int,
+    settings: NDArray[np.float64],
+    matched: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Find the next boresight from place `start` on that the stars vote for; return its place (−1: none) and pairs.
+
+    Parameters
+    ----------
+    stars, bin_start, frame
+        Stars of a spherical database.
+    observed
+        x, y in pixels and magnitude of the observed stars, (n, 3).
+    candidates
+        Right ascension and declination, degrees, (k, 2).
+    settings
+        Greatest error of a boresight in pixels, greatest difference of magnitudes, share of the stars and number of
+        stars that must vote for one turn.
+    matched
+        Output (n, 2): observed star, row in the table of stars.
+    """
+    n = observed.shape[0]
+    polar = np.empty((n, 2))
+    for i in range(n):
+        polar[i, 0] = math.sqrt(observed[i, 0] ** 2 + observed[i, 1] ** 2)
+        polar[i, 1] = math.atan2(observed[i, 1], observed[i, 0])
+    near = np.empty((MAX_STARS, 3))
+    rows = np.empty(MAX_STARS, dtype=np.int64)
+    votes = np.empty(ROLL_BINS)
+    offset, gate, share, fewest = settings[0], settings[1], settings[2], settings[3]
+    for place in range(start, candidates.shape[0]):
+        count = stars_near(
+            stars, bin_start, frame, candidates[place, 0], candidates[place, 1], offset, near, rows
+        )
+        need = max(fewest, share * min(n, count))
+        if min(n, count) < fewest:
+            continue
+        turn, best = vote_roll(observed, polar, near, count, offset, gate, votes)
+        if best < need:
+            continue
+        found = pair_stars(observed, near, count, turn, 2.5 * offset, gate, matched)
+        if found >= need:
+            for k in range(found):
+                matched[k, 1] = rows[matched[k, 1]]
+            return place, found
+    return -1, 0

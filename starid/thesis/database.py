@@ -1,0 +1,355 @@
+"""The feature database: one 8-bit feature vector for every frame of a grid, built in parallel from the stars."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.camera import Camera
+from starid.catalog import Band, StarCatalog
+from starid.errors import StaridError
+from starid.jit import compiled
+from starid.thesis.features import FEATURE_COUNT, FeatureVector
+from starid.thesis.frame_grid import FrameGrid, Geometry, make_grid
+from starid.thesis.frame_sky import Direction, FrameSky, cell_features, make_frame_sky
+
+CODE_MAX: Final = 255
+"""Largest code of a stored feature; codes span 0 … 100 of the normalised scale."""
+
+CODE_STEP: Final = 100.0 / CODE_MAX
+"""One step of a stored feature on the normalised scale."""
+
+THETA_CODES: Final = 255
+"""Number of codes of the polar angle; the code 255 marks a cell without a star."""
+
+THESIS_FRAME_DEG: Final = 40.0
+"""Frame width of every published number (the text says 42°)."""
+
+THESIS_KAPPA: Final = 11.5
+"""Brightness limit of every published number, on the Hp magnitude, keeping the stars that are fainter."""
+
+_ROWS_PER_BLOCK: Final = 8
+_WIDEST_HALF_FIELD: Final = math.radians(60.0)
+
+Progress = Callable[[int, int], None]
+"""Called with cells done and cells in all, both passes counted."""
+
+
+class DatabaseError(StaridError):
+    """A database that cannot be built, read, or used for what it is asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class DatabaseParameters:
+    """What a database depends on beside the stars.
+
+    Attributes
+    ----------
+    geometry
+        "planar" for the thesis's plane, "spherical" for a camera on the true sphere.
+    overlap
+        Overlap ratio p as a fraction.
+    fov_deg
+        Width φ of a frame, degrees.
+    kappa, direction, band
+        Brightness limit, which side of it is kept, and the magnitude it is put on.
+    full_field
+        Square frames instead of circles (not invariant to roll).
+    focal_px, half_width_px
+        Focal length and half the frame's width in pixels of a gnomonic image; spherical only.
+    """
+
+    geometry: Geometry = "planar"
+    overlap: float = 0.995
+    fov_deg: float = THESIS_FRAME_DEG
+    kappa: float = THESIS_KAPPA
+    direction: Direction = "faintest"
+    band: Band = "hp"
+    full_field: bool = False
+    focal_px: float = 0.0
+    half_width_px: float = 0.0
+
+    @classmethod
+    def for_camera(
+        cls,
+        camera: Camera,
+        *,
+        overlap: float,
+        kappa: float,
+        direction: Direction = "brightest",
+        band: Band = "v",
+        full_field: bool = False,
+    ) -> Self:
+        """Spherical parameters for the largest circle (or square) about the boresight that fits the camera's image."""
+        (cx, cy), focal = camera.centre_px, camera.focal_px[0]
+        half = 0.5 + min(cx, camera.width - 1 - cx, cy, camera.height - 1 - cy)
+        edge = np.array([[cx + half, cy]])
+        direction_of_edge = camera.back_project(edge)[0]
+        angle = math.atan2(math.hypot(direction_of_edge[0], direction_of_edge[1]), direction_of_edge[2])
+        if not (half > 0.0 and angle < _WIDEST_HALF_FIELD):
+            raise DatabaseError(
+                "database: features are gnomonic and need a camera with less than 120° of field"
+            )
+        return cls(
+            "spherical",
+            overlap,
+            2.0 * math.degrees(angle),
+            kappa,
+            direction,
+            band,
+            full_field=full_field,
+            focal_px=focal,
+            half_width_px=focal * math.tan(angle),
+        )
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Read parameters back from a file's header."""
+        names = {field.name for field in dataclasses.fields(cls)}
+        if set(values) != names:
+            raise DatabaseError(
+                f"database: header has the parameters {sorted(values)}, needed are {sorted(names)}"
+            )
+        return cls(**values)
+
+    @property
+    def half_width(self) -> float:
+        """Half the frame's width in the unit of the offsets: degrees (planar) or pixels (spherical)."""
+        return self.half_width_px if self.geometry == "spherical" else 0.5 * self.fov_deg
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureDatabase:
+    """A grid of frames with their features.
+
+    Attributes
+    ----------
+    parameters, grid, sky
+        What the database was made with, its grid, and its stars.
+    features
+        Stored normalised features, (N, 5) uint8, read-only; 255 is 100 on the normalised scale.
+    theta
+        Stored polar angles, (N,) uint8, 255 for a cell without stars.
+    minimum, maximum
+        Extremes of each feature over the cells that hold a star, (5,).
+    catalog_identity
+        Checksum of the stars.
+    """
+
+    parameters: DatabaseParameters
+    grid: FrameGrid
+    sky: FrameSky
+    features: NDArray[np.uint8]
+    theta: NDArray[np.uint8]
+    minimum: NDArray[np.float64]
+    maximum: NDArray[np.float64]
+    catalog_identity: str
+
+    @property
+    def cells(self) -> int:
+        """Number of cells N."""
+        return self.grid.cells
+
+    @property
+    def bytes_features(self) -> int:
+        """Size of the stored features, bytes."""
+        return int(self.features.nbytes)
+
+    def normalise(self, features: FeatureVector | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normalised feature vector, eq. 2.11: 100·(f − min)/(max − min) for each feature over the database, (5,)."""
+        vector = (
+            features.vector if isinstance(features, FeatureVector) else np.asarray(features, dtype=np.float64)
+        )
+        return np.asarray((vector - self.minimum) * self.scale, dtype=np.float64)
+
+    @cached_property
+    def scale(self) -> NDArray[np.float64]:
+        """Normalised units per unit of each feature, (5,); 0 for a feature that is the same everywhere."""
+        return normalising_scale(self.minimum, self.maximum)
+
+    def stored_vector(self, cell: int) -> NDArray[np.float64]:
+        """Normalised features of a cell as stored, (5,)."""
+        return np.asarray(self.features[cell] * CODE_STEP, dtype=np.float64)
+
+    def exact_features(self, cell: int) -> FeatureVector:
+        """Features of a cell in full precision, computed from the stars."""
+        return self.sky.features(*self.grid.centre(cell))
+
+
+def normalising_scale(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> NDArray[np.float64]:
+    """100/(max − min) for each feature, 0 where the extremes agree."""
+    span = maximum - minimum
+    return np.asarray(np.where(span > 0.0, 100.0 / np.where(span > 0.0, span, 1.0), 0.0), dtype=np.float64)
+
+
+@compiled
+def _extremes_of_rows(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    row_dec: NDArray[np.float64],
+    row_ra_step: NDArray[np.float64],
+    row_columns: NDArray[np.int64],
+    first_ra: float,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+) -> None:
+    sums = np.empty(8)
+    out = np.empty(5)
+    for row in range(row_dec.size):
+        for column in range(row_columns[row]):
+            ra = (first_ra + column * row_ra_step[row]) % 360.0
+            cell_features(stars, bin_start, frame, ra, row_dec[row], sums, out)
+            if out[0] >= 1.0:
+                for f in range(5):
+                    low[f] = min(low[f], out[f])
+                    high[f] = max(high[f], out[f])
+
+
+@compiled
+def _store_rows(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    row_dec: NDArray[np.float64],
+    row_ra_step: NDArray[np.float64],
+    row_columns: NDArray[np.int64],
+    first_ra: float,
+    low: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    features: NDArray[np.uint8],
+    theta: NDArray[np.uint8],
+) -> None:
+    sums = np.empty(8)
+    out = np.empty(5)
+    cell = 0
+    for row in range(row_dec.size):
+        for column in range(row_columns[row]):
+            ra = (first_ra + column * row_ra_step[row]) % 360.0
+            angle = cell_features(stars, bin_start, frame, ra, row_dec[row], sums, out)
+            if out[0] >= 1.0:
+                for f in range(5):
+                    features[cell, f] = np.uint8(round((out[f] - low[f]) * scale[f] * 2.55))
+                turn = angle / (2.0 * math.pi)
+                theta[cell] = np.uint8(round(turn * 255.0) % 255)
+            else:
+                for f in range(5):
+                    features[cell, f] = np.uint8(0)
+                theta[cell] = np.uint8(255)
+            cell += 1
+
+
+def sky_of(catalog: StarCatalog, parameters: DatabaseParameters) -> FrameSky:
+    """Stars of a catalogue as the frames of such a database see them."""
+    return make_frame_sky(
+        np.degrees(catalog.ra_rad),
+        np.degrees(catalog.dec_rad),
+        catalog.magnitude(parameters.band),
+        geometry=parameters.geometry,
+        half_width=parameters.half_width,
+        kappa=parameters.kappa,
+        direction=parameters.direction,
+        full_field=parameters.full_field,
+        focal_px=parameters.focal_px,
+    )
+
+
+def build_database(
+    catalog: StarCatalog,
+    parameters: DatabaseParameters,
+    *,
+    progress: Progress | None = None,
+    threads: int | None = None,
+) -> FeatureDatabase:
+    """Compute the features of every frame of the grid.
+
+    Two passes over the grid, the extremes first and the codes second, so that full-precision features are never held:
+    memory is what the database itself takes. Threads share the rows; the result does not depend on their number.
+
+    Parameters
+    ----------
+    catalog
+        Stars; the published numbers need the catalogue epoch J1991.25 without proper motion.
+    parameters
+        Geometry, grid and brightness limit.
+    progress
+        Called from this thread as blocks of rows are done.
+    threads
+        Worker threads; default: the processors at hand.
+
+    Raises
+    ------
+    DatabaseError, StaridError
+        If the parameters make no grid or leave no star.
+    """
+    grid = make_grid(parameters.geometry, parameters.fov_deg, parameters.overlap)
+    sky = sky_of(catalog, parameters)
+    features = np.empty((grid.cells, FEATURE_COUNT), dtype=np.uint8)
+    theta = np.empty(grid.cells, dtype=np.uint8)
+    blocks = [slice(r, min(r + _ROWS_PER_BLOCK, grid.rows)) for r in range(0, grid.rows, _ROWS_PER_BLOCK)]
+    low = np.full((len(blocks), FEATURE_COUNT), np.inf)
+    high = np.full((len(blocks), FEATURE_COUNT), -np.inf)
+    done = 0
+
+    def cells_of(block: slice) -> slice:
+        return slice(int(grid.row_start[block.start]), int(grid.row_start[block.stop]))
+
+    def run(work: Callable[[int], None]) -> None:
+        nonlocal done
+        futures = {pool.submit(work, i): i for i in range(len(blocks))}
+        for future in as_completed(futures):
+            future.result()
+            where = cells_of(blocks[futures[future]])
+            done += where.stop - where.start
+            if progress is not None:
+                progress(done, 2 * grid.cells)
+
+    def find_extremes(i: int) -> None:
+        rows = blocks[i]
+        _extremes_of_rows(
+            sky.stars,
+            sky.bin_start,
+            sky.frame,
+            grid.row_dec_deg[rows],
+            grid.row_ra_step_deg[rows],
+            grid.row_columns[rows],
+            grid.first_ra_deg,
+            low[i],
+            high[i],
+        )
+
+    def store(i: int) -> None:
+        rows, where = blocks[i], cells_of(blocks[i])
+        _store_rows(
+            sky.stars,
+            sky.bin_start,
+            sky.frame,
+            grid.row_dec_deg[rows],
+            grid.row_ra_step_deg[rows],
+            grid.row_columns[rows],
+            grid.first_ra_deg,
+            minimum,
+            scale,
+            features[where],
+            theta[where],
+        )
+
+    with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
+        run(find_extremes)
+        minimum, maximum = low.min(axis=0), high.max(axis=0)
+        if not np.isfinite(minimum).all():
+            raise DatabaseError("database: no frame of the grid holds a star; change the brightness limit")
+        scale = normalising_scale(minimum, maximum)
+        run(store)
+    features.setflags(write=False)
+    theta.setflags(write=False)
+    return FeatureDatabase(parameters, grid, sky, features, theta, minimum, maximum, catalog.identity)

@@ -1,0 +1,275 @@
+"""The catalogue stars as the frames of a database see them: features of any frame, straight from the stars."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+from starid.jit import compiled
+from starid.thesis.features import SUM_COUNT, FeatureVector, add_star, clear_sums, finish_features
+from starid.thesis.frame_grid import Geometry
+
+Direction = Literal["faintest", "brightest"]
+
+BIN_DEG: Final = 5.0
+"""Side of the bins in which stars are looked up, degrees."""
+
+DEC_BINS: Final = 36
+RA_BINS: Final = 72
+
+BRIGHTNESS, RIGHT_ASCENSION, DECLINATION, UX, UY, UZ = range(6)
+"""Columns of the star table: magnitude, degrees, degrees, unit vector."""
+
+SPHERICAL, HALF_WIDTH, FULL_FIELD, FOCAL, REACH, PIVOT = range(6)
+"""Places in the frame's numbers: 1 on the sphere, half width (degrees or pixels), 1 for the whole square, focal length
+in pixels, greatest angle of a star from the centre in degrees, brightness to sum about."""
+
+
+class SkyError(StaridError):
+    """Stars or a frame that no database can be made of."""
+
+
+@compiled
+def cell_sums(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    ra_deg: float,
+    dec_deg: float,
+    sums: NDArray[np.float64],
+) -> None:
+    """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360; flat or gnomonic offsets."""
+    clear_sums(sums)
+    half = frame[HALF_WIDTH]
+    reach = frame[REACH]
+    spherical = frame[SPHERICAL] > 0.5
+    full = frame[FULL_FIELD] > 0.5
+    low_dec = max(math.floor((dec_deg - reach + 90.0) / BIN_DEG), 0)
+    high_dec = min(math.floor((dec_deg + reach + 90.0) / BIN_DEG), DEC_BINS - 1)
+    window = reach
+    cos_a = sin_a = cos_d = sin_d = 0.0
+    if spherical:
+        a = math.radians(ra_deg)
+        d = math.radians(dec_deg)
+        cos_a, sin_a, cos_d, sin_d = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
+        ratio = math.sin(math.radians(reach)) / max(cos_d, 1e-12)
+        window = 180.0 if abs(dec_deg) + reach >= 90.0 else math.degrees(math.asin(min(ratio, 1.0)))
+    first_ra = math.floor((ra_deg - window) / BIN_DEG)
+    bins = min(math.floor((ra_deg + window) / BIN_DEG) - first_ra + 1, RA_BINS)
+    first_ra %= RA_BINS
+    end_ra = min(first_ra + bins, RA_BINS)
+    half2 = half * half
+    for band in range(low_dec, high_dec + 1):
+        for part in range(2):
+            first = band * RA_BINS + (first_ra if part == 0 else 0)
+            last = band * RA_BINS + (end_ra if part == 0 else first_ra + bins - RA_BINS)
+            if last <= first:
+                continue
+            for i in range(bin_start[first], bin_start[last]):
+                if spherical:
+                    east = cos_a * stars[i, UY] - sin_a * stars[i, UX]
+                    level = cos_a * stars[i, UX] + sin_a * stars[i, UY]
+                    depth = cos_d * level + sin_d * stars[i, UZ]
+                    if depth <= 0.0:
+                        continue
+                    x = -frame[FOCAL] * east / depth
+                    y = -frame[FOCAL] * (cos_d * stars[i, UZ] - sin_d * level) / depth
+                else:
+                    y = stars[i, DECLINATION] - dec_deg
+                    x = stars[i, RIGHT_ASCENSION] - ra_deg
+                    if x > 180.0:
+                        x -= 360.0
+                    elif x < -180.0:
+                        x += 360.0
+                if (full and abs(x) <= half and abs(y) <= half) or (not full and x * x + y * y <= half2):
+                    add_star(sums, stars[i, BRIGHTNESS], x, y, frame[PIVOT])
+
+
+@compiled
+def cell_features(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    ra_deg: float,
+    dec_deg: float,
+    sums: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> float:
+    """Write the features of the frame centred at (ra, dec) to `out`; return the polar angle in radians."""
+    cell_sums(stars, bin_start, frame, ra_deg, dec_deg, sums)
+    return finish_features(sums, frame[PIVOT], out)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSky:
+    """Stars within the brightness limit, binned by place, and the shape of a frame.
+
+    Attributes
+    ----------
+    geometry
+        "planar" (offsets x = α − α_c, y = δ − δ_c in degrees) or "spherical" (gnomonic offsets in pixels, +x right
+        and +y down for a camera with north up).
+    half_width
+        Half the frame's width: degrees for planar, pixels for spherical.
+    full_field
+        The whole square (True) or the inscribed circle.
+    focal_px
+        Focal length in pixels for the spherical geometry, 0 for the planar one.
+    stars
+        Table (n, 6): brightness, α, δ in degrees, unit vector; sorted by bin.
+    bin_start
+        First star of each bin, (36·72 + 1,).
+    source
+        Row of each star in the arrays that the sky was made of, (n,).
+    """
+
+    geometry: Geometry
+    half_width: float
+    full_field: bool
+    focal_px: float
+    stars: NDArray[np.float64]
+    bin_start: NDArray[np.int64]
+    source: NDArray[np.int64]
+
+    @cached_property
+    def frame(self) -> NDArray[np.float64]:
+        """The frame's numbers for the kernels, (6,)."""
+        reach = self.half_width
+        corner = math.sqrt(2.0) if self.full_field else 1.0
+        if self.geometry == "spherical":
+            reach = math.degrees(math.atan(corner * self.half_width / self.focal_px))
+        pivot = float(np.median(self.stars[:, BRIGHTNESS])) if self.stars.size else 0.0
+        return np.array(
+            [
+                1.0 if self.geometry == "spherical" else 0.0,
+                self.half_width,
+                1.0 if self.full_field else 0.0,
+                self.focal_px,
+                reach,
+                pivot,
+            ]
+        )
+
+    def features(self, ra_deg: float, dec_deg: float) -> FeatureVector:
+        """Feature vector of the frame centred at (ra, dec), degrees, north up.
+
+        Raises
+        ------
+        SkyError
+            If no star lies in that frame.
+        """
+        out = np.empty(5)
+        theta = float(
+            cell_features(self.stars, self.bin_start, self.frame, ra_deg, dec_deg, np.empty(SUM_COUNT), out)
+        )
+        if out[0] < 1.0:
+            raise SkyError(
+                f"sky: no star in the frame at ({ra_deg:.3f}°, {dec_deg:.3f}°) within the brightness limit"
+            )
+        r = float(out[2])
+        return FeatureVector(
+            int(out[0]),
+            float(out[1]),
+            r,
+            float(out[3]),
+            float(out[4]),
+            theta,
+            r * math.cos(theta),
+            r * math.sin(theta),
+        )
+
+    def stars_in_frame(
+        self, ra_deg: float, dec_deg: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Brightness (n,), offsets (n, 2) and source rows (n,) of the stars in the frame centred at (ra, dec)."""
+        x, y = self.offsets(ra_deg, dec_deg)
+        if self.full_field:
+            inside = np.maximum(abs(x), abs(y)) <= self.half_width
+        else:
+            inside = x * x + y * y <= self.half_width * self.half_width
+        return self.stars[inside, BRIGHTNESS], np.column_stack([x[inside], y[inside]]), self.source[inside]
+
+    def offsets(self, ra_deg: float, dec_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Offsets x, y of all stars from the frame centre; infinite behind the camera."""
+        if self.geometry == "planar":
+            x = self.stars[:, RIGHT_ASCENSION] - ra_deg
+            return x - 360.0 * np.rint(x / 360.0), self.stars[:, DECLINATION] - dec_deg
+        a, d = math.radians(ra_deg), math.radians(dec_deg)
+        east = math.cos(a) * self.stars[:, UY] - math.sin(a) * self.stars[:, UX]
+        level = math.cos(a) * self.stars[:, UX] + math.sin(a) * self.stars[:, UY]
+        depth = math.cos(d) * level + math.sin(d) * self.stars[:, UZ]
+        north = math.cos(d) * self.stars[:, UZ] - math.sin(d) * level
+        ahead = depth > 0.0
+        scale = np.where(ahead, self.focal_px / np.where(ahead, depth, 1.0), np.inf)
+        with np.errstate(invalid="ignore"):
+            return np.where(ahead, -east * scale, np.inf), np.where(ahead, -north * scale, np.inf)
+
+
+def make_frame_sky(
+    ra_deg: NDArray[np.float64],
+    dec_deg: NDArray[np.float64],
+    brightness: NDArray[np.float64],
+    *,
+    geometry: Geometry,
+    half_width: float,
+    kappa: float,
+    direction: Direction,
+    full_field: bool = False,
+    focal_px: float = 0.0,
+) -> FrameSky:
+    """Select the stars within the brightness limit and bin them.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg, brightness
+        Stars, (n,): degrees, degrees, magnitudes. Stars without a finite value are left out.
+    geometry, half_width, full_field, focal_px
+        As in `FrameSky`.
+    kappa
+        Brightness limit κ.
+    direction
+        "faintest" keeps a ≥ κ, as every published number does; "brightest" keeps a ≤ κ, as a sensor does.
+
+    Raises
+    ------
+    SkyError
+        If no star is left or the frame makes no sense.
+    """
+    if direction not in ("faintest", "brightest"):
+        raise SkyError(
+            f"sky: brightness direction {direction!r} is unknown; one of faintest, brightest is needed"
+        )
+    if geometry == "spherical" and not focal_px > 0.0:
+        raise SkyError("sky: the spherical geometry needs the camera's focal length in pixels")
+    if not half_width > 0.0:
+        raise SkyError(f"sky: half the frame's width is {half_width}; it must be positive")
+    keep = (brightness >= kappa) if direction == "faintest" else (brightness <= kappa)
+    source = np.flatnonzero(keep & np.isfinite(ra_deg) & np.isfinite(dec_deg) & np.isfinite(brightness))
+    if source.size == 0:
+        raise SkyError(f"sky: no star is {direction} than {kappa} mag; change the limit or its direction")
+    ra = ra_deg[source] % 360.0
+    dec = dec_deg[source]
+    a, d = np.radians(ra), np.radians(dec)
+    band = np.clip(np.floor((dec + 90.0) / BIN_DEG), 0, DEC_BINS - 1).astype(np.int64)
+    place = np.clip(np.floor(ra / BIN_DEG), 0, RA_BINS - 1).astype(np.int64)
+    bins = band * RA_BINS + place
+    order = np.argsort(bins, kind="stable")
+    table = np.column_stack(
+        [brightness[source], ra, dec, np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)]
+    )
+    bin_start = np.searchsorted(bins[order], np.arange(DEC_BINS * RA_BINS + 1)).astype(np.int64)
+    return FrameSky(
+        geometry,
+        half_width,
+        full_field,
+        focal_px,
+        np.ascontiguousarray(table[order]),
+        bin_start,
+        source[order],
+    )

@@ -1,0 +1,275 @@
+"""The thesis's false-star filter: pairs of objects in two frames, and the cluster of their differences (algorithm 2).
+
+The list of differences grows with the fourth power of the number of objects; beyond two dozen objects the filter of
+`starid.thesis.scalable_filter` takes its place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.jit import compiled
+from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
+
+EPSILON: Final = 0.4
+"""Radius of the neighbourhood: magnitudes, degrees and degrees alike."""
+
+MIN_SAMPLES_SHARE: Final = 0.5
+"""Least number of members of a neighbourhood, as a share of the number of objects."""
+
+MAX_OBJECTS: Final = 24
+"""Most objects in a frame: 276 pairs, 76 176 disparities."""
+
+
+def pair_count(objects: int) -> int:
+    """Number of feature vectors of a frame, L = (N_o over 2), eq. 3.7."""
+    return objects * (objects - 1) // 2
+
+
+@compiled
+def pair_features(
+    brightness: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    members: NDArray[np.int64],
+) -> None:
+    """Write the set of feature vectors of a frame (eq. 3.8), one v = (A_ij, d_ij, m_ij) (eq. 3.3) for each pair i < j.
+
+    A_ij is the mean brightness, eq. 3.4, d_ij the separation in degrees, eq. 3.5, and m_ij the slope of the line
+    between the two in degrees, 0 ≤ m < 180, eq. 3.6.
+    """
+    k = 0
+    for i in range(brightness.size):
+        for j in range(i + 1, brightness.size):
+            dx = positions[j, 0] - positions[i, 0]
+            dy = positions[j, 1] - positions[i, 1]
+            vectors[k, 0] = 0.5 * (brightness[i] + brightness[j])
+            vectors[k, 1] = math.sqrt(dx * dx + dy * dy)
+            vectors[k, 2] = math.degrees(math.atan2(dy, dx)) % 180.0
+            members[k, 0] = i
+            members[k, 1] = j
+            k += 1
+
+
+@compiled
+def disparity_list(
+    before: NDArray[np.float64], now: NDArray[np.float64], disparities: NDArray[np.float64]
+) -> None:
+    """Write all differences d = v_i − v_j (eq. 3.9), D = L₁·L₂ rows (eq. 3.10), the later frame's pairs running fastest.
+
+    The slope's difference is taken on the circle of 180°, −90 < Δm ≤ 90, so that a line near the horizontal is like
+    any other.
+    """
+    k = 0
+    for i in range(before.shape[0]):
+        for j in range(now.shape[0]):
+            disparities[k, 0] = before[i, 0] - now[j, 0]
+            disparities[k, 1] = before[i, 1] - now[j, 1]
+            turn = before[i, 2] - now[j, 2]
+            disparities[k, 2] = turn - 180.0 * math.ceil(turn / 180.0 - 0.5)
+            k += 1
+
+
+@compiled
+def _neighbours(
+    points: NDArray[np.float64], order: NDArray[np.int64], at: int, epsilon: float, found: NDArray[np.int64]
+) -> int:
+    """Write the places (in sorted order) of all points within ε of the one at place `at`; return how many."""
+    count = 0
+    limit = epsilon * epsilon
+    here = order[at]
+    for side in range(2):
+        place = at if side == 0 else at - 1
+        while 0 <= place < order.size:
+            there = order[place]
+            d1 = points[there, 1] - points[here, 1]
+            if abs(d1) > epsilon:
+                break
+            d0 = points[there, 0] - points[here, 0]
+            d2 = points[there, 2] - points[here, 2]
+            if d0 * d0 + d1 * d1 + d2 * d2 <= limit:
+                found[count] = place
+                count += 1
+            place += 1 if side == 0 else -1
+    return count
+
+
+@compiled
+def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: float) -> NDArray[np.int64]:
+    """Label the density-based clusters of a list of points (n, 3); −1 is an outlier (eq. 3.1).
+
+    The same labels as scikit-learn's DBSCAN: clusters are numbered by their first core point, a border point goes to
+    the first cluster that reaches it. Neighbours are sought along the sorted second coordinate, the separation,
+    which spreads most.
+    """
+    n = points.shape[0]
+    labels = np.full(n, -1, dtype=np.int64)
+    order = np.argsort(points[:, 1], kind="mergesort")
+    place = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        place[order[i]] = i
+    found = np.empty(n, dtype=np.int64)
+    core = np.zeros(n, dtype=np.bool_)
+    for i in range(n):
+        core[i] = _neighbours(points, order, place[i], epsilon, found) >= min_samples
+    stack = np.empty(n, dtype=np.int64)
+    label = 0
+    for i in range(n):
+        if labels[i] != -1 or not core[i]:
+            continue
+        labels[i] = label
+        stack[0] = i
+        top = 1
+        while top > 0:
+            top -= 1
+            count = _neighbours(points, order, place[stack[top]], epsilon, found)
+            for k in range(count):
+                j = order[found[k]]
+                if labels[j] == -1:
+                    labels[j] = label
+                    if core[j]:
+                        stack[top] = j
+                        top += 1
+        label += 1
+    return labels
+
+
+@compiled
+def main_cluster(labels: NDArray[np.int64]) -> int:
+    """Label of the cluster with most members, the first of several; −1 without any."""
+    clusters = 0
+    for i in range(labels.size):
+        clusters = max(clusters, labels[i] + 1)
+    if clusters == 0:
+        return -1
+    count = np.zeros(clusters, dtype=np.int64)
+    for i in range(labels.size):
+        if labels[i] >= 0:
+            count[labels[i]] += 1
+    return int(np.argmax(count))
+
+
+@compiled
+def trace_back(
+    labels: NDArray[np.int64],
+    main: int,
+    members_before: NDArray[np.int64],
+    members_now: NDArray[np.int64],
+    votes: NDArray[np.int64],
+) -> None:
+    """Count for each object of the earlier and of the later frame how often the main cluster lets them correspond."""
+    width = members_now.shape[0]
+    for k in range(labels.size):
+        if labels[k] == main:
+            i = k // width
+            j = k % width
+            for a in range(2):
+                for b in range(2):
+                    votes[members_before[i, a], members_now[j, b]] += 1
+
+
+@compiled
+def _mutual_matches(votes: NDArray[np.int64], matches: NDArray[np.int64]) -> int:
+    """Write the pairs of objects that vote for each other most, each at least twice; return how many."""
+    count = 0
+    for i in range(votes.shape[0]):
+        j = int(np.argmax(votes[i]))
+        if votes[i, j] >= 2 and int(np.argmax(votes[:, j])) == i:
+            matches[count, 0] = i
+            matches[count, 1] = j
+            count += 1
+    return count
+
+
+@compiled
+def filter_kernel(
+    brightness_before: NDArray[np.float64],
+    positions_before: NDArray[np.float64],
+    brightness_now: NDArray[np.float64],
+    positions_now: NDArray[np.float64],
+    epsilon: float,
+    min_samples: float,
+    true_before: NDArray[np.bool_],
+    true_now: NDArray[np.bool_],
+    matches: NDArray[np.int64],
+) -> int:
+    """Run the filter; return the number of matches."""
+    first, second = brightness_before.size, brightness_now.size
+    true_before[:] = False
+    true_now[:] = False
+    if first < 2 or second < 2:
+        return 0
+    rows = first * (first - 1) // 2
+    columns = second * (second - 1) // 2
+    before = np.empty((rows, 3))
+    now = np.empty((columns, 3))
+    members_before = np.empty((rows, 2), dtype=np.int64)
+    members_now = np.empty((columns, 2), dtype=np.int64)
+    pair_features(brightness_before, positions_before, before, members_before)
+    pair_features(brightness_now, positions_now, now, members_now)
+    disparities = np.empty((rows * columns, 3))
+    disparity_list(before, now, disparities)
+    labels = density_clusters(disparities, epsilon, min_samples)
+    main = main_cluster(labels)
+    if main < 0:
+        return 0
+    votes = np.zeros((first, second), dtype=np.int64)
+    trace_back(labels, main, members_before, members_now, votes)
+    for i in range(first):
+        for j in range(second):
+            if votes[i, j] > 0:
+                true_before[i] = True
+                true_now[j] = True
+    return _mutual_matches(votes, matches)
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterFilter:
+    """The thesis's filter as a `FalseStarFilter`: objects that appear in the main cluster are true stars.
+
+    Attributes
+    ----------
+    epsilon
+        Radius ε of the neighbourhood.
+    min_samples
+        Least number of members of a neighbourhood; None takes `MIN_SAMPLES_SHARE` of the later frame's objects.
+    """
+
+    epsilon: float = EPSILON
+    min_samples: float | None = None
+
+    def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
+        """Compare two frames.
+
+        Raises
+        ------
+        FilterError
+            If a frame holds more than `MAX_OBJECTS` objects.
+        """
+        largest = max(len(before), len(now))
+        if largest > MAX_OBJECTS:
+            raise FilterError(
+                f"filter: {largest} objects in a frame, at most {MAX_OBJECTS} for the cluster filter; "
+                "take the scalable filter"
+            )
+        least = MIN_SAMPLES_SHARE * len(now) if self.min_samples is None else self.min_samples
+        true_before = np.zeros(len(before), dtype=np.bool_)
+        true_now = np.zeros(len(now), dtype=np.bool_)
+        matches = np.empty((len(before), 2), dtype=np.int64)
+        count = filter_kernel(
+            before.brightness,
+            before.positions,
+            now.brightness,
+            now.positions,
+            self.epsilon,
+            least,
+            true_before,
+            true_now,
+            matches,
+        )
+        return FilterResult(true_before, true_now, matches[:count])

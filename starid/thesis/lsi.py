@@ -1,0 +1,494 @@
+"""Lost in space: the LSI algorithm of the thesis, from one feature vector to boresight and roll (its algorithm 1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.jit import compiled
+from starid.thesis.cell_search import (
+    CellArrays,
+    CellIndex,
+    cell_arrays,
+    exact_nearest,
+    exact_vector,
+    make_cell_index,
+    stored_neighbours,
+)
+from starid.thesis.database import DatabaseError, FeatureDatabase
+from starid.thesis.features import FeatureVector
+from starid.thesis.frame_grid import DICTIONARY_SIZE, dictionary_cells
+from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
+
+Precision = Literal["exact", "stored"]
+Choice = Literal["mse", "1se"]
+
+_FULL_TURN: Final = 360.0
+_RESULT_SIZE: Final = 16
+_LEAST_WEIGHT: Final = 1e-3
+
+SUM, RA, DEC, THETA, ERROR, LAMBDA, BORESIGHT, POINTER = 0, 1, 2, 3, 4, 5, 6, 9
+"""Places in a row of results: Σω, α, δ (degrees), θ (radians), ε_ψ, λ, boresight and pointer vectors."""
+
+
+class StoredCells(NamedTuple):
+    """The stored codes of a database, for dictionaries made of them."""
+
+    features: NDArray[np.uint8]
+    theta: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class LsiEstimate:
+    """One estimate of the boresight and of what the frame looks like there.
+
+    Attributes
+    ----------
+    right_ascension_deg, declination_deg
+        Estimated boresight f = (α̃, δ̃), eq. 2.14: the centre of the frame, degrees. For the lower-left corner that
+        the thesis tabulates subtract half a frame.
+    theta_rad
+        Estimated polar angle of the frame object for a camera with north up, eq. 2.17 with the angles averaged on the
+        circle; the roll is what the observed polar angle differs from it by.
+    omega
+        Weights ω of the nine dictionary cells, (9,).
+    penalty
+        The λ that they belong to.
+    error_psi
+        Error of the reconstruction ε_ψ = ‖ψ̂ − Tω‖, eq. 2.20, on the normalised scale.
+    reconstruction
+        Reconstructed observation T·ω, eq. 2.19, on the normalised scale, (5,).
+    boresight, pointer
+        Spherical geometry: unit vectors (ICRS) of the boresight and, at right angles to it, of the direction in which
+        the frame object lies; zeros in the planar geometry.
+    """
+
+    right_ascension_deg: float
+    declination_deg: float
+    theta_rad: float
+    omega: NDArray[np.float64]
+    penalty: float
+    error_psi: float
+    reconstruction: NDArray[np.float64]
+    boresight: NDArray[np.float64]
+    pointer: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LsiSolution:
+    """What the LSI algorithm makes of one observation.
+
+    Attributes
+    ----------
+    observation
+        Normalised observation ψ̂, (5,).
+    nearest
+        Cell of the nearest neighbour t₅, counted from 0; the thesis counts from 1.
+    distance
+        Its distance on the normalised scale.
+    cells
+        Cells of the dictionary, (9,).
+    dictionary
+        T of eq. 2.13: normalised features of these cells in columns, (5, 9).
+    weights, results
+        Weights and numbers of the two estimates, (2, 9) and (2, 16).
+    """
+
+    observation: NDArray[np.float64]
+    nearest: int
+    distance: float
+    cells: NDArray[np.int64]
+    dictionary: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    results: NDArray[np.float64]
+
+    @cached_property
+    def mse(self) -> LsiEstimate:
+        """Estimate at the λ of least mean squared error."""
+        return self._estimate(0)
+
+    @cached_property
+    def one_se(self) -> LsiEstimate:
+        """Estimate at the largest λ within one standard error of the least."""
+        return self._estimate(1)
+
+    def choose(self, choice: Choice) -> LsiEstimate:
+        """Estimate by name."""
+        return self.mse if choice == "mse" else self.one_se
+
+    def _estimate(self, row: int) -> LsiEstimate:
+        numbers, omega = self.results[row], self.weights[row]
+        return LsiEstimate(
+            float(numbers[RA]),
+            float(numbers[DEC]),
+            float(numbers[THETA]),
+            omega,
+            float(numbers[LAMBDA]),
+            float(numbers[ERROR]),
+            self.dictionary @ omega,
+            numbers[BORESIGHT : BORESIGHT + 3],
+            numbers[POINTER : POINTER + 3],
+        )
+
+
+@compiled
+def fill_dictionary(
+    arrays: CellArrays,
+    stored: StoredCells,
+    cell: int,
+    exact: bool,
+    cells: NDArray[np.int64],
+    right_ascension: NDArray[np.float64],
+    declination: NDArray[np.float64],
+    dictionary: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> None:
+    """Set up the dictionary about a cell: its features, the boresights F of eq. 2.16 and the angles Θ of eq. 2.18."""
+    first_row = dictionary_cells(
+        arrays.row_start,
+        arrays.row_columns,
+        arrays.row_ra_step,
+        arrays.first_ra,
+        cell,
+        cells,
+        right_ascension,
+    )
+    sums = np.empty(8)
+    vector = np.empty(5)
+    for j in range(9):
+        declination[j] = arrays.row_dec[first_row + j // 3]
+        if exact:
+            theta[j] = exact_vector(arrays, cells[j], sums, vector)
+            for f in range(5):
+                dictionary[f, j] = vector[f]
+        else:
+            theta[j] = stored.theta[cells[j]] * (2.0 * math.pi / 255.0)
+            for f in range(5):
+                dictionary[f, j] = stored.features[cells[j], f] / 2.55
+
+
+@compiled
+def _flat_estimate(
+    omega: NDArray[np.float64],
+    right_ascension: NDArray[np.float64],
+    declination: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> None:
+    """Combine boresights and angles in the flat plane, with weights scaled to a sum of one."""
+    cos_sum = 0.0
+    sin_sum = 0.0
+    ra = 0.0
+    dec = 0.0
+    for j in range(9):
+        ra += omega[j] * right_ascension[j]
+        dec += omega[j] * declination[j]
+        cos_sum += omega[j] * math.cos(theta[j])
+        sin_sum += omega[j] * math.sin(theta[j])
+    result[1] = (ra / result[0]) % 360.0
+    result[2] = dec / result[0]
+    result[3] = math.atan2(sin_sum, cos_sum)
+
+
+@compiled
+def _sphere_estimate(
+    omega: NDArray[np.float64],
+    right_ascension: NDArray[np.float64],
+    declination: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> None:
+    """Combine boresights and frame-object directions as vectors, so that poles and 0°/360° are like any other place."""
+    boresight = np.zeros(3)
+    pointer = np.zeros(3)
+    for j in range(9):
+        a = math.radians(right_ascension[j])
+        d = math.radians(declination[j])
+        ca, sa, cd, sd = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
+        east = -math.cos(theta[j])
+        north = -math.sin(theta[j])
+        boresight[0] += omega[j] * cd * ca
+        boresight[1] += omega[j] * cd * sa
+        boresight[2] += omega[j] * sd
+        pointer[0] += omega[j] * (-east * sa - north * sd * ca)
+        pointer[1] += omega[j] * (east * ca - north * sd * sa)
+        pointer[2] += omega[j] * north * cd
+    boresight /= math.sqrt((boresight**2).sum())
+    pointer -= boresight * (pointer * boresight).sum()
+    length = math.sqrt((pointer**2).sum())
+    level = math.hypot(boresight[0], boresight[1])
+    ca, sa = (boresight[0] / level, boresight[1] / level) if level > 0.0 else (1.0, 0.0)
+    result[1] = math.degrees(math.atan2(sa, ca)) % 360.0
+    result[2] = math.degrees(math.atan2(boresight[2], level))
+    if length < 1e-12:
+        pointer[:] = (sa, -ca, 0.0)
+        length = 1.0
+    pointer /= length
+    north = -pointer[0] * boresight[2] * ca - pointer[1] * boresight[2] * sa + pointer[2] * level
+    east = pointer[1] * ca - pointer[0] * sa
+    result[3] = math.atan2(-north, -east)
+    result[6:9] = boresight
+    result[9:12] = pointer
+
+
+@compiled
+def estimate_from_cell(
+    arrays: CellArrays,
+    stored: StoredCells,
+    cell: int,
+    exact: bool,
+    observation: NDArray[np.float64],
+    lambdas: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    dictionary: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    results: NDArray[np.float64],
+) -> None:
+    """Dictionary, LASSO and estimates about a cell.
+
+    The boresight is F·ω (eq. 2.15, printed again as eq. 2.36) and the angle Θ·ω (eq. 2.37) with weights scaled to a
+    sum of one; the reconstruction is T·ω (eq. 2.35). Should the weights cancel, the cell itself is the estimate.
+    """
+    right_ascension = np.empty(9)
+    declination = np.empty(9)
+    theta = np.empty(9)
+    fill_dictionary(arrays, stored, cell, exact, cells, right_ascension, declination, dictionary, theta)
+    path = np.empty((lambdas.size, 9))
+    error = np.empty(lambdas.size)
+    lasso_path(dictionary, observation, lambdas, path)
+    chosen = choose_lambdas(dictionary, observation, path, error)
+    for row in range(2):
+        omega = weights[row]
+        result = results[row]
+        omega[:] = path[chosen[row]]
+        total = omega.sum()
+        if total < _LEAST_WEIGHT:
+            for j in range(9):
+                omega[j] = 1.0 if cells[j] == cell else 0.0
+            total = 1.0
+        square = 0.0
+        for f in range(5):
+            residual = observation[f]
+            for j in range(9):
+                residual -= dictionary[f, j] * omega[j]
+            square += residual * residual
+        result[0] = total
+        result[4] = math.sqrt(square)
+        result[5] = lambdas[chosen[row]]
+        if arrays.frame[0] > 0.5:
+            _sphere_estimate(omega, right_ascension, declination, theta, result)
+        else:
+            _flat_estimate(omega, right_ascension, declination, theta, result)
+            result[6:12] = 0.0
+
+
+@compiled
+def lsi_kernel(
+    index: CellIndex,
+    arrays: CellArrays,
+    stored: StoredCells,
+    exact: bool,
+    observation: NDArray[np.float64],
+    lambdas: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    dictionary: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    results: NDArray[np.float64],
+    found: NDArray[np.float64],
+) -> int:
+    """Search and estimate in one go; return the nearest cell, −1 if there is none."""
+    if exact:
+        cell = exact_nearest(index, arrays, observation, found)
+    else:
+        distances = np.empty(1)
+        nearest = np.empty(1, dtype=np.int64)
+        stored_neighbours(index, observation * 2.55, distances, nearest)
+        cell = nearest[0]
+        found[0] = math.sqrt(distances[0]) / 2.55
+    if cell >= 0:
+        estimate_from_cell(
+            arrays, stored, cell, exact, observation, lambdas, cells, dictionary, weights, results
+        )
+    return cell
+
+
+@compiled
+def region_nearest(
+    arrays: CellArrays,
+    stored: StoredCells,
+    exact: bool,
+    observation: NDArray[np.float64],
+    ra_deg: float,
+    dec_deg: float,
+    side_deg: float,
+    found: NDArray[np.float64],
+) -> int:
+    """Find the nearest neighbour among the cells of a square region of search; −1 if the region holds no cell.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg, side_deg
+        Centre and side Γ of the square, degrees; it wraps in right ascension and is cut off at the grid's edges.
+    found
+        Output (2,): distance on the normalised scale and number of cells in the region.
+    """
+    sums = np.empty(8)
+    vector = np.empty(5)
+    best_cell = -1
+    best = math.inf
+    count = 0
+    half = 0.5 * side_deg
+    for row in range(arrays.row_dec.size):
+        if abs(arrays.row_dec[row] - dec_deg) > half:
+            continue
+        step = arrays.row_ra_step[row]
+        columns = arrays.row_columns[row]
+        width = half
+        if arrays.frame[0] > 0.5:
+            width = half / max(math.cos(math.radians(arrays.row_dec[row])), half / 180.0)
+        first = math.ceil((ra_deg - width - arrays.first_ra) / step)
+        last = min(math.floor((ra_deg + width - arrays.first_ra) / step), first + columns - 1)
+        for place in range(first, last + 1):
+            cell = arrays.row_start[row] + place % columns
+            if stored.theta[cell] == 255:
+                continue
+            count += 1
+            d = 0.0
+            for f in range(5):
+                gap = abs(stored.features[cell, f] - observation[f] * 2.55)
+                if exact:
+                    gap = max(gap - 0.5 - 1e-9, 0.0)
+                d += gap * gap
+            if d >= best:
+                continue
+            if exact:
+                exact_vector(arrays, cell, sums, vector)
+                d = 0.0
+                for f in range(5):
+                    gap = (vector[f] - observation[f]) * 2.55
+                    d += gap * gap
+            if d < best:
+                best = d
+                best_cell = cell
+    found[0] = math.sqrt(best) / 2.55
+    found[1] = count
+    return best_cell
+
+
+class LostInSpace:
+    """The LSI algorithm on one database.
+
+    The nearest neighbour t₅ is the cell of least distance ‖ψ̂ − t̂‖ (eq. 2.12) of all d_i (eq. 2.28), eq. 2.29; its
+    3×3 neighbourhood is the dictionary, the LASSO gives the weights, and the weights give the answer.
+
+    Parameters
+    ----------
+    database
+        Feature database.
+    precision
+        "exact": distances and dictionaries in full precision, computed from the stars where the stored codes leave a
+        doubt; this is what the published accuracy was made with. "stored": the 8-bit codes as they are.
+
+    Raises
+    ------
+    DatabaseError
+        If the precision is unknown.
+    """
+
+    def __init__(self, database: FeatureDatabase, *, precision: Precision = "exact") -> None:
+        if precision not in ("exact", "stored"):
+            raise DatabaseError(f"LSI: precision {precision!r} is unknown; one of exact, stored is needed")
+        self.database = database
+        self.exact = precision == "exact"
+        self.index = make_cell_index(database)
+        self.arrays = cell_arrays(database)
+        self.stored = StoredCells(database.features, database.theta)
+
+    def solve(self, features: FeatureVector) -> LsiSolution:
+        """Estimate boresight and roll from the features of one frame, searching the whole database."""
+        return self.solve_normalised(self.database.normalise(features))
+
+    def solve_normalised(self, observation: NDArray[np.float64]) -> LsiSolution:
+        """Estimate from a normalised observation ψ̂, (5,).
+
+        Raises
+        ------
+        DatabaseError
+            If the observation is not five finite numbers.
+        """
+        self._check(observation)
+        cells, dictionary, weights, results, found = _outputs()
+        nearest = lsi_kernel(
+            self.index,
+            self.arrays,
+            self.stored,
+            self.exact,
+            observation,
+            LAMBDAS,
+            cells,
+            dictionary,
+            weights,
+            results,
+            found,
+        )
+        return LsiSolution(observation, nearest, float(found[0]), cells, dictionary, weights, results)
+
+    def nearest(self, observation: NDArray[np.float64]) -> tuple[int, float]:
+        """Nearest cell of the whole database and its distance, for a normalised observation; the search alone."""
+        self._check(observation)
+        found = np.empty(2)
+        if self.exact:
+            return exact_nearest(self.index, self.arrays, observation, found), float(found[0])
+        cells = np.empty(1, dtype=np.int64)
+        stored_neighbours(self.index, observation * 2.55, found[:1], cells)
+        return int(cells[0]), math.sqrt(found[0]) / 2.55
+
+    def nearest_in_region(
+        self, observation: NDArray[np.float64], ra_deg: float, dec_deg: float, side_deg: float
+    ) -> tuple[int, float, int]:
+        """Nearest cell of a square region, its distance, and how many cells the region holds; cell −1 if none."""
+        self._check(observation)
+        found = np.empty(2)
+        cell = region_nearest(
+            self.arrays, self.stored, self.exact, observation, ra_deg, dec_deg, side_deg, found
+        )
+        return cell, float(found[0]), int(found[1])
+
+    def estimate(self, observation: NDArray[np.float64], cell: int, distance: float) -> LsiSolution:
+        """Dictionary, LASSO and estimates about a given cell."""
+        self._check(observation)
+        cells, dictionary, weights, results, _ = _outputs()
+        estimate_from_cell(
+            self.arrays,
+            self.stored,
+            cell,
+            self.exact,
+            observation,
+            LAMBDAS,
+            cells,
+            dictionary,
+            weights,
+            results,
+        )
+        return LsiSolution(observation, cell, distance, cells, dictionary, weights, results)
+
+    def _check(self, observation: NDArray[np.float64]) -> None:
+        if observation.shape != (5,) or not np.isfinite(observation).all():
+            raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
+
+
+def _outputs() -> tuple[
+    NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+]:
+    return (
+        np.empty(DICTIONARY_SIZE, dtype=np.int64),
+        np.empty((5, DICTIONARY_SIZE)),
+        np.empty((2, DICTIONARY_SIZE)),
+        np.empty((2, _RESULT_SIZE)),
+        np.empty(2),
+    )

@@ -1,0 +1,414 @@
+"""The LSI algorithm for a real sensor: features on the sphere, many neighbours, and no answer that is not verified.
+
+Off the plane of the thesis its nearest neighbour is right in a third of the frames only: stars near the brightness
+limit come and go with the noise of their magnitudes. So the nearest neighbours are tried one after the other: the stars
+of each vote for a roll (`starid.thesis.coarse_match`), a clear peak is paired star by star, and the attitude that follows is
+refined and verified by the geometric identifier's tracking stage. What does not pass is invalid.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.attitude import Attitude
+from starid.cache import cache_dir
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import StarCatalog, load_catalog
+from starid.errors import StaridError
+from starid.geometric.identifier import Identifier
+from starid.geometric.pattern_index import seen_stars
+from starid.solution import Reason, Solution
+from starid.thesis.cell_search import stored_neighbours
+from starid.thesis.coarse_match import next_candidate
+from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDatabase, build_database
+from starid.thesis.database_file import load_database, save_database
+from starid.thesis.features import FeatureVector, extract_features
+from starid.thesis.frame_sky import UX, UZ
+from starid.thesis.lsi import LostInSpace
+from starid.wahba import solve_wahba
+
+STARS_PER_FIELD: Final = 60
+"""Stars in a field that the default brightness limit of the features aims at."""
+
+DATABASE_VERSION: Final = 1
+"""Part of the name of a cached database; raised when its contents change."""
+
+_FEWEST_STARS: Final = 5
+_MAGNITUDE_GATE: Final = 0.8
+_MOST_VOTERS: Final = 60
+_ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
+_ZERO_POINT_STAR: Final = 25
+_WINDOW_PX: Final = 12.0
+_BLEND_PX: Final = 2.0
+_VOTE_SHARE: Final = 0.25
+_SPREAD: Final = 0.8
+_SPOTS_PER_BAND: Final = 100_000.0
+_STAGES: Final = (200, 3000)
+_OFFSET_SHARE: Final = 0.055
+_FEWEST_VOTES: Final = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class FieldStars:
+    """The detections as the features see them.
+
+    Attributes
+    ----------
+    place
+        Gnomonic offsets from the boresight in pixels, +x right, +y down, (n, 2).
+    magnitude
+        Magnitudes, (n,), brightest first.
+    row
+        Row of each in the detections given, (n,).
+    """
+
+    place: NDArray[np.float64]
+    magnitude: NDArray[np.float64]
+    row: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class LsiReport:
+    """What the last call did, for statistics.
+
+    Attributes
+    ----------
+    coarse
+        Attitude of the thesis's answer: one nearest neighbour, LASSO, roll from the polar angle. None without one.
+    tried
+        Candidates that voted.
+    verified
+        Candidates that were put to the verification.
+    zero_point
+        Magnitude of one unit of flux that was used.
+    """
+
+    coarse: Attitude | None
+    tried: int
+    verified: int
+    zero_point: float
+
+
+class LsiIdentifier:
+    """Star identification by the LSI algorithm, for one camera against one catalogue.
+
+    Parameters
+    ----------
+    camera
+        What the detections were taken with.
+    catalog
+        Default: the whole of Hipparcos at its default epoch.
+    feature_limit
+        Faintest V whose stars make features; by default what gives some 60 stars a field. The sensor must see deeper.
+    overlap
+        Overlap ratio of the database.
+    neighbours
+        Most neighbours tried, the nearest first.
+    zero_point
+        Magnitude V of one unit of flux, where it is known; found from the frame, and kept, where it is not.
+    limiting_magnitude
+        Faintest V of the verification, as `Identifier` takes it.
+    database
+        Feature database to use instead of the cached one.
+    cache
+        Keep database and index in the cache folder.
+
+    Raises
+    ------
+    DatabaseError
+        If the database given belongs to another camera, catalogue or geometry.
+    """
+
+    def __init__(
+        self,
+        camera: Camera = DEFAULT_CAMERA,
+        catalog: StarCatalog | None = None,
+        *,
+        feature_limit: float | None = None,
+        overlap: float = 0.99,
+        neighbours: int = 30_000,
+        zero_point: float | None = None,
+        limiting_magnitude: float | None = None,
+        database: str | Path | None = None,
+        cache: bool = True,
+    ) -> None:
+        if neighbours < 1:
+            raise StaridError(f"lsi neighbours: {neighbours} given, at least 1 needed")
+        self._catalog = load_catalog() if catalog is None else catalog
+        self._camera = camera
+        probe = DatabaseParameters.for_camera(camera, overlap=overlap, kappa=0.0)
+        share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
+        limit = self._limit_for(share) if feature_limit is None else feature_limit
+        parameters = dataclasses.replace(probe, kappa=limit)
+        seen = seen_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
+        self.database = self._load(seen, parameters, database, cache=cache)
+        self.lost_in_space = LostInSpace(self.database)
+        self._offset_px = _OFFSET_SHARE * self.database.parameters.half_width_px
+        self._neighbours = neighbours
+        self._zero_point = zero_point
+        self._star_magnitude = self._magnitude_of_rank(share)
+        self.verifier = Identifier(camera, self._catalog, limiting_magnitude=limiting_magnitude, cache=cache)
+        self.last_report = LsiReport(None, 0, 0, math.nan)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the positions belong to."""
+        return self._camera
+
+    @property
+    def catalog(self) -> StarCatalog:
+        """The catalogue that `Solution.catalog_index` counts in."""
+        return self._catalog
+
+    @property
+    def zero_point(self) -> float | None:
+        """Magnitude V of one unit of flux; None before it was given or found."""
+        return self._zero_point
+
+    def _limit_for(self, share: float) -> float:
+        v = np.sort(self._catalog.v)
+        row = min(int(STARS_PER_FIELD / share), v.size) - 1
+        return math.ceil(10.0 * float(v[row])) / 10.0
+
+    def _magnitude_of_rank(self, share: float) -> float:
+        """V of the star of rank `_ZERO_POINT_STAR` in an average field."""
+        v = np.sort(self._catalog.v)
+        return float(v[min(int(_ZERO_POINT_STAR / share), v.size - 1)])
+
+    @staticmethod
+    def _load(
+        stars: StarCatalog, parameters: DatabaseParameters, path: str | Path | None, *, cache: bool
+    ) -> FeatureDatabase:
+        if path is not None:
+            database = load_database(Path(path))
+            if database.parameters.geometry != "spherical":
+                raise DatabaseError(
+                    f"database: {path} is planar; a sensor needs one with --geometry spherical"
+                )
+            numbers = (database.parameters.focal_px, database.parameters.half_width_px)
+            if not np.allclose(numbers, (parameters.focal_px, parameters.half_width_px), rtol=1e-6):
+                raise DatabaseError(
+                    f"database: {path} belongs to another camera: focal length {numbers[0]:.2f} px and field radius "
+                    f"{numbers[1]:.2f} px, not {parameters.focal_px:.2f} and {parameters.half_width_px:.2f}"
+                )
+            if database.parameters.direction != "brightest" or database.parameters.full_field:
+                raise DatabaseError(
+                    f"database: {path} does not hold circles of the brightest stars; build it anew"
+                )
+            return database
+        text = repr((DATABASE_VERSION, stars.identity, dataclasses.astuple(parameters)))
+        key = hashlib.sha256(text.encode()).hexdigest()[:16]
+        file = cache_dir() / f"features-{key}.bin"
+        if cache and file.is_file():
+            try:
+                return load_database(file)
+            except DatabaseError:
+                file.unlink(missing_ok=True)
+        database = build_database(stars, parameters)
+        if cache:
+            save_database(database, file)
+        return database
+
+    def warm_up(self) -> None:
+        """Compile, or load, the kernels, so that the first real frame is not late."""
+        self.verifier.warm_up()
+        zero_point, self._zero_point = self._zero_point, 0.0
+        xy = self._camera.border(4)[:_FEWEST_STARS] * 0.25 + 0.375 * np.array(
+            [self._camera.width, self._camera.height]
+        )
+        self.identify(xy, np.ones(len(xy)))
+        self._zero_point = zero_point
+
+    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+        """Lost in space: attitude without any knowledge of it.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `Identifier.identify`.
+
+        Raises
+        ------
+        StaridError
+            The arrays do not fit each other, or hold values that are not finite.
+        """
+        begin = time.perf_counter()
+        xy, brightness = checked_detections(xy_px, flux)
+        tried = verified = 0
+        coarse: Attitude | None = None
+        enough = False
+        for zero_point in self._zero_points(brightness):
+            field = self.field_stars(xy, brightness, zero_point)
+            features = self.features(field)
+            if features is None:
+                continue
+            enough = True
+            first, place = self._coarse(features)
+            coarse = coarse or first
+            for attitude, attempts in self._attitudes_of(field, place, features):
+                tried += attempts
+                if attitude is None:
+                    continue
+                verified += 1
+                solution = self.verifier.track(xy, brightness, attitude, xy_sigma_px, window_px=_WINDOW_PX)
+                if solution.valid:
+                    self.learn(solution, brightness)
+                    self.last_report = LsiReport(coarse, tried, verified, zero_point)
+                    return dataclasses.replace(
+                        solution, mode="lost_in_space", elapsed=time.perf_counter() - begin
+                    )
+        self.last_report = LsiReport(coarse, tried, verified, math.nan)
+        reason = Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS
+        return Solution.invalid(reason, elapsed=time.perf_counter() - begin)
+
+    def track(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        predicted: Attitude | ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        window_px: float | None = None,
+    ) -> Solution:
+        """Attitude near a predicted one, as the verification finds it; the LSI algorithm has no tracking of its own.
+
+        Parameters
+        ----------
+        xy_px, flux, predicted, xy_sigma_px, window_px
+            As in `Identifier.track`.
+        """
+        return self.verifier.track(xy_px, flux, predicted, xy_sigma_px, window_px=window_px)
+
+    def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
+        if self._zero_point is not None:
+            return [self._zero_point]
+        bright = np.sort(flux[flux > 0.0])[::-1]
+        if bright.size < _FEWEST_STARS:
+            return []
+        rank = min(_ZERO_POINT_STAR, bright.size) - 1
+        guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
+        return [guess + step for step in _ZERO_POINT_STEPS]
+
+    def learn(self, solution: Solution, flux: NDArray[np.float64]) -> None:
+        """Keep the zero point that the matched stars show, where none was given."""
+        if self._zero_point is None and solution.star_count >= _FEWEST_STARS:
+            magnitudes = self._catalog.v[solution.catalog_index]
+            found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
+            self._zero_point = float(np.median(found))
+
+    def field_stars(
+        self, xy: NDArray[np.float64], flux: NDArray[np.float64], zero_point: float
+    ) -> FieldStars:
+        """Detections with flux in the circular field of the features, brightest first."""
+        rows = np.flatnonzero(flux > 0.0)
+        directions = self._camera.back_project(xy[rows])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            place = self.database.parameters.focal_px * directions[:, :2] / directions[:, 2:3]
+            inside = np.sum(place**2, axis=1) <= self.database.parameters.half_width_px**2
+        inside &= directions[:, 2] > 0.0
+        magnitude = zero_point - 2.5 * np.log10(flux[rows[inside]])
+        order = np.argsort(magnitude, kind="stable")
+        return FieldStars(place[inside][order], magnitude[order], rows[inside][order])
+
+    def features(self, field: FieldStars) -> FeatureVector | None:
+        """Feature vector of the stars above the brightness limit; None if there are too few."""
+        bright = field.magnitude <= self.database.parameters.kappa
+        if np.count_nonzero(bright) < _FEWEST_STARS:
+            return None
+        return extract_features(field.magnitude[bright], field.place[bright])
+
+    def _coarse(self, features: FeatureVector) -> tuple[Attitude, NDArray[np.float64]]:
+        """Attitude in the thesis's form, one neighbour and LASSO, and its boresight (1, 2) in degrees."""
+        solution = self.lost_in_space.solve(features).mse
+        x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
+        across = np.cross(solution.boresight, solution.pointer)
+        rows = [x * solution.pointer - y * across, y * solution.pointer + x * across, solution.boresight]
+        place = np.array([[solution.right_ascension_deg, solution.declination_deg]])
+        return Attitude.from_matrix(np.stack(rows)), place
+
+    def _candidates(self, features: FeatureVector) -> Iterator[NDArray[np.float64]]:
+        """Boresights (k, 2) in degrees to try: centres of the nearest cells in growing numbers, none twice."""
+        observation = self.database.normalise(features)
+        most = min(self._neighbours, self.database.cells)
+        tried = np.empty(0)
+        for count in sorted({min(stage, most) for stage in (*_STAGES, most)}):
+            distances, cells = np.empty(count), np.empty(count, dtype=np.int64)
+            stored_neighbours(self.lost_in_space.index, observation * 2.55, distances, cells)
+            order = np.lexsort((cells, distances))
+            centres = self.cell_centres(cells[order][cells[order] >= 0])
+            spots = self._spots(centres)
+            first = np.sort(np.unique(spots, return_index=True)[1])
+            new = first[~np.isin(spots[first], tried)]
+            tried = np.concatenate([tried, spots[new]])
+            yield centres[new]
+
+    def _spots(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Number of the spot that each place (n, 2) lies in, on a grid just fine enough for the votes."""
+        step = math.degrees(_SPREAD * self._offset_px / self.database.parameters.focal_px)
+        band = np.floor((places[:, 1] + 90.0) / step)
+        columns = np.maximum(np.rint(360.0 * np.cos(np.radians((band + 0.5) * step - 90.0)) / step), 1.0)
+        return np.asarray(band * _SPOTS_PER_BAND + np.floor(places[:, 0] / 360.0 * columns), dtype=np.float64)
+
+    def _attitudes_of(
+        self, field: FieldStars, place: NDArray[np.float64], features: FeatureVector
+    ) -> Iterator[tuple[Attitude | None, int]]:
+        yield from self.attitudes(field, place)
+        for places in self._candidates(features):
+            yield from self.attitudes(field, places)
+
+    def cell_centres(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Right ascension and declination of cells, degrees, (n, 2)."""
+        grid = self.database.grid
+        row = np.searchsorted(grid.row_start, cells, side="right") - 1
+        ra = grid.first_ra_deg + (cells - grid.row_start[row]) * grid.row_ra_step_deg[row]
+        return np.column_stack([ra % 360.0, grid.row_dec_deg[row]])
+
+    def attitudes(
+        self, field: FieldStars, candidates: NDArray[np.float64]
+    ) -> Iterator[tuple[Attitude | None, int]]:
+        """Attitudes of the candidate boresights (k, 2) that the stars vote for, and how many were tried since the last.
+
+        The last item has no attitude unless the last candidate gave one.
+        """
+        voters = min(field.magnitude.size, _MOST_VOTERS)
+        observed = np.column_stack([field.place[:voters], field.magnitude[:voters]])
+        sky = self.database.sky
+        settings = np.array([self._offset_px, _MAGNITUDE_GATE, _VOTE_SHARE, _FEWEST_VOTES])
+        matched = np.empty((voters, 2), dtype=np.int64)
+        start = 0
+        while start < len(candidates):
+            place, count = next_candidate(
+                sky.stars, sky.bin_start, sky.frame, observed, candidates, start, settings, matched
+            )
+            if place < 0:
+                yield None, len(candidates) - start
+                return
+            seen = field.place[matched[:count, 0]]
+            body = np.column_stack([seen, np.full(count, self.database.parameters.focal_px)])
+            yield solve_wahba(body, sky.stars[matched[:count, 1], UX : UZ + 1]), place + 1 - start
+            start = place + 1
+
+
+def checked_detections(xy_px: ArrayLike, flux: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Own, contiguous copies of the detections, or a one-line error."""
+    xy = np.array(xy_px, dtype=np.float64, order="C")
+    brightness = np.array(flux, dtype=np.float64, order="C")
+    if xy.size == 0:
+        xy = xy.reshape(-1, 2)
+    if xy.ndim != 2 or xy.shape[1] != 2 or brightness.shape != (xy.shape[0],):
+        raise StaridError(
+            f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
+        )
+    if not (np.isfinite(xy).all() and np.isfinite(brightness).all()):
+        raise StaridError("detections: positions and flux must be finite numbers")
+    return xy, brightness

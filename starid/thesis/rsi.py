@@ -1,0 +1,308 @@
+"""Recursive star identification: filter, motion, a small region of search, and the whole sky when that fails (algorithm 3)."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+from starid.thesis.cme import CameraMotion, estimate_motion
+from starid.thesis.false_stars import FalseStarFilter, FilterError, ObservedFrame
+from starid.thesis.features import FeatureVector, extract_features
+from starid.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
+
+Mode = Literal["lsi", "rsi"]
+
+THRESHOLDS: Final = (0.5, 1.0)
+"""The two published values of the threshold τ."""
+
+_FEWEST_MATCHES: Final = 2
+
+
+class RsiError(StaridError):
+    """Settings or frames that the recursive algorithm refuses."""
+
+
+@dataclass(frozen=True, slots=True)
+class RsiSettings:
+    """Settings of the recursive algorithm.
+
+    Attributes
+    ----------
+    tau
+        Threshold τ on ε_ψ beyond which the whole database is searched.
+    invalid_factor
+        K: an estimate with ε_ψ > K·τ is invalid.
+    gamma_min_deg, gamma_scale, gamma_lsi_deg
+        Γ_min, the factor of its growth, and the side from which on the whole database is searched at once.
+    motion_threshold_deg
+        Distance beyond which a match does not count for the motion.
+    patience
+        0: the thesis's rule, the smaller ε_ψ wins. Otherwise an answer of the whole database that lies outside the
+        region is believed only after that many frames in a row in which the region's exceeded τ; until then the
+        region's stands. An answer far from where the camera can have turned is far more often wrong than right.
+    """
+
+    tau: float = 0.5
+    invalid_factor: float = 10.0
+    gamma_min_deg: float = 2.0
+    gamma_scale: float = 1.0
+    gamma_lsi_deg: float = 90.0
+    motion_threshold_deg: float = 1.0
+    patience: int = 0
+
+    def __post_init__(self) -> None:
+        values = (
+            self.tau,
+            self.invalid_factor,
+            self.gamma_min_deg,
+            self.gamma_lsi_deg,
+            self.motion_threshold_deg,
+        )
+        if not all(value > 0.0 for value in values) or self.gamma_scale < 0.0 or self.patience < 0:
+            raise RsiError("RSI: thresholds and sides must be positive, the patience not negative")
+
+
+@dataclass(frozen=True, eq=False)
+class RsiStep:
+    """What the algorithm made of one frame.
+
+    Attributes
+    ----------
+    estimate
+        Boresight and polar angle; None when no star was left to go by.
+    roll_deg
+        Angle by which the frame is turned: observed polar angle less the estimated one, −180 … 180.
+    valid
+        False for no estimate or ε_ψ > K·τ.
+    mode
+        How the search began: in the region ("rsi") or in the whole database ("lsi").
+    triggered
+        The region's answer exceeded τ, and the whole database was searched as well.
+    exceeded
+        ε_ψ of the answer kept exceeds τ.
+    region_deg, region_cells
+        Side Γ of the region and number of its cells; NaN and 0 in mode "lsi".
+    motion
+        Camera motion since the frame before, where there was one.
+    true_stars
+        Which objects the features were made of.
+    search_s, lasso_s
+        Time of the nearest-neighbour searches and of the regularisation, seconds.
+    """
+
+    estimate: LsiEstimate | None
+    roll_deg: float
+    valid: bool
+    mode: Mode
+    triggered: bool
+    exceeded: bool
+    region_deg: float
+    region_cells: int
+    motion: CameraMotion | None
+    true_stars: NDArray[np.bool_]
+    search_s: float
+    lasso_s: float
+
+
+def region_side(mean_distance_deg: float, sigma_distance_deg: float, settings: RsiSettings) -> float:
+    """Side of the region of search: Γ = Γ_min + scale·√(μ_d·σ_d), the reading taken of eq. 6.5, degrees.
+
+    The thesis prints Γ_min + 110^(−log10(μ_d)/2)·110^(−log10(σ_d)/2)·σ_d·μ_d. With "1·10" for "110" the powers are
+    1/√μ_d and 1/√σ_d, and the product is √(μ_d·σ_d).
+    """
+    return settings.gamma_min_deg + settings.gamma_scale * math.sqrt(mean_distance_deg * sigma_distance_deg)
+
+
+def region_cells(side_deg: float, fov_deg: float, overlap: float) -> float:
+    """Number of cells of a region, N_RoS = Γ²/(φ_x·φ_y·(1 − p)²), eq. 6.6."""
+    return (side_deg / (fov_deg * (1.0 - overlap))) ** 2
+
+
+def correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> tuple[float, float]:
+    """Correlation coefficient ρ(μ_d, σ_d) of eq. 4.2, and the probability of as much by chance."""
+    from scipy.stats import pearsonr
+
+    result = pearsonr(first, second)
+    return float(result.statistic), float(result.pvalue)
+
+
+class RecursiveIdentification:
+    """The recursive algorithm on one database; feed it frame after frame.
+
+    Parameters
+    ----------
+    lost_in_space
+        The LSI algorithm on a planar database.
+    false_star_filter
+        Compares the frame before with the frame now; None trusts every object.
+    settings
+        Thresholds and region of search.
+
+    Raises
+    ------
+    RsiError
+        If the database is not planar: the recursive identifier of the product works on the sphere.
+    """
+
+    def __init__(
+        self,
+        lost_in_space: LostInSpace,
+        false_star_filter: FalseStarFilter | None,
+        settings: RsiSettings | None = None,
+    ) -> None:
+        if lost_in_space.database.parameters.geometry != "planar":
+            raise RsiError(
+                "RSI: the thesis's algorithm needs a planar database; build one with --geometry planar"
+            )
+        self.settings = settings or RsiSettings()
+        self._lsi = lost_in_space
+        self._filter = false_star_filter
+        self._radius = lost_in_space.database.parameters.half_width
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past; the next frame is the first."""
+        self._before: ObservedFrame | None = None
+        self._place: tuple[float, float, float] | None = None
+        self._searches_all = True
+        self._doubts = 0
+
+    def step(self, frame: ObservedFrame) -> RsiStep:
+        """Identify the next frame.
+
+        The first frame, and every frame after one whose ε_ψ stayed above τ, searches the whole database. Any other
+        searches the region about the predicted boresight and, should ε_ψ exceed τ (eq. 4.1), the whole database too,
+        keeping the answer of smaller ε_ψ.
+        """
+        true_stars, motion = self._filtered(frame)
+        side = math.nan
+        if motion is not None:
+            side = region_side(motion.mean_distance_deg, motion.sigma_distance_deg, self.settings)
+        features = self._features(frame, true_stars)
+        previous, self._before = self._place, frame
+        if features is None:
+            self._place, self._searches_all = None, True
+            return _empty_step(true_stars, motion)
+        observation = self._lsi.database.normalise(features)
+        predicted = _predicted(previous, motion)
+        waits = 0 < self._doubts < self.settings.patience
+        use_region = predicted is not None and side < self.settings.gamma_lsi_deg
+        use_region = use_region and (waits or not self._searches_all)
+        start = time.perf_counter()
+        cells = 0
+        cell, distance = -1, math.inf
+        if use_region and predicted is not None:
+            cell, distance, cells = self._lsi.nearest_in_region(observation, predicted[0], predicted[1], side)
+        use_region = cell >= 0
+        if not use_region:
+            cell, distance = self._lsi.nearest(observation)
+        found = time.perf_counter()
+        solution = self._lsi.estimate(observation, cell, distance)
+        solved = time.perf_counter()
+        search_s, lasso_s = found - start, solved - found
+        triggered = use_region and solution.mse.error_psi > self.settings.tau
+        if triggered:
+            solution, more_search, more_lasso = self._whole_database(observation, solution, side)
+            search_s, lasso_s = search_s + more_search, lasso_s + more_lasso
+        estimate = solution.mse
+        roll = (features.theta_deg - math.degrees(estimate.theta_rad) + 180.0) % 360.0 - 180.0
+        exceeded = estimate.error_psi > self.settings.tau
+        valid = estimate.error_psi <= self.settings.invalid_factor * self.settings.tau
+        self._searches_all = exceeded
+        self._doubts = self._doubts if exceeded else 0
+        self._place = (estimate.right_ascension_deg, estimate.declination_deg, roll) if valid else None
+        return RsiStep(
+            estimate,
+            roll,
+            valid,
+            "rsi" if use_region else "lsi",
+            triggered,
+            exceeded,
+            side if use_region else math.nan,
+            cells,
+            motion,
+            true_stars,
+            search_s,
+            lasso_s,
+        )
+
+    def _whole_database(
+        self, observation: NDArray[np.float64], solution: LsiSolution, side_deg: float
+    ) -> tuple[LsiSolution, float, float]:
+        start = time.perf_counter()
+        cell, distance = self._lsi.nearest(observation)
+        found = time.perf_counter()
+        other = self._lsi.estimate(observation, cell, distance)
+        solved = time.perf_counter()
+        better = other if other.mse.error_psi < solution.mse.error_psi else solution
+        self._doubts += 1
+        if self._doubts < self.settings.patience and not _near(other.mse, solution.mse, side_deg):
+            better = solution
+        return better, found - start, solved - found
+
+    def _filtered(self, frame: ObservedFrame) -> tuple[NDArray[np.bool_], CameraMotion | None]:
+        """Which objects are stars, and how they moved; without a frame before, or matches, all and None."""
+        everything = np.ones(len(frame), dtype=np.bool_)
+        if self._before is None or self._filter is None:
+            return everything, None
+        result = self._filter(self._before, frame)
+        if result.matches.shape[0] < _FEWEST_MATCHES:
+            return everything, None
+        try:
+            motion = estimate_motion(
+                self._before.positions[result.matches[:, 0]],
+                frame.positions[result.matches[:, 1]],
+                threshold_deg=self.settings.motion_threshold_deg,
+            )
+        except FilterError:
+            return everything, None
+        return result.true_now, motion
+
+    def _features(self, frame: ObservedFrame, chosen: NDArray[np.bool_]) -> FeatureVector | None:
+        inside = chosen & (np.sum(frame.positions**2, axis=1) <= self._radius**2)
+        if not inside.any():
+            return None
+        return extract_features(frame.brightness[inside], frame.positions[inside])
+
+
+def _near(first: LsiEstimate, second: LsiEstimate, side_deg: float) -> bool:
+    turn = (first.right_ascension_deg - second.right_ascension_deg + 180.0) % 360.0 - 180.0
+    return max(abs(turn), abs(first.declination_deg - second.declination_deg)) <= side_deg
+
+
+def _predicted(
+    place: tuple[float, float, float] | None, motion: CameraMotion | None
+) -> tuple[float, float] | None:
+    """Boresight expected from the last one and the motion: where the frame's centre was in the frame before."""
+    if place is None or motion is None:
+        return None
+    ra, dec, roll = place
+    rotation = motion.matrix[:2, :2]
+    centre_before = -rotation.T @ motion.translation_deg
+    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+    east = c * centre_before[0] + s * centre_before[1]
+    north = -s * centre_before[0] + c * centre_before[1]
+    return (ra + float(east)) % 360.0, dec + float(north)
+
+
+def _empty_step(true_stars: NDArray[np.bool_], motion: CameraMotion | None) -> RsiStep:
+    return RsiStep(
+        estimate=None,
+        roll_deg=math.nan,
+        valid=False,
+        mode="lsi",
+        triggered=False,
+        exceeded=True,
+        region_deg=math.nan,
+        region_cells=0,
+        motion=motion,
+        true_stars=true_stars,
+        search_s=0.0,
+        lasso_s=0.0,
+    )

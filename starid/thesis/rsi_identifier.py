@@ -1,0 +1,276 @@
+"""The RSI algorithm for a real sensor: filter, motion, a region of search on the sphere, and LSI when that fails.
+
+It is the thesis's recursion with one difference: whether the region's answer is good enough is not told by ε_ψ, which on
+the sphere and with stars near the brightness limit says little, but by the verification that every answer has to pass.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import StarCatalog
+from starid.solution import Reason, Solution
+from starid.thesis.cme import estimate_motion
+from starid.thesis.false_stars import FilterError, ObservedFrame
+from starid.thesis.lsi_identifier import FieldStars, LsiIdentifier, checked_detections
+from starid.thesis.rsi import RsiSettings, region_side
+from starid.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings
+
+_WINDOW_PX: Final = 12.0
+_FEWEST_MATCHES: Final = 3
+_SPOT_DEG: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RsiStatistics:
+    """Counts since the identifier was made or `reset`.
+
+    Attributes
+    ----------
+    frames
+        Calls of `track`.
+    in_region
+        Frames answered from the region of search.
+    triggers
+        Frames in which the region failed and the whole database was searched.
+    invalid
+        Frames without an answer.
+    region_sum_deg
+        Sum of the sides of the regions; divide by `frames` for the mean.
+    """
+
+    frames: int = 0
+    in_region: int = 0
+    triggers: int = 0
+    invalid: int = 0
+    region_sum_deg: float = 0.0
+
+
+class RsiIdentifier:
+    """Star identification by the recursive algorithm, for one camera against one catalogue.
+
+    Parameters
+    ----------
+    camera, catalog, feature_limit, overlap, neighbours, zero_point, limiting_magnitude, database, cache
+        As in `LsiIdentifier`.
+    gamma_min_deg
+        Least side of the region of search, degrees.
+    gamma_scale
+        Factor of its growth with the errors of the motion.
+    filter_false_stars
+        Follow the detections from frame to frame and make features of the true stars only.
+    position_sigma_px
+        One-sigma error of a position per axis that the filter assumes, pixels.
+    """
+
+    def __init__(
+        self,
+        camera: Camera = DEFAULT_CAMERA,
+        catalog: StarCatalog | None = None,
+        *,
+        feature_limit: float | None = None,
+        overlap: float = 0.99,
+        neighbours: int = 30_000,
+        zero_point: float | None = None,
+        limiting_magnitude: float | None = None,
+        database: str | Path | None = None,
+        cache: bool = True,
+        gamma_min_deg: float = 2.0,
+        gamma_scale: float = 1.0,
+        filter_false_stars: bool = True,
+        position_sigma_px: float = 0.5,
+    ) -> None:
+        self.lsi = LsiIdentifier(
+            camera,
+            catalog,
+            feature_limit=feature_limit,
+            overlap=overlap,
+            neighbours=neighbours,
+            zero_point=zero_point,
+            limiting_magnitude=limiting_magnitude,
+            database=database,
+            cache=cache,
+        )
+        self._settings = RsiSettings(gamma_min_deg=gamma_min_deg, gamma_scale=gamma_scale)
+        scale = math.degrees(1.0 / camera.focal_px[0])
+        half_field = 0.5 * self.lsi.database.parameters.fov_deg
+        self._filter = (
+            TrackFilter(
+                TrackFilterSettings(
+                    position_sigma_deg=position_sigma_px * scale,
+                    brightness_sigma=0.3,
+                    max_rotation_deg=15.0,
+                    max_shift_deg=0.5 * half_field,
+                )
+            )
+            if filter_false_stars
+            else None
+        )
+        self._before: ObservedFrame | None = None
+        self.statistics = RsiStatistics()
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the positions belong to."""
+        return self.lsi.camera
+
+    @property
+    def catalog(self) -> StarCatalog:
+        """The catalogue that `Solution.catalog_index` counts in."""
+        return self.lsi.catalog
+
+    def warm_up(self) -> None:
+        """Compile, or load, the kernels, so that the first real frame is not late."""
+        self.lsi.warm_up()
+        xy = self.camera.border(8) * 0.25 + 0.375 * np.array([self.camera.width, self.camera.height])
+        for _ in range(2):
+            self.track(xy, np.linspace(1.0, 2.0, len(xy)), Attitude.identity())
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames and the statistics."""
+        self._before = None
+        if self._filter is not None:
+            self._filter.reset()
+        self.statistics = RsiStatistics()
+
+    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+        """Lost in space, by the LSI algorithm.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `LsiIdentifier.identify`.
+        """
+        xy, brightness = checked_detections(xy_px, flux)
+        self._follow(xy, brightness)
+        return self.lsi.identify(xy, brightness, xy_sigma_px)
+
+    def track(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        predicted: Attitude | ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        window_px: float | None = None,
+    ) -> Solution:
+        """Attitude from the region of search about a predicted one, or from the whole sky if that fails.
+
+        A prediction serves to place the region; neither its roll nor what it is off by within the region matters.
+
+        Parameters
+        ----------
+        xy_px, flux, xy_sigma_px
+            As in `LsiIdentifier.identify`.
+        predicted
+            Attitude expected, or its scalar-last quaternion.
+        window_px
+            Where it is wider than the region, the region is widened to it.
+        """
+        begin = time.perf_counter()
+        xy, brightness = checked_detections(xy_px, flux)
+        attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
+        true_stars, side = self._follow(xy, brightness)
+        if window_px is not None:
+            side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
+        solution = self._in_region(xy, brightness, true_stars, attitude, side, xy_sigma_px)
+        triggered = not solution.valid
+        if triggered:
+            solution = self.lsi.identify(xy, brightness, xy_sigma_px)
+        old = self.statistics
+        self.statistics = RsiStatistics(
+            old.frames + 1,
+            old.in_region + (not triggered),
+            old.triggers + triggered,
+            old.invalid + (not solution.valid),
+            old.region_sum_deg + side,
+        )
+        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+
+    def _follow(self, xy: NDArray[np.float64], flux: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float]:
+        """Which detections are stars, as far as the frames before tell, and the side of the region of search."""
+        everything = np.ones(flux.size, dtype=np.bool_)
+        if self._filter is None:
+            return everything, self._settings.gamma_min_deg
+        usable = np.flatnonzero(flux > 0.0)[:MAX_OBJECTS]
+        directions = self.camera.back_project(xy[usable])
+        ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0.0)
+        usable = usable[ahead]
+        place = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
+        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), place)
+        before, self._before = self._before, frame
+        if before is None:
+            return everything, self._settings.gamma_min_deg
+        result = self._filter(before, frame)
+        if result.matches.shape[0] < _FEWEST_MATCHES:
+            return everything, self._settings.gamma_min_deg
+        try:
+            motion = estimate_motion(
+                before.positions[result.matches[:, 0]], frame.positions[result.matches[:, 1]]
+            )
+        except FilterError:
+            return everything, self._settings.gamma_min_deg
+        true_stars = np.zeros(flux.size, dtype=np.bool_)
+        true_stars[usable] = result.true_now
+        side = region_side(motion.mean_distance_deg, motion.sigma_distance_deg, self._settings)
+        return true_stars, side
+
+    def _in_region(
+        self,
+        xy: NDArray[np.float64],
+        flux: NDArray[np.float64],
+        true_stars: NDArray[np.bool_],
+        predicted: Attitude,
+        side_deg: float,
+        xy_sigma_px: ArrayLike | None,
+    ) -> Solution:
+        """Verified answer from the cells of the region, the likeliest first."""
+        lsi = self.lsi
+        zero_point = lsi.zero_point
+        if zero_point is None:
+            return Solution.invalid(Reason.NO_MATCH, mode="tracking")
+        field = lsi.field_stars(xy, flux, zero_point)
+        trusted = true_stars[field.row]
+        chosen = FieldStars(field.place[trusted], field.magnitude[trusted], field.row[trusted])
+        features = lsi.features(chosen)
+        if features is None:
+            return Solution.invalid(Reason.TOO_FEW_STARS, mode="tracking")
+        observation = lsi.database.normalise(features)
+        cell, distance, _ = lsi.lost_in_space.nearest_in_region(
+            observation, predicted.ra_deg, predicted.dec_deg, side_deg
+        )
+        places = _spots(predicted, side_deg)
+        if cell >= 0:
+            answer = lsi.lost_in_space.estimate(observation, cell, distance).mse
+            places = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], places])
+        for attitude, _ in lsi.attitudes(chosen, places):
+            if attitude is None:
+                continue
+            solution = lsi.verifier.track(xy, flux, attitude, xy_sigma_px, window_px=_WINDOW_PX)
+            if solution.valid:
+                lsi.learn(solution, flux)
+                return dataclasses.replace(solution, mode="tracking")
+        return Solution.invalid(Reason.NO_MATCH, mode="tracking")
+
+
+def _spots(predicted: Attitude, side_deg: float) -> NDArray[np.float64]:
+    """Boresights (k, 2) in degrees that cover the region, from its middle outwards."""
+    steps = math.ceil(0.5 * side_deg / _SPOT_DEG)
+    offsets = np.linspace(-0.5 * side_deg, 0.5 * side_deg, 2 * steps + 1)
+    east, north = (grid.ravel() for grid in np.meshgrid(offsets, offsets))
+    order = np.argsort(np.hypot(east, north), kind="stable")
+    slopes = np.tan(np.radians(np.column_stack([east, north])[order]))
+    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ predicted.matrix
+    ra = np.degrees(np.arctan2(rays[:, 1], rays[:, 0])) % 360.0
+    return np.column_stack([ra, np.degrees(np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])))])

@@ -1,0 +1,373 @@
+"""A false-star filter for hundreds of objects a frame: stars move as one, and what does not move with them is false.
+
+Objects are followed from frame to frame in the frame that moves with the stars. Transient objects (radiation hits,
+glints) are not seen again; stationary ones (hot pixels) stay where the stars have moved on; drifting ones (debris, other
+satellites) leave the gate. Where the motion is so slow that the last two stay within it, they are told by their scatter
+about their place among the stars. All of it costs a few operations per pair of objects, where the list of the thesis
+grows with their fourth power.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.thesis.cme import rigid_fit
+from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
+from starid.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
+
+MAX_OBJECTS: Final = 2000
+"""Most objects of a frame."""
+
+_REFITS: Final = 3
+_LEAST_OBJECTS: Final = 2
+_LEAST_SCORE: Final = 2.0
+_SCATTER_FRAMES: Final = 3
+_LEAST_SPREAD: Final = 0.5
+_SUMS: Final = 11
+_FADING: Final = 0.95
+_MOTION_NOISE: Final = 0.05
+_TRIM: Final = 2.2
+_STILL: Final = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class TrackFilterSettings:
+    """What the filter knows about the sensor and its motion.
+
+    Attributes
+    ----------
+    position_sigma_deg
+        One-sigma error of a position per axis, degrees.
+    brightness_sigma
+        One-sigma error of a magnitude.
+    max_rotation_deg, max_shift_deg
+        Greatest rotation and shift from one frame to the next.
+    gate
+        Greatest distance of an object from where a star is expected, in sigmas.
+    evidence
+        How much better, in squared sigmas, an object must be explained as fixed on the sensor to be taken for that;
+        twice as much for drifting.
+    history
+        Frames that a star may be missing before it is forgotten.
+    confirm
+        Sightings that make an object a true star, once that many frames have been seen. Two are enough where all
+        false stars are transient and positions are good; slow ones need three to be told.
+    """
+
+    position_sigma_deg: float = 0.02
+    brightness_sigma: float = 0.2
+    max_rotation_deg: float = 10.0
+    max_shift_deg: float = 8.0
+    gate: float = 3.8
+    evidence: float = 9.0
+    history: int = 4
+    confirm: int = 3
+
+    def __post_init__(self) -> None:
+        if not (self.position_sigma_deg > 0.0 and self.brightness_sigma > 0.0 and self.gate > 0.0):
+            raise FilterError("filter: the errors of position and brightness and the gate must be positive")
+        if self.history < 1 or self.confirm < _LEAST_OBJECTS:
+            raise FilterError(
+                "filter: a star is remembered for one frame at least and confirmed by two at least"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult:
+    """What the filter says about one frame.
+
+    Attributes
+    ----------
+    true_now
+        Which objects are true stars, (n,). In the first frame nothing is known and all are False.
+    track
+        Track of each object, (n,), equal for the same star in every frame.
+    motion
+        Motion of the stars since the frame before: cosine, sine, shift x, shift y (degrees); None without one.
+    """
+
+    true_now: NDArray[np.bool_]
+    track: NDArray[np.int64]
+    motion: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Objects followed: position and magnitude now, and sums over their observations for the scatter.
+
+    `sums` (n, 11) holds, with fading weights, Σ1, Σt, Σt², then Σx, Σy, Σ(x² + y²), Σt·x, Σt·y in coordinates that
+    move with the stars, and Σu, Σv, Σ(u² + v²) in those of the sensor.
+    """
+
+    number: NDArray[np.int64]
+    position: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    seen: NDArray[np.int64]
+    missed: NDArray[np.int64]
+    sums: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return int(self.number.size)
+
+    def kept(self, mask: NDArray[np.bool_]) -> _Tracks:
+        return _Tracks(
+            self.number[mask],
+            self.position[mask],
+            self.variance[mask],
+            self.brightness[mask],
+            self.seen[mask],
+            self.missed[mask],
+            self.sums[mask],
+        )
+
+    def joined(self, other: _Tracks) -> _Tracks:
+        return _Tracks(
+            np.concatenate([self.number, other.number]),
+            np.concatenate([self.position, other.position]),
+            np.concatenate([self.variance, other.variance]),
+            np.concatenate([self.brightness, other.brightness]),
+            np.concatenate([self.seen, other.seen]),
+            np.concatenate([self.missed, other.missed]),
+            np.concatenate([self.sums, other.sums]),
+        )
+
+
+class TrackFilter:
+    """The scalable filter: feed it frame after frame with `update`, or compare two frames by calling it.
+
+    Parameters
+    ----------
+    settings
+        What is known about the sensor and its motion.
+    """
+
+    def __init__(self, settings: TrackFilterSettings | None = None) -> None:
+        self.settings = settings or TrackFilterSettings()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as after a gap in the frames."""
+        self._last_frame: ObservedFrame | None = None
+        self._last_result: TrackResult | None = None
+        self._next_number = 0
+        self._frame = 0
+        self._anchor = _STILL.copy()
+        self._last_motion = _STILL.copy()
+        self._tracks = self._new_tracks(np.empty((0, 2)), np.empty(0))
+        self._suspect = np.empty(0, dtype=np.bool_)
+
+    def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
+        """Compare two frames; if the first is the one seen last, with what is known from those before it."""
+        if before is not self._last_frame or self._last_result is None:
+            self.reset()
+            self._last_result = self.update(before)
+        first = self._last_result.track
+        second = self.update(now)
+        self._last_frame, self._last_result = now, second
+        place = {int(number): i for i, number in enumerate(first)}
+        pairs = [(place.get(int(second.track[j])), int(j)) for j in np.flatnonzero(second.true_now)]
+        found = [pair for pair in pairs if pair[0] is not None]
+        matches = np.array(found, dtype=np.int64).reshape(-1, 2)
+        true_before = np.zeros(len(before), dtype=np.bool_)
+        true_before[matches[:, 0]] = True
+        return FilterResult(true_before, second.true_now, matches)
+
+    def update(self, frame: ObservedFrame) -> TrackResult:
+        """Follow the objects of the next frame.
+
+        Raises
+        ------
+        FilterError
+            If the frame holds more than `MAX_OBJECTS` objects.
+        """
+        if len(frame) > MAX_OBJECTS:
+            raise FilterError(
+                f"filter: {len(frame)} objects in a frame, at most {MAX_OBJECTS}; raise the threshold"
+            )
+        self._frame += 1
+        positions = np.ascontiguousarray(frame.positions, dtype=np.float64)
+        brightness = np.ascontiguousarray(frame.brightness, dtype=np.float64)
+        motion = self._find_motion(positions, brightness)
+        if motion is None:
+            fresh = self._new_tracks(positions, brightness)
+            self._tracks = self._tracks.joined(fresh) if len(frame) < _LEAST_OBJECTS else fresh
+            self._suspect = np.zeros(len(self._tracks), dtype=np.bool_)
+            return TrackResult(np.zeros(len(frame), dtype=np.bool_), fresh.number, None)
+        partner = self._associate(positions, brightness, motion)
+        self._last_motion = motion
+        self._anchor = _composed(motion, self._anchor)
+        self._follow(positions, brightness, partner, motion)
+        wandering = self._wandering()
+        genuine = (self._tracks.seen >= min(self.settings.confirm, self._frame)) & ~wandering
+        true_now = np.zeros(len(frame), dtype=np.bool_)
+        number = np.full(len(frame), -1, dtype=np.int64)
+        matched = np.flatnonzero(partner >= 0)
+        true_now[partner[matched]] = genuine[matched]
+        number[partner[matched]] = self._tracks.number[matched]
+        new = number < 0
+        fresh = self._new_tracks(positions[new], brightness[new])
+        number[new] = fresh.number
+        tracks = self._tracks
+        keep = (tracks.missed == 0) | ((tracks.missed < self.settings.history) & (tracks.seen > 1))
+        self._tracks = tracks.kept(keep).joined(fresh)
+        self._suspect = np.concatenate([wandering[keep], np.zeros(len(fresh), dtype=np.bool_)])
+        return TrackResult(true_now, number, motion)
+
+    def _new_tracks(self, positions: NDArray[np.float64], brightness: NDArray[np.float64]) -> _Tracks:
+        n = brightness.size
+        number = np.arange(self._next_number, self._next_number + n, dtype=np.int64)
+        self._next_number += n
+        tracks = _Tracks(
+            number,
+            positions.copy(),
+            np.full(n, self.settings.position_sigma_deg**2),
+            brightness.copy(),
+            np.ones(n, dtype=np.int64),
+            np.zeros(n, dtype=np.int64),
+            np.zeros((n, _SUMS)),
+        )
+        self._add_to_sums(tracks.sums, np.arange(n), positions)
+        return tracks
+
+    def _add_to_sums(
+        self, sums: NDArray[np.float64], which: NDArray[np.int64], positions: NDArray[np.float64]
+    ) -> None:
+        x, y = _moved_back(positions, self._anchor).T
+        u, v = positions.T
+        t = np.full(x.size, float(self._frame))
+        terms = [np.ones_like(t), t, t * t, x, y, x * x + y * y, t * x, t * y, u, v, u * u + v * v]
+        sums[which] += np.column_stack(terms)
+
+    def _find_motion(
+        self, positions: NDArray[np.float64], brightness: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        """Motion since the frame before, from the objects seen most often and the brightest; None if none fits."""
+        tracks, settings = self._tracks, self.settings
+        if len(tracks) < _LEAST_OBJECTS or brightness.size < _LEAST_OBJECTS:
+            return None
+        voters = np.lexsort((tracks.brightness, -np.minimum(tracks.seen, 2)))[:MAX_VOTERS]
+        brightest = np.argsort(brightness, kind="stable")[:MAX_VOTERS]
+        motion = self._last_motion.copy()
+        score = find_motion(
+            tracks.position[voters],
+            tracks.brightness[voters],
+            positions[brightest],
+            brightness[brightest],
+            settings.position_sigma_deg,
+            settings.brightness_sigma,
+            math.radians(settings.max_rotation_deg),
+            settings.max_shift_deg,
+            motion,
+        )
+        return motion if score >= _LEAST_SCORE else None
+
+    def _associate(
+        self, positions: NDArray[np.float64], brightness: NDArray[np.float64], motion: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Match tracks and objects and refine the motion in place; the object of each track, −1 for none."""
+        tracks, settings = self._tracks, self.settings
+        partner = np.empty(len(tracks), dtype=np.int64)
+        trusted = (tracks.seen > 1) & ~self._suspect
+        error = np.zeros(len(tracks))
+        for turn in range(_REFITS):
+            predicted = _moved(tracks.position, motion)
+            variance = tracks.variance + settings.position_sigma_deg**2
+            nearest_objects(
+                positions,
+                brightness,
+                predicted,
+                tracks.brightness,
+                variance + error,
+                settings.brightness_sigma,
+                settings.gate**2,
+                partner,
+            )
+            chosen = partner >= 0
+            if np.count_nonzero(chosen & trusted) > _LEAST_OBJECTS:
+                chosen &= trusted
+            objects = positions[np.maximum(partner, 0)]
+            if turn > 0:
+                distance = np.hypot(*(objects - predicted).T) / np.sqrt(variance)
+                near = chosen & (distance <= _TRIM * max(float(np.median(distance[chosen])), 1.0))
+                chosen = near if np.count_nonzero(near) > _LEAST_OBJECTS else chosen
+            if rigid_fit(tracks.position, objects, chosen, motion):
+                arm = np.sum((tracks.position - tracks.position[chosen].mean(axis=0)) ** 2, axis=1)
+                share = 1.0 / np.count_nonzero(chosen) + arm / max(float(arm[chosen].sum()), 1e-12)
+                error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
+        return partner
+
+    def _follow(
+        self,
+        positions: NDArray[np.float64],
+        brightness: NDArray[np.float64],
+        partner: NDArray[np.int64],
+        motion: NDArray[np.float64],
+    ) -> None:
+        """Move all tracks with the stars and bring the matched ones up to date."""
+        old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
+        which = np.flatnonzero(partner >= 0)
+        objects = partner[which]
+        position = _moved(old.position, motion)
+        variance = old.variance + _MOTION_NOISE * sigma2
+        gain = variance[which] / (variance[which] + sigma2)
+        position[which] += gain[:, None] * (positions[objects] - position[which])
+        variance[which] *= 1.0 - gain
+        magnitude = old.brightness.copy()
+        magnitude[which] += (brightness[objects] - magnitude[which]) / (old.seen[which] + 1.0)
+        seen, missed = old.seen.copy(), old.missed + 1
+        seen[which] += 1
+        missed[which] = 0
+        sums = _FADING * old.sums
+        self._add_to_sums(sums, which, positions[objects])
+        self._tracks = _Tracks(old.number, position, variance, magnitude, seen, missed, sums)
+
+    def _wandering(self) -> NDArray[np.bool_]:
+        """Which tracks are explained better as fixed on the sensor or as drifting than as stars.
+
+        Each of the three explanations leaves a sum of squared distances; their differences, in units of the usual
+        variance, are tested. What all tracks share, an error of the motion, is taken off with the median.
+        """
+        tracks = self._tracks
+        result = np.zeros(len(tracks), dtype=np.bool_)
+        old = np.flatnonzero(tracks.seen >= _SCATTER_FRAMES)
+        if old.size <= _LEAST_OBJECTS:
+            return result
+        n, t, tt, x, y, xx, tx, ty, u, v, uu = tracks.sums[old].T
+        as_star = np.maximum(xx - (x * x + y * y) / n, 0.0)
+        as_fixed = np.maximum(uu - (u * u + v * v) / n, 0.0)
+        usual = max(self.settings.position_sigma_deg**2, float(np.median(as_star / (2.0 * n))))
+        spread = np.maximum(tt - t * t / n, _LEAST_SPREAD)
+        velocity = np.column_stack([tx - t * x / n, ty - t * y / n]) / spread[:, None]
+        velocity -= np.median(velocity, axis=0)
+        drift = np.sum(velocity**2, axis=1) * spread / usual
+        drift /= max(1.0, float(np.median(drift)))
+        limit = self.settings.evidence
+        result[old] = ((as_star - as_fixed) / usual > limit) | (drift > 2.0 * limit)
+        return result
+
+
+def _moved(positions: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    c, s, x, y = motion
+    return np.column_stack(
+        [c * positions[:, 0] - s * positions[:, 1] + x, s * positions[:, 0] + c * positions[:, 1] + y]
+    )
+
+
+def _moved_back(positions: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    c, s, x, y = motion
+    u, v = positions[:, 0] - x, positions[:, 1] - y
+    return np.column_stack([c * u + s * v, c * v - s * u])
+
+
+def _composed(second: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Motion `first` followed by `second`."""
+    c, s = second[0] * first[0] - second[1] * first[1], second[1] * first[0] + second[0] * first[1]
+    x = second[0] * first[2] - second[1] * first[3] + second[2]
+    y = second[1] * first[2] + second[0] * first[3] + second[3]
+    return np.array([c, s, x, y])

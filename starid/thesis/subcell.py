@@ -1,0 +1,254 @@
+"""Finer than the grid: solve for the boresight between the cells, from several neighbours, and keep the best.
+
+While no star enters or leaves the frame, n, A and σ_A do not change with the boresight and r and σ_r are smooth functions
+of it: two equations for two unknowns. Newton's method from each of the k nearest cells therefore either lands on the
+frame itself or on a place whose features, computed there from the stars, do not fit; the residual of all five tells
+which. What limits the thesis's form off the grid is thus named: the cell that looks nearest often has another star
+at its rim, and a combination of cells cannot undo that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.jit import compiled
+from starid.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
+from starid.thesis.database import DatabaseError
+from starid.thesis.features import FeatureVector
+from starid.thesis.frame_grid import cell_row
+from starid.thesis.frame_sky import cell_features
+from starid.thesis.lsi import LostInSpace
+
+_DIFFERENCE_DEG = 1e-4
+_MAX_STEPS = 8
+_CONVERGED_DEG = 1e-7
+_AGREED = 1e-12
+
+
+@compiled
+def _residual(
+    arrays: CellArrays,
+    observation: NDArray[np.float64],
+    ra: float,
+    dec: float,
+    sums: NDArray[np.float64],
+    vector: NDArray[np.float64],
+) -> float:
+    """Write the normalised features at (ra, dec) less the observation to `vector`; return the squared length."""
+    cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, sums, vector)
+    total = 0.0
+    for f in range(5):
+        vector[f] = (vector[f] - arrays.minimum[f]) * arrays.scale[f] - observation[f]
+        total += vector[f] * vector[f]
+    return total
+
+
+@compiled
+def newton_from(
+    arrays: CellArrays,
+    observation: NDArray[np.float64],
+    ra: float,
+    dec: float,
+    reach_deg: float,
+    place: NDArray[np.float64],
+) -> float:
+    """Improve a boresight until r and σ_r agree; return the squared residual of all five features at the best place.
+
+    Parameters
+    ----------
+    ra, dec
+        Start, degrees.
+    reach_deg
+        Greatest distance from the start that is tried.
+    place
+        Output (2,): right ascension and declination of the best place found, degrees.
+    """
+    sums = np.empty(8)
+    here = np.empty(5)
+    east = np.empty(5)
+    north = np.empty(5)
+    best = math.inf
+    a, d = ra, dec
+    for _ in range(_MAX_STEPS):
+        cost = _residual(arrays, observation, a, d, sums, here)
+        stars = sums[0]
+        if cost < best:
+            best = cost
+            place[0] = a
+            place[1] = d
+        widen = 1.0
+        if arrays.frame[0] > 0.5:
+            widen = 1.0 / max(math.cos(math.radians(d)), 1e-3)
+        _residual(arrays, observation, a + _DIFFERENCE_DEG * widen, d, sums, east)
+        east_stars = sums[0]
+        _residual(arrays, observation, a, d + _DIFFERENCE_DEG, sums, north)
+        if east_stars != stars or sums[0] != stars:
+            a += 3.0 * _DIFFERENCE_DEG * widen
+            d -= 3.0 * _DIFFERENCE_DEG
+            continue
+        j00 = (east[2] - here[2]) / _DIFFERENCE_DEG
+        j01 = (north[2] - here[2]) / _DIFFERENCE_DEG
+        j10 = (east[4] - here[4]) / _DIFFERENCE_DEG
+        j11 = (north[4] - here[4]) / _DIFFERENCE_DEG
+        size = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
+        damping = 1e-6 * size
+        h00 = j00 * j00 + j10 * j10 + damping
+        h11 = j01 * j01 + j11 * j11 + damping
+        h01 = j00 * j01 + j10 * j11
+        g0 = j00 * here[2] + j10 * here[4]
+        g1 = j01 * here[2] + j11 * here[4]
+        determinant = h00 * h11 - h01 * h01
+        if determinant <= 0.0:
+            break
+        step_a = -(h11 * g0 - h01 * g1) / determinant
+        step_d = -(h00 * g1 - h01 * g0) / determinant
+        length = math.hypot(step_a, step_d)
+        if length > 0.5 * reach_deg:
+            step_a *= 0.5 * reach_deg / length
+            step_d *= 0.5 * reach_deg / length
+        a += step_a * widen
+        d += step_d
+        d = min(max(d, -90.0), 90.0)
+        if math.hypot((a - ra) / widen, d - dec) > reach_deg:
+            break
+        if length < _CONVERGED_DEG:
+            cost = _residual(arrays, observation, a, d, sums, here)
+            if cost < best:
+                best = cost
+                place[0] = a
+                place[1] = d
+            break
+    return best
+
+
+@compiled
+def subcell_kernel(
+    index: CellIndex,
+    arrays: CellArrays,
+    observation: NDArray[np.float64],
+    reach_deg: float,
+    distances: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    answer: NDArray[np.float64],
+) -> int:
+    """Try the neighbours from the nearest outwards; return how many starts were made.
+
+    The nearest cell in full precision goes first, and the first start that agrees in all features ends the search. A
+    start near an earlier one is left out. `answer` (4,) receives right
+    ascension, declination (degrees), polar angle (radians) and the length of the residual.
+    """
+    stored_neighbours(index, observation * 2.55, distances, cells)
+    order = np.argsort(distances)
+    first = exact_nearest(index, arrays, observation, answer)
+    places = np.empty((cells.size + 1, 2))
+    place = np.empty(2)
+    starts = 0
+    best = math.inf
+    for turn in range(-1, order.size):
+        if best < _AGREED:
+            break
+        cell = first if turn < 0 else cells[order[turn]]
+        if cell < 0:
+            continue
+        row = cell_row(arrays.row_start, cell)
+        dec = arrays.row_dec[row]
+        ra = arrays.first_ra + (cell - arrays.row_start[row]) * arrays.row_ra_step[row]
+        narrow = math.cos(math.radians(dec)) if arrays.frame[0] > 0.5 else 1.0
+        known = False
+        for i in range(starts):
+            gap = (ra - places[i, 0] + 180.0) % 360.0 - 180.0
+            if math.hypot(gap * narrow, dec - places[i, 1]) < 0.4 * reach_deg:
+                known = True
+                break
+        if known:
+            continue
+        cost = newton_from(arrays, observation, ra, dec, reach_deg, place)
+        places[starts, 0] = ra
+        places[starts, 1] = dec
+        starts += 1
+        if cost < best:
+            best = cost
+            answer[0] = place[0] % 360.0
+            answer[1] = place[1]
+    if starts > 0:
+        sums = np.empty(8)
+        vector = np.empty(5)
+        answer[2] = cell_features(
+            arrays.stars, arrays.bin_start, arrays.frame, answer[0], answer[1], sums, vector
+        )
+        answer[3] = math.sqrt(best)
+    return starts
+
+
+@dataclass(frozen=True, slots=True)
+class FineEstimate:
+    """A boresight between the cells.
+
+    Attributes
+    ----------
+    right_ascension_deg, declination_deg
+        Centre of the frame, degrees.
+    theta_rad
+        Polar angle of the frame object there for a camera with north up.
+    residual
+        Length of the difference of all five normalised features; near zero where the stars of the frame are the
+        stars of the answer.
+    starts
+        Cells that were tried.
+    """
+
+    right_ascension_deg: float
+    declination_deg: float
+    theta_rad: float
+    residual: float
+    starts: int
+
+
+class SubcellSearch:
+    """The named improvement of the LSI estimate: k neighbours, each solved between the cells.
+
+    Parameters
+    ----------
+    lost_in_space
+        The LSI algorithm whose database, index and arrays are used.
+    neighbours
+        Stored neighbours tried beside the nearest cell.
+    reach_steps
+        How far an answer may lie from its start, in steps of the grid.
+    """
+
+    def __init__(self, lost_in_space: LostInSpace, *, neighbours: int = 16, reach_steps: float = 2.0) -> None:
+        if neighbours < 1 or not reach_steps > 0.0:
+            raise DatabaseError("LSI: at least one neighbour and a positive reach are needed")
+        self._lsi = lost_in_space
+        self._reach = reach_steps * lost_in_space.database.grid.step_deg
+        self._neighbours = neighbours
+
+    def solve(self, features: FeatureVector) -> FineEstimate:
+        """Boresight from the features of one frame.
+
+        Raises
+        ------
+        DatabaseError
+            If the features are not finite or the database is empty.
+        """
+        observation = self._lsi.database.normalise(features)
+        if not np.isfinite(observation).all():
+            raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
+        answer = np.empty(4)
+        starts = subcell_kernel(
+            self._lsi.index,
+            self._lsi.arrays,
+            observation,
+            self._reach,
+            np.empty(self._neighbours),
+            np.empty(self._neighbours, dtype=np.int64),
+            answer,
+        )
+        if starts == 0:
+            raise DatabaseError("LSI: the database holds no frame with a star")
+        return FineEstimate(float(answer[0]), float(answer[1]), float(answer[2]), float(answer[3]), starts)

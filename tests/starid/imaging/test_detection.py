@@ -1,0 +1,415 @@
+"""Detection finds what is there, where it is, as well as the noise lets it, and says how well."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.special import erf
+
+from starid.errors import StaridError
+from starid.imaging.detection import Detections, DetectionSettings, detect
+
+SIGMA = 0.8
+SKY, NOISE, GAIN = 40.0, 3.0, 2.0
+KNOWN = DetectionSettings(gain_e_per_dn=GAIN)
+
+
+def spot(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA) -> np.ndarray:
+    """A Gaussian star integrated over pixels, independent of the code under test."""
+    profiles = [
+        np.diff(0.5 * erf((np.arange(size + 1) - 0.5 - place) / (sigma * math.sqrt(2.0))))
+        for size, place in zip(shape, (y, x), strict=True)
+    ]
+    return flux * np.outer(*profiles)
+
+
+def trail(shape: tuple[int, int], x: float, y: float, flux: float, dx: float, dy: float) -> np.ndarray:
+    parts = (np.arange(64) + 0.5) / 64 - 0.5
+    return sum(spot(shape, x + part * dx, y + part * dy, flux / 64) for part in parts)
+
+
+def photograph(
+    light: np.ndarray, seed: int = 1, sky: float | np.ndarray = SKY, top: int = 65535
+) -> np.ndarray:
+    """Counts of light (DN) above a sky, with shot noise of the light and white noise."""
+    rng = np.random.default_rng(seed)
+    shot = rng.normal(0.0, 1.0, light.shape) * np.sqrt(np.maximum(light, 0.0) / GAIN)
+    counts = sky + light + shot + rng.normal(0.0, NOISE, light.shape)
+    return np.clip(np.rint(counts), 0, top).astype(np.uint8 if top < 256 else np.uint16)
+
+
+def scattered(count: int, shape: tuple[int, int], seed: int, gap: float = 14.0) -> np.ndarray:
+    """Random places, no two closer than `gap`, none within 10 pixels of the edge."""
+    rng = np.random.default_rng(seed)
+    places: list[np.ndarray] = []
+    while len(places) < count:
+        candidate = rng.uniform((10.0, 10.0), (shape[1] - 11.0, shape[0] - 11.0))
+        if all(np.hypot(*(candidate - other)) > gap for other in places):
+            places.append(candidate)
+    return np.array(places)
+
+
+def matched(found: Detections, places: np.ndarray, reach: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+    """For each place the number of its detection (−1 if none), and which detections are of nothing."""
+    gaps = np.linalg.norm(places[:, None] - found.xy_px[None], axis=2)
+    nearest = np.where(gaps.min(axis=1) < reach, gaps.argmin(axis=1), -1)
+    return nearest, np.setdiff1d(np.arange(len(found)), nearest)
+
+
+@pytest.mark.parametrize("top", [255, 65535])
+def test_stars_are_found_where_they_are(top: int) -> None:
+    shape = (300, 400)
+    places = scattered(40, shape, 2)
+    fluxes = np.geomspace(200.0, 900.0, 40)
+    image = photograph(
+        sum(spot(shape, *place, flux) for place, flux in zip(places, fluxes, strict=True)), top=top
+    )
+    found = detect(image, KNOWN)
+    number, spurious = matched(found, places)
+    assert np.all(number >= 0)
+    assert len(spurious) == 0
+    assert found.reason == ""
+    assert found.background == pytest.approx(SKY, abs=0.5)
+    assert found.noise == pytest.approx(NOISE, rel=0.05)
+    assert found.psf_sigma_px == pytest.approx(SIGMA, rel=0.05)
+    assert np.all(np.diff(found.flux) <= 0.0), "brightest first"
+    pull = (found.flux[number] / GAIN - fluxes) / (found.flux_sigma[number] / GAIN)
+    assert abs(pull.mean()) < 0.7
+    assert pull.std() == pytest.approx(1.0, abs=0.4)
+
+
+@pytest.mark.parametrize("flux", [250.0, 1000.0, 8000.0, 60000.0])
+def test_errors_are_honest_and_at_the_bound(flux: float) -> None:
+    """Mean squared error over its own estimate is 1, and the estimate is the Cramér–Rao bound."""
+    shape = (400, 400)
+    squares, stated = [], []
+    for seed in range(4):
+        places = scattered(120, shape, seed, gap=16.0)
+        image = photograph(sum(spot(shape, *place, flux) for place in places), seed)
+        found = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA, model_error=0.0))
+        number, _ = matched(found, places)
+        assert np.all(number >= 0)
+        error = found.xy_px[number] - places
+        squares.append((error / found.xy_sigma_px[number]) ** 2)
+        stated.append(found.xy_sigma_px[number])
+    normalised = np.concatenate(squares)
+    assert normalised.mean() == pytest.approx(1.0, abs=0.2)
+    model = spot((31, 31), 15.0, 15.0, flux)
+    slope = (spot((31, 31), 15.001, 15.0, flux) - spot((31, 31), 14.999, 15.0, flux)) / 0.002
+    bound = 1.0 / math.sqrt(np.sum(slope**2 / (NOISE**2 + 1.0 / 12.0 + model / GAIN)))
+    assert np.sqrt(np.mean(np.concatenate(stated) ** 2)) == pytest.approx(bound, rel=0.12)
+
+
+def test_no_pixel_phase_error() -> None:
+    """Bright stars on a grid of sub-pixel places: the error has no systematic part."""
+    shape = (420, 420)
+    places = np.array(
+        [(20.0 * i + i / 20.0, 20.0 * j + j / 20.0) for i in range(1, 20) for j in range(1, 20)]
+    )
+    light = sum(spot(shape, *place, 30000.0) for place in places)
+    found = detect(photograph(light), KNOWN)
+    number, _ = matched(found, places)
+    error = found.xy_px[number] - places
+    phase = places[:, 0] % 1.0
+    for low in np.arange(0.0, 1.0, 0.25):
+        chosen = (phase >= low) & (phase < low + 0.25)
+        assert abs(error[chosen, 0].mean()) < 0.004
+
+
+def test_faint_noise_makes_no_stars() -> None:
+    image = photograph(np.zeros((900, 900)), 5)
+    found = detect(image)
+    assert len(found) <= 1
+    assert found.reason or len(found) == 1
+
+
+def test_saturated_stars_are_flagged_and_still_centred() -> None:
+    shape = (200, 200)
+    places = scattered(15, shape, 4, gap=30.0)
+    light = sum(spot(shape, *place, 20000.0) for place in places)
+    image = photograph(light, top=255)
+    found = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
+    number, spurious = matched(found, places, 0.5)
+    assert np.all(number >= 0)
+    assert len(spurious) == 0
+    assert np.all(found.saturated[number])
+    error = found.xy_px[number] - places
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert np.median(found.flux[number]) == pytest.approx(20000.0 * GAIN, rel=0.2)
+
+
+def test_stars_at_the_edge_are_flagged() -> None:
+    shape = (120, 160)
+    places = np.array([(0.4, 60.0), (159.2, 30.0), (80.0, 0.2), (40.0, 118.7), (80.0, 60.0), (30.0, 40.0)])
+    found = detect(photograph(sum(spot(shape, *place, 2000.0) for place in places)), KNOWN)
+    number, _ = matched(found, places)
+    assert np.all(number >= 0)
+    assert found.edge[number].tolist() == [True, True, True, True, False, False]
+    error = np.hypot(*(found.xy_px[number] - places).T)
+    assert np.all(error < 0.25)
+    assert np.all(found.xy_sigma_px[number[:4]].max(axis=1) > found.xy_sigma_px[number[4:]].max())
+
+
+@pytest.mark.parametrize("height", [60.0, 300.0, 3000.0, 60000.0])
+def test_hot_pixels_are_refused(height: float) -> None:
+    shape = (300, 300)
+    places = scattered(30, shape, 6)
+    light = sum(spot(shape, *place, 1500.0) for place in places[:15])
+    light[tuple(np.rint(places[15:]).astype(int)[:, ::-1].T)] += height
+    found = detect(photograph(light), KNOWN)
+    number, spurious = matched(found, places[:15])
+    assert np.all(number >= 0)
+    assert len(spurious) == 0
+    assert found.refused >= 15
+
+
+def test_saturated_hot_pixels_are_refused() -> None:
+    shape = (200, 200)
+    light = spot(shape, 50.0, 50.0, 1500.0)
+    light[100, 120] = 70000.0
+    found = detect(photograph(light), KNOWN)
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("separation", [2.5, 3.5, 5.0])
+def test_pairs_are_taken_apart(separation: float) -> None:
+    shape = (400, 400)
+    places = scattered(40, shape, 8, gap=25.0)
+    angles = np.random.default_rng(3).uniform(0.0, 2.0 * math.pi, 40)
+    partners = places + separation * np.column_stack([np.cos(angles), np.sin(angles)])
+    both = np.concatenate([places, partners])
+    fluxes = np.concatenate([np.full(40, 4000.0), np.full(40, 2500.0)])
+    light = sum(spot(shape, *place, flux) for place, flux in zip(both, fluxes, strict=True))
+    found = detect(photograph(light), DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
+    gaps = np.linalg.norm(both[:, None] - found.xy_px[None], axis=2)
+    assert np.mean(gaps.min(axis=1) < 0.3) > 0.95
+    error = gaps.min(axis=1)
+    assert np.sqrt(np.mean(error[error < 0.3] ** 2)) < 0.08
+
+
+@pytest.mark.parametrize("separation", [0.6, 1.0, 1.4, 1.8])
+def test_a_close_pair_is_one_star_at_its_centre_of_light(separation: float) -> None:
+    shape = (100, 100)
+    for seed in range(5):
+        light = spot(shape, 50.2, 50.0, 6000.0) + spot(shape, 50.2 + separation, 50.0, 3000.0)
+        found = detect(photograph(light, seed), DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
+        assert len(found) == 1
+        assert found.xy_px[0] == pytest.approx((50.2 + separation / 3.0, 50.0), abs=0.05)
+        assert found.flux[0] == pytest.approx(9000.0 * GAIN, rel=0.06)
+
+
+def test_a_close_pair_can_be_told_apart() -> None:
+    shape = (100, 100)
+    light = spot(shape, 50.0, 50.0, 6000.0) + spot(shape, 51.3, 50.0, 4000.0)
+    found = detect(photograph(light), DetectionSettings(psf_sigma_px=SIGMA, blend_px=0.0))
+    assert found.xy_px == pytest.approx(np.array([[50.0, 50.0], [51.3, 50.0]]), abs=0.1)
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(2.0, 1.0), (6.0, 0.0), (-5.0, 8.0), (15.0, 10.0)])
+def test_trails_of_a_turning_sensor_are_followed(dx: float, dy: float) -> None:
+    shape = (400, 500)
+    places = scattered(40, shape, 9, gap=45.0)
+    places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
+    fluxes = np.geomspace(3000.0, 30000.0, len(places))
+    light = sum(trail(shape, *place, flux, dx, dy) for place, flux in zip(places, fluxes, strict=True))
+    found = detect(photograph(light), KNOWN)
+    number, spurious = matched(found, places)
+    assert np.all(number >= 0)
+    assert len(spurious) <= 1
+    assert found.trail_px == pytest.approx(math.hypot(dx, dy), rel=0.05)
+    error = (found.xy_px[number] - places) / found.xy_sigma_px[number]
+    assert np.mean(error**2) == pytest.approx(1.0, abs=0.5)
+
+
+def test_trails_of_a_roll_are_followed() -> None:
+    shape = (400, 400)
+    places = scattered(60, shape, 10, gap=30.0)
+    roll = 0.03
+    off = places - 199.5
+    trails = roll * np.column_stack([-off[:, 1], off[:, 0]])
+    light = sum(trail(shape, *place, 15000.0, *path) for place, path in zip(places, trails, strict=True))
+    found = detect(photograph(light), KNOWN)
+    number, _ = matched(found, places, 1.0)
+    assert np.mean(number >= 0) > 0.95
+    number, places = number[number >= 0], places[number >= 0]
+    assert np.sqrt(np.mean((found.xy_px[number] - places) ** 2)) < 0.05
+
+
+def test_round_stars_have_no_trail() -> None:
+    shape = (300, 300)
+    places = scattered(50, shape, 11)
+    for seed in range(5):
+        image = photograph(sum(spot(shape, *place, 700.0) for place in places), seed)
+        assert detect(image).trail_px == 0.0
+
+
+def test_uneven_sky_does_not_move_stars() -> None:
+    """A vignetted sky with a gradient, as under the open sky: no false stars, and no bias of the true ones."""
+    shape = (500, 600)
+    rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
+    radius2 = ((columns - 300.0) ** 2 + (rows - 250.0) ** 2) / 390.0**2
+    sky = 3000.0 * (1.0 - 0.5 * radius2) + 1.5 * columns
+    places = scattered(80, shape, 12)
+    light = sum(spot(shape, *place, 900.0) for place in places)
+    found = detect(photograph(light, sky=sky), DetectionSettings())
+    number, spurious = matched(found, places)
+    assert np.mean(number >= 0) > 0.97
+    assert len(spurious) == 0
+    seen = number >= 0
+    error = found.xy_px[number[seen]] - places[seen]
+    assert np.all(np.abs(error.mean(axis=0)) < 0.02)
+
+
+def test_a_bright_limb_hides_only_itself() -> None:
+    shape = (400, 400)
+    places = scattered(60, shape, 13)
+    light = sum(spot(shape, *place, 1500.0) for place in places)
+    rows = np.mgrid[0 : shape[0], 0 : shape[1]][0]
+    light = np.where(rows > 260, 20000.0, light)
+    found = detect(photograph(light), KNOWN)
+    number, spurious = matched(found, places)
+    assert np.all(number[places[:, 1] < 228.0] >= 0), "more than a block away from the limb"
+    assert len(spurious) <= 2
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.7, 1.5, 2.5])
+def test_other_widths_are_found_out(sigma: float) -> None:
+    shape = (400, 400)
+    places = scattered(60, shape, 14, gap=22.0)
+    light = sum(spot(shape, *place, 6000.0, sigma) for place in places)
+    found = detect(photograph(light), KNOWN)
+    number, spurious = matched(found, places)
+    assert np.all(number >= 0)
+    assert len(spurious) == 0
+    assert found.psf_sigma_px == pytest.approx(sigma, rel=0.12)
+
+
+def test_star_sizes_can_be_limited() -> None:
+    shape = (200, 200)
+    light = spot(shape, 50.0, 50.0, 40000.0) + spot(shape, 150.0, 150.0, 400.0)
+    image = photograph(light)
+    assert len(detect(image)) == 2
+    big = detect(image, DetectionSettings(min_star_pixels=12))
+    assert big.xy_px[0] == pytest.approx((50.0, 50.0), abs=0.1)
+    assert len(big) == 1
+    small = detect(image, DetectionSettings(max_star_pixels=12))
+    assert len(small) == 1
+    assert small.xy_px[0] == pytest.approx((150.0, 150.0), abs=0.3)
+    assert small.refused >= 1
+
+
+def test_at_most_max_stars() -> None:
+    shape = (300, 300)
+    places = scattered(40, shape, 15)
+    image = photograph(sum(spot(shape, *place, 500.0 + 50.0 * k) for k, place in enumerate(places)))
+    found = detect(image, DetectionSettings(max_stars=10))
+    assert len(found) == 10
+    assert found.flux.min() > np.median(detect(image).flux)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(16, 16), (17, 400), (400, 17), (33, 31), (937, 937)])
+def test_black_and_white_and_flat_have_a_reason(dtype: type, shape: tuple[int, int]) -> None:
+    top = int(np.iinfo(dtype).max)
+    for level, word in ((0, "flat"), (7, "flat"), (top, "saturated")):
+        found = detect(np.full(shape, level, dtype=dtype))
+        assert len(found) == 0
+        assert word in found.reason
+        assert found.xy_px.shape == (0, 2)
+        assert found.sigma_px.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("image", "text"),
+    [
+        (np.zeros((50, 50, 3), np.uint8), "colour"),
+        (np.zeros((50, 50, 1, 1), np.uint8), "shape"),
+        (np.zeros(50, np.uint8), "shape"),
+        (np.zeros((50, 50), np.float64), "type float64"),
+        (np.full((50, 50), np.nan), "type float64"),
+        (np.zeros((50, 50), np.int16), "type int16"),
+        (np.zeros((50, 50), np.uint32), "type uint32"),
+        (np.zeros((50, 50), bool), "type bool"),
+        (np.zeros((15, 50), np.uint8), "at least 16×16"),
+        (np.zeros((0, 0), np.uint8), "at least 16×16"),
+        ([[1, 2], [3, 4]], "a list given"),
+        (None, "a NoneType given"),
+    ],
+)
+def test_what_is_no_image_is_refused_in_one_line(image: object, text: str) -> None:
+    with pytest.raises(StaridError) as caught:
+        detect(image)  # type: ignore[arg-type]
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"threshold_sigma": 0.0},
+        {"psf_sigma_px": -1.0},
+        {"max_stars": 0},
+        {"block_px": 2},
+        {"model_error": 2.0},
+    ],
+)
+def test_bad_settings_are_refused(values: dict[str, float]) -> None:
+    with pytest.raises(StaridError, match=rf"detection {next(iter(values))}: "):
+        DetectionSettings(**values)  # type: ignore[arg-type]
+
+
+def test_memory_layout_and_byte_order_do_not_matter() -> None:
+    shape = (120, 150)
+    image = photograph(sum(spot(shape, *place, 1500.0) for place in scattered(10, shape, 16)))
+    plain = detect(image)
+    big_endian = detect(image.astype(">u2"))
+    columns_first = detect(np.asfortranarray(image))
+    cut = detect(np.pad(image, 5)[5:-5, 5:-5])
+    for other in (big_endian, columns_first, cut):
+        np.testing.assert_array_equal(other.xy_px, plain.xy_px)
+
+
+def test_the_image_is_not_changed() -> None:
+    image = photograph(spot((100, 100), 50.0, 50.0, 5000.0))
+    before = image.copy()
+    detect(image)
+    np.testing.assert_array_equal(image, before)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    image=st.one_of(
+        hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, min_side=16, max_side=60)),
+        hnp.arrays(np.uint16, hnp.array_shapes(min_dims=2, max_dims=2, min_side=16, max_side=60)),
+    )
+)
+def test_any_image_gets_an_answer(image: np.ndarray) -> None:
+    found = detect(image)
+    assert np.all(np.isfinite(found.xy_px))
+    assert np.all(np.isfinite(found.flux))
+    assert np.all(found.xy_sigma_px > 0.0)
+    assert np.all(found.flux > 0.0)
+    inside = (found.xy_px > -0.5) & (found.xy_px < np.array(image.shape[::-1]) - 0.5)
+    assert np.all(inside)
+    assert bool(found.reason) == (len(found) == 0)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    share=st.sampled_from([0.0, 0.01, 0.2, 0.9]),
+    top=st.sampled_from([255, 65535]),
+)
+def test_salt_and_pepper_gets_an_answer(seed: int, share: float, top: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = photograph(np.zeros((80, 90)), seed, top=top)
+    image[rng.random(image.shape) < share] = top
+    image[rng.random(image.shape) < share] = 0
+    found = detect(image)
+    assert np.all(np.isfinite(found.xy_sigma_px))
+    assert bool(found.reason) == (len(found) == 0)

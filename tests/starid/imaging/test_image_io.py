@@ -1,0 +1,137 @@
+"""Image files: what is read is what was written, and everything else is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import starid
+from starid.errors import StaridError
+from starid.imaging.image_io import read_image, write_image
+
+RNG = np.random.default_rng(8)
+GREY8 = RNG.integers(0, 255, (60, 80), dtype=np.uint8)
+GREY16 = RNG.integers(0, 65535, (60, 80), dtype=np.uint16)
+
+
+def written(folder: Path, name: str, pixels: np.ndarray) -> Path:
+    assert cv2.imwrite(str(folder / name), pixels)
+    return folder / name
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "tiff"])
+@pytest.mark.parametrize(("pixels", "bits"), [(GREY8, 8), (GREY16, 16)])
+def test_lossless_formats_come_back_exactly(
+    tmp_path: Path, suffix: str, pixels: np.ndarray, bits: int
+) -> None:
+    image = read_image(written(tmp_path, f"a.{suffix}", pixels))
+    np.testing.assert_array_equal(image, pixels)
+    assert 8 * image.itemsize == bits
+    assert image.dtype == pixels.dtype
+
+
+def test_jpeg_comes_back_nearly(tmp_path: Path) -> None:
+    smooth = cv2.GaussianBlur(GREY8, (0, 0), 3)
+    image = read_image(written(tmp_path, "a.jpg", smooth))
+    assert np.abs(image.astype(int) - smooth).max() <= 8
+
+
+def test_jpeg_with_a_tail_is_whole(tmp_path: Path) -> None:
+    path = written(tmp_path, "a.jpg", GREY8)
+    path.write_bytes(path.read_bytes() + b"appended by a camera")
+    assert read_image(path).shape == (60, 80)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "jpg"])
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9, 0.999])
+def test_truncated_files_are_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], suffix: str, share: float
+) -> None:
+    path = written(tmp_path, f"a.{suffix}", GREY8)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(StaridError, match=rf"a\.{suffix}: truncated or damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == "", "the decoder's own complaints stay out of the way"
+
+
+def test_png_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "a.png", GREY8)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(StaridError, match="damaged"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "words"),
+    [
+        ("c.png", np.dstack([GREY8, GREY8 // 2, GREY8 // 3]), "3 channels"),
+        ("c.tif", np.dstack([GREY16] * 3), "3 channels"),
+        ("c.png", np.dstack([GREY8] * 4), "4 channels"),
+        ("f.tif", GREY8.astype(np.float32), "type float32"),
+        ("k.png", np.zeros((9, 9), np.uint8), "all black"),
+        ("w.png", np.full((9, 9), 255, np.uint8), "all white"),
+        ("w.tif", np.full((9, 9), 65535, np.uint16), "all white"),
+        ("g.png", np.full((9, 9), 7, np.uint8), "without any contrast"),
+    ],
+)
+def test_images_that_are_no_frames_are_refused(
+    tmp_path: Path, name: str, pixels: np.ndarray, words: str
+) -> None:
+    with pytest.raises(StaridError, match=words) as caught:
+        read_image(written(tmp_path, name, pixels))
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_colour_becomes_luma_when_allowed(tmp_path: Path) -> None:
+    blue, green, red = GREY8, GREY8.T.reshape(GREY8.shape), 255 - GREY8
+    image = read_image(written(tmp_path, "c.png", np.dstack([blue, green, red])), allow_colour=True)
+    expected = 0.114 * blue + 0.587 * green + 0.299 * red
+    np.testing.assert_allclose(image, expected, atol=0.5001)
+    assert image.dtype == np.uint8
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"GIF89a" + b"\x00" * 50])
+def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(StaridError, match=r"PNG, TIFF or JPEG|is empty"):
+        read_image(tmp_path / "a.png")
+
+
+def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StaridError, match="no such file"):
+        read_image(tmp_path / "nothing.png")
+    with pytest.raises(StaridError, match="cannot be read"):
+        read_image(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tiff", "sub/folder/a.PNG"])
+@pytest.mark.parametrize("pixels", [GREY8, GREY16])
+def test_what_is_written_is_read_back(tmp_path: Path, name: str, pixels: np.ndarray) -> None:
+    write_image(tmp_path / name, pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / name), pixels)
+    assert [p.name for p in (tmp_path / name).parent.iterdir()] == [Path(name).name]
+
+
+def test_images_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StaridError, match=r"suffix '\.bmp'"):
+        write_image(tmp_path / "a.bmp", GREY8)
+    with pytest.raises(StaridError, match="JPEG holds 8 bits"):
+        write_image(tmp_path / "a.jpg", GREY16)
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StaridError, match="cannot be written"):
+        write_image(tmp_path / "file" / "a.png", GREY8)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_public_names_are_reached_from_the_package() -> None:
+    assert starid.Camera.__module__ == "starid.camera"
+    assert "load_catalog" in dir(starid)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = starid.nonsense
