@@ -34,6 +34,14 @@ def command(
         bool, typer.Option("--start", help="Start the emulator as a process for this run.")
     ] = False,
     profile: Annotated[str | None, typer.Option(help="With --start: device profile.")] = None,
+    speed: Annotated[
+        float,
+        typer.Option(
+            min=0.01,
+            max=1.0,
+            help="Run time in a second, below 1 on a slow or busy machine; an emulator that runs already must have it too (run --clock scaled:…).",
+        ),
+    ] = 1.0,
     safe_only: Annotated[
         bool, typer.Option("--safe-only", help="Only cases that change nothing: for a unit in use.")
     ] = False,
@@ -83,6 +91,7 @@ def command(
         device_address=device_address,
         patterns=tuple(patterns or ()),
         safe_only=safe_only,
+        speed=speed,
         times=ProbeTimes(answer_s=time_out),
     )
     console = Console(highlight=False, quiet=as_json)

@@ -7,7 +7,9 @@ import logging
 from abc import ABC, abstractmethod
 from typing import Final, Generic, Protocol, TypeVar
 
+from emulator.clock import NANOSECONDS
 from emulator.device.device import Device
+from emulator.device.scheduler import Event
 from emulator.links.wire_faults import Pieces, WireFaults
 from protocol.errors import ProtocolError
 from protocol.messages import LinkFault, Reply, Request
@@ -60,7 +62,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._transport = transport
         self._loop = asyncio.get_running_loop()
         self._receiver = self._new_receiver()
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: Event | None = None
         self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, self._loop.call_later, seed)
         device.outlets.append(self._unsolicited)
         device.on_reset.append(self._forget)
@@ -92,8 +94,12 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._timer.cancel()
         await self._transport.close()
 
+    def _now(self) -> float:
+        """Run time, s: a message that does not end is given up in the device's own time."""
+        return self._device.clock.now_ns() / NANOSECONDS
+
     def _receive(self, item: Item) -> None:
-        for event in self._receiver.feed(item, self._loop.time()):
+        for event in self._receiver.feed(item, self._now()):
             self._take(event)
         self._watch()
 
@@ -108,11 +114,12 @@ class DeviceLink(ABC, Generic[Item, Style]):
     def _watch(self) -> None:
         """Look again at a message that was begun."""
         if self._timer is None and self._receiver.busy:
-            self._timer = self._loop.call_later(FLUSH_S, self._flush)
+            due_ns = self._device.clock.now_ns() + round(FLUSH_S * NANOSECONDS)
+            self._timer = self._device.scheduler.at(due_ns, self._flush)
 
-    def _flush(self) -> None:
+    def _flush(self, _due_ns: int) -> None:
         self._timer = None
-        for fault in self._receiver.flush(self._loop.time()):
+        for fault in self._receiver.flush(self._now()):
             self._device.fault(fault)
         self._watch()
 

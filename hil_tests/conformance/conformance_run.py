@@ -40,6 +40,7 @@ class ConformanceRequest:
     device_address: int = 4
     patterns: tuple[str, ...] = ()
     safe_only: bool = False
+    speed: float = 1.0
     times: ProbeTimes = field(default_factory=ProbeTimes)
 
 
@@ -84,13 +85,15 @@ def run_conformance(
             serial, can = _start(request, stack)
         mine = [item for item in cases if item.id.startswith("serial.")]
         if mine and serial is not None:
-            port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD))
+            port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD, request.speed))
             baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
+            if baud is not None:  # the line itself keeps its pace
+                baud = round(baud / request.speed)
             probe = SerialProbe(port, icd, dialect=request.dialect, baud=baud, times=request.times)
             outcomes += run_cases(probe, mine, on_outcome)
         mine = [item for item in cases if item.id.startswith("can.")]
         if mine and can is not None:
-            bus = stack.enter_context(live_can(can))
+            bus = stack.enter_context(live_can(can, request.speed))
             addresses = {"host": request.host_address, "device": request.device_address}
             outcomes += run_cases(CanProbe(bus, icd, times=request.times, **addresses), mine, on_outcome)
         mine = [item for item in cases if item.id.startswith("canopen.")]
@@ -107,6 +110,8 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
     if needs_bus:
         channel = stack.enter_context(OwnBus()) if request.can in (None, "auto") else str(request.can)
     extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
+    if request.speed != 1.0:
+        extra += ["--clock", f"scaled:{request.speed:g}"]
     command = emulator_command(
         profile=request.profile,
         serial="off" if request.serial is None else request.serial,
@@ -139,7 +144,7 @@ def _run_canopen(
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
             raise BenchError(f"{request.eds}: not a data sheet that can be read: {error}") from None
     outcomes = []
-    with live_can(can) as bus:
+    with live_can(can, request.speed) as bus:
         probe = CanopenProbe(bus, node, dictionary, text)
         for item in cases:
             found = run_canopen_case(probe, item)

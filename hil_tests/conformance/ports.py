@@ -31,10 +31,19 @@ class Port(Protocol[Item]):
 
 
 class LivePort(Generic[Item]):
-    """A port over one of the asyncio transports, whose loop runs in a thread of its own; a context manager."""
+    """A port over one of the asyncio transports, whose loop runs in a thread of its own; a context manager.
 
-    def __init__(self, transport: Transport[Item]) -> None:
+    Parameters
+    ----------
+    transport
+        What carries the items.
+    speed
+        Seconds that pass on this port's clock in a second of the wall clock.
+    """
+
+    def __init__(self, transport: Transport[Item], speed: float = 1.0) -> None:
         self._transport = transport
+        self._speed = speed
         self._loop = LoopThread("conformance")
         self._arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._lost: ProtocolError | None = None
@@ -56,13 +65,15 @@ class LivePort(Generic[Item]):
     def receive(self, timeout_s: float) -> Item | None:
         """Return the next item, None if none comes in time."""
         try:
-            return self._arrived.get(timeout=timeout_s) if timeout_s > 0 else self._arrived.get_nowait()
+            if timeout_s > 0:
+                return self._arrived.get(timeout=timeout_s / self._speed)
+            return self._arrived.get_nowait()
         except queue.Empty:
             return None
 
     def now(self) -> float:
         """Time, s, from any origin."""
-        return time.monotonic()
+        return time.monotonic() * self._speed
 
     def _fail(self, error: ProtocolError) -> None:
         self._lost = error
@@ -86,11 +97,11 @@ class LivePort(Generic[Item]):
         await self._transport.close()
 
 
-def live_serial(spec: str, baud: int) -> LivePort[bytes]:
+def live_serial(spec: str, baud: int, speed: float = 1.0) -> LivePort[bytes]:
     """Make the port of a serial specification; it is opened as a context manager."""
-    return LivePort(open_serial(spec, baud=baud, paced=False))
+    return LivePort(open_serial(spec, baud=baud, paced=False), speed)
 
 
-def live_can(spec: str) -> LivePort[CanFrame]:
+def live_can(spec: str, speed: float = 1.0) -> LivePort[CanFrame]:
     """Make the bus of a CAN specification; it is opened as a context manager."""
-    return LivePort(open_can(spec))
+    return LivePort(open_can(spec), speed)
