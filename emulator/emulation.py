@@ -338,6 +338,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         epoch=profile.catalog.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
+        build_beside=profile.run.clock != "stepped",
     )
 
 

@@ -210,6 +210,7 @@ def precise_attitude(device: Device) -> Values:
         "valid": answer.valid,
         "rate_valid": last.rate_valid,
         "tracking": result.tracked,
+        "index_pending": result.index_pending,
         "stars_detected": result.detected,
         "stars_matched": result.matched,
         "uncertainty_cross": result.sigma_cross_arcsec if answer.valid else 0.0,

@@ -36,6 +36,9 @@ class PipelineSetup:
         `geometric`, `lsi` or `rsi`.
     seed
         Seed of all noise.
+    build_beside
+        Answer with the star index in force while another is built; without it frames wait, so that the same run gives
+        the same bytes on a clock that waits too.
     """
 
     camera: dict[str, Any]
@@ -46,6 +49,7 @@ class PipelineSetup:
     epoch: float
     algorithm: str
     seed: int
+    build_beside: bool = False
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,8 @@ class FrameResult:
         The brightest identified ones, brightest first.
     probability_false, rms_px
         As the identification reports them.
+    index_pending
+        Solved with the star index of the settings before; the one for those of the request is being built.
     background_dn, noise_dn
         Level and noise of the background, counts.
     render_s, detect_s, identify_s
@@ -159,6 +165,7 @@ class FrameResult:
     stars: tuple[MatchedStar, ...] = ()
     probability_false: float = 1.0
     rms_px: float = 0.0
+    index_pending: bool = False
     background_dn: float = 0.0
     noise_dn: float = 0.0
     solved: bool = True

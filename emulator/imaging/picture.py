@@ -23,6 +23,7 @@ from emulator.imaging.frames import (
     SolverSettings,
     Warm,
 )
+from emulator.imaging.identifiers import IdentifierChoice, Identifiers
 from emulator.imaging.precompile import picture_was_compiled, start_helper
 from emulator.imaging.sensor import Frame, Renderer
 from emulator.imaging.sensor_model import SensorModel
@@ -32,7 +33,7 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.errors import StaridError
 from starid.imaging.detection import Detections, DetectionSettings, detect
-from starid.interface import StarIdentifier, make_identifier
+from starid.interface import StarIdentifier
 from starid.solution import Reason, Solution
 
 STARS_SENT: Final = 16
@@ -74,8 +75,7 @@ class Picture:
         self.catalog = load_catalog(setup.catalog_path or None, setup.epoch)
         self._sensor = SensorModel().with_(**setup.sensor)
         self._renderer = Renderer(self.camera, self.catalog, self._sensor, setup.seed)
-        self._identifier: StarIdentifier | None = None
-        self._identifier_key: object = None
+        self._identifiers = Identifiers(lambda choice: choice.make(self.catalog), beside=setup.build_beside)
         self._sky = SkyObjects.from_dict(setup.sky)
         self._last: Frame | None = None
 
@@ -135,60 +135,39 @@ class Picture:
             return FrameResult(request.index, solved=False, render_s=rendered - begin)
         found = detect(frame.image, detection_settings(sensor, request.settings))
         detected = time.perf_counter()
-        solution = self._solve(found, request)
+        identifier, current = self._identifiers.get(self._choice(request.settings))
+        solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
-        return self._result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        result = self._result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        return result if current else replace(result, index_pending=True)
 
-    def _solve(self, found: Detections, request: FrameRequest) -> Solution:
+    def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
         settings = request.settings
         chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
         xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
         sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
-        identifier = self._identifier_for(settings)
         if request.predicted_xyzw is None:
             solution = identifier.identify(xy, flux, sigma)
         else:
             predicted = np.array(request.predicted_xyzw)
             solution = identifier.track(xy, flux, predicted, sigma, window_px=tracking_window(settings))
-        if solution.valid and self._within_margin(solution, xy, settings) < settings.min_stars_matched:
+        if solution.valid and _within_margin(identifier, solution, xy, settings) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
             return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
         return solution
 
-    def _within_margin(self, solution: Solution, xy: NDArray[np.float64], settings: SolverSettings) -> int:
-        """Count the matched stars that lie within the validation margin of their place."""
-        identifier = self._identifier_for(settings)
-        icrs = identifier.catalog.vectors[solution.catalog_index]
-        places, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
-        off = np.hypot(*(places - xy[solution.detection_index]).T)
-        return int(np.count_nonzero(off <= settings.validation_margin))
-
-    def _identifier_for(self, settings: SolverSettings) -> StarIdentifier:
-        """Return the identifier for the device's own idea of its camera, made anew when that changes."""
-        camera = own_camera(self.camera, settings)
-        options: dict[str, Any] = dict(self._setup.identifier)
+    def _choice(self, settings: SolverSettings) -> IdentifierChoice:
+        """What the identifier for the device's own idea of its camera is made for."""
+        setup = self._setup
+        options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
-        if (
-            self._setup.algorithm != "geometric"
-        ):  # these count the stars of a field, and so need their magnitudes
+        if setup.algorithm != "geometric":  # these count the stars of a field, and so need their magnitudes
             options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
-        key = (camera, settings.error_margin, tuple(sorted(options.items())))
-        if self._identifier is None or key != self._identifier_key:
-            if self._setup.algorithm == "geometric":
-                from starid.geometric.identifier import Effort
-
-                nominal = Effort()
-                options["effort"] = replace(
-                    nominal, tolerance_px=nominal.tolerance_px * settings.error_margin / 100.0
-                )
-            try:
-                self._identifier = make_identifier(self._setup.algorithm, camera, self.catalog, **options)
-            except TypeError as error:
-                raise EmulatorError(f"identifier {self._setup.algorithm}: {error}") from None
-            self._identifier_key = key
-        return self._identifier
+        camera = own_camera(self.camera, settings)
+        margin = settings.error_margin / 100.0
+        return IdentifierChoice(setup.algorithm, camera, margin, tuple(sorted(options.items())))
 
     def _result(
         self,
@@ -248,6 +227,16 @@ class Picture:
             height, width = image.shape
             return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
+
+
+def _within_margin(
+    identifier: StarIdentifier, solution: Solution, xy: NDArray[np.float64], settings: SolverSettings
+) -> int:
+    """Count the matched stars that lie within the validation margin of their place."""
+    icrs = identifier.catalog.vectors[solution.catalog_index]
+    places, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
+    off = np.hypot(*(places - xy[solution.detection_index]).T)
+    return int(np.count_nonzero(off <= settings.validation_margin))
 
 
 def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
