@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ from starid.thesis.cme import CameraMotion, estimate_motion
 from starid.thesis.false_stars import FalseStarFilter, FilterError, ObservedFrame
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
+from starid.thesis.rsi_memory import AnswerMemory, Place
 
 Mode = Literal["lsi", "rsi"]
 
@@ -22,6 +23,7 @@ THRESHOLDS: Final = (0.5, 1.0)
 """The two published values of the threshold τ."""
 
 _FEWEST_MATCHES: Final = 2
+_FEWEST_VOTES: Final = 2
 
 
 class RsiError(StaridError):
@@ -42,10 +44,10 @@ class RsiSettings:
         Γ_min, the factor of its growth, and the side from which on the whole database is searched at once.
     motion_threshold_deg
         Distance beyond which a match does not count for the motion.
-    patience
-        0: the thesis's rule, the smaller ε_ψ wins. Otherwise an answer of the whole database that lies outside the
-        region is believed only after that many frames in a row in which the region's exceeded τ; until then the
-        region's stands. An answer far from where the camera can have turned is far more often wrong than right.
+    memory, agreement_deg
+        0: the thesis's algorithm, in which every frame's answer stands, and the last one is where the region of search
+        lies. Otherwise our addition: so many last answers, carried forward with the motion, vote, two of them agreeing
+        when they are within `agreement_deg`; what most agree on is the answer and the centre of the next region.
     """
 
     tau: float = 0.5
@@ -54,7 +56,8 @@ class RsiSettings:
     gamma_scale: float = 1.0
     gamma_lsi_deg: float = 90.0
     motion_threshold_deg: float = 1.0
-    patience: int = 0
+    memory: int = 0
+    agreement_deg: float = 0.5
 
     def __post_init__(self) -> None:
         values = (
@@ -63,9 +66,10 @@ class RsiSettings:
             self.gamma_min_deg,
             self.gamma_lsi_deg,
             self.motion_threshold_deg,
+            self.agreement_deg,
         )
-        if not all(value > 0.0 for value in values) or self.gamma_scale < 0.0 or self.patience < 0:
-            raise RsiError("RSI: thresholds and sides must be positive, the patience not negative")
+        if not all(value > 0.0 for value in values) or self.gamma_scale < 0.0 or self.memory < 0:
+            raise RsiError("RSI: thresholds and sides must be positive, the memory not negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,36 +173,38 @@ class RecursiveIdentification:
     def reset(self) -> None:
         """Forget the past; the next frame is the first."""
         self._before: ObservedFrame | None = None
-        self._place: tuple[float, float, float] | None = None
+        self._memory = AnswerMemory(max(self.settings.memory, 1), self.settings.agreement_deg)
         self._searches_all = True
-        self._doubts = 0
 
     def step(self, frame: ObservedFrame) -> RsiStep:
         """Identify the next frame.
 
         The first frame, and every frame after one whose ε_ψ stayed above τ, searches the whole database. Any other
         searches the region about the predicted boresight and, should ε_ψ exceed τ (eq. 4.1), the whole database too,
-        keeping the answer of smaller ε_ψ.
+        keeping the answer of smaller ε_ψ. With a memory a region that several answers agree on is searched after such
+        a frame as well.
         """
         true_stars, motion = self._filtered(frame)
         side = math.nan
-        if motion is not None:
+        if motion is None:
+            self._memory.clear()
+        else:
             side = region_side(motion.mean_distance_deg, motion.sigma_distance_deg, self.settings)
+            self._memory.carry(motion)
         features = self._features(frame, true_stars)
-        previous, self._before = self._place, frame
+        self._before = frame
         if features is None:
-            self._place, self._searches_all = None, True
+            self._memory.clear()
+            self._searches_all = True
             return _empty_step(true_stars, motion)
         observation = self._lsi.database.normalise(features)
-        predicted = _predicted(previous, motion)
-        waits = 0 < self._doubts < self.settings.patience
-        use_region = predicted is not None and side < self.settings.gamma_lsi_deg
-        use_region = use_region and (waits or not self._searches_all)
+        predicted = self._memory.place()
         start = time.perf_counter()
         cells = 0
         cell, distance = -1, math.inf
-        if use_region and predicted is not None:
-            cell, distance, cells = self._lsi.nearest_in_region(observation, predicted[0], predicted[1], side)
+        if predicted is not None and side < self.settings.gamma_lsi_deg and self._trusts(predicted):
+            centre = predicted.right_ascension_deg, predicted.declination_deg
+            cell, distance, cells = self._lsi.nearest_in_region(observation, *centre, side)
         use_region = cell >= 0
         if not use_region:
             cell, distance = self._lsi.nearest(observation)
@@ -208,19 +214,15 @@ class RecursiveIdentification:
         search_s, lasso_s = found - start, solved - found
         triggered = use_region and solution.mse.error_psi > self.settings.tau
         if triggered:
-            solution, more_search, more_lasso = self._whole_database(observation, solution, side)
+            solution, more_search, more_lasso = self._whole_database(observation, solution)
             search_s, lasso_s = search_s + more_search, lasso_s + more_lasso
-        estimate = solution.mse
-        roll = (features.theta_deg - math.degrees(estimate.theta_rad) + 180.0) % 360.0 - 180.0
+        estimate, roll = self._voted(solution.mse, features)
         exceeded = estimate.error_psi > self.settings.tau
-        valid = estimate.error_psi <= self.settings.invalid_factor * self.settings.tau
         self._searches_all = exceeded
-        self._doubts = self._doubts if exceeded else 0
-        self._place = (estimate.right_ascension_deg, estimate.declination_deg, roll) if valid else None
         return RsiStep(
             estimate,
             roll,
-            valid,
+            estimate.error_psi <= self.settings.invalid_factor * self.settings.tau,
             "rsi" if use_region else "lsi",
             triggered,
             exceeded,
@@ -232,8 +234,31 @@ class RecursiveIdentification:
             lasso_s,
         )
 
+    def _trusts(self, place: Place) -> bool:
+        """Whether the region about a place is searched: not after a frame in doubt, unless several answers agree."""
+        return not self._searches_all or place.votes >= _FEWEST_VOTES
+
+    def _voted(self, estimate: LsiEstimate, features: FeatureVector) -> tuple[LsiEstimate, float]:
+        """Remember a valid answer; return the one to give and the roll: with a memory, what most answers agree on."""
+        roll = (features.theta_deg - math.degrees(estimate.theta_rad) + 180.0) % 360.0 - 180.0
+        if estimate.error_psi <= self.settings.invalid_factor * self.settings.tau:
+            self._memory.add(estimate.right_ascension_deg, estimate.declination_deg, roll)
+        elif self.settings.memory == 0:
+            self._memory.clear()
+        place = self._memory.place() if self.settings.memory > 0 else None
+        if place is None or place.votes < _FEWEST_VOTES:
+            return estimate, roll
+        theta = math.remainder(math.radians(features.theta_deg - place.roll_deg), 2.0 * math.pi)
+        voted = replace(
+            estimate,
+            right_ascension_deg=place.right_ascension_deg,
+            declination_deg=place.declination_deg,
+            theta_rad=theta,
+        )
+        return voted, place.roll_deg
+
     def _whole_database(
-        self, observation: NDArray[np.float64], solution: LsiSolution, side_deg: float
+        self, observation: NDArray[np.float64], solution: LsiSolution
     ) -> tuple[LsiSolution, float, float]:
         start = time.perf_counter()
         cell, distance = self._lsi.nearest(observation)
@@ -241,9 +266,6 @@ class RecursiveIdentification:
         other = self._lsi.estimate(observation, cell, distance)
         solved = time.perf_counter()
         better = other if other.mse.error_psi < solution.mse.error_psi else solution
-        self._doubts += 1
-        if self._doubts < self.settings.patience and not _near(other.mse, solution.mse, side_deg):
-            better = solution
         return better, found - start, solved - found
 
     def _filtered(self, frame: ObservedFrame) -> tuple[NDArray[np.bool_], CameraMotion | None]:
@@ -269,26 +291,6 @@ class RecursiveIdentification:
         if not inside.any():
             return None
         return extract_features(frame.brightness[inside], frame.positions[inside])
-
-
-def _near(first: LsiEstimate, second: LsiEstimate, side_deg: float) -> bool:
-    turn = (first.right_ascension_deg - second.right_ascension_deg + 180.0) % 360.0 - 180.0
-    return max(abs(turn), abs(first.declination_deg - second.declination_deg)) <= side_deg
-
-
-def _predicted(
-    place: tuple[float, float, float] | None, motion: CameraMotion | None
-) -> tuple[float, float] | None:
-    """Boresight expected from the last one and the motion: where the frame's centre was in the frame before."""
-    if place is None or motion is None:
-        return None
-    ra, dec, roll = place
-    rotation = motion.matrix[:2, :2]
-    centre_before = -rotation.T @ motion.translation_deg
-    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    east = c * centre_before[0] + s * centre_before[1]
-    north = -s * centre_before[0] + c * centre_before[1]
-    return (ra + float(east)) % 360.0, dec + float(north)
 
 
 def _empty_step(true_stars: NDArray[np.bool_], motion: CameraMotion | None) -> RsiStep:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
+from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.metrics import boresight_error, error_colours, rotation_error
 from starid.thesis.rsi import (
@@ -15,8 +18,9 @@ from starid.thesis.rsi import (
     region_cells,
     region_side,
 )
+from starid.thesis.rsi_memory import AnswerMemory
 from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis.simulation import NoiseModel, add_noise, sky_sequence
+from starid.thesis.simulation import NoiseModel, add_noise, sky_sequence, turned
 from tests.starid.thesis.thesis_sky import lost_in_space
 
 
@@ -26,7 +30,7 @@ def quiet_filter():
 
 def test_a_clean_sequence_is_followed_in_the_region():
     lsi = lost_in_space(99.5)
-    recursion = RecursiveIdentification(lsi, quiet_filter(), RsiSettings(tau=0.5, patience=3))
+    recursion = RecursiveIdentification(lsi, quiet_filter(), RsiSettings(tau=0.5, memory=15))
     frames = sky_sequence(
         np.random.default_rng(1), lsi.database.sky, 108.41, 12.14, NoiseModel(), count=120, wander=True
     )
@@ -112,3 +116,70 @@ def test_measures():
     rho, p = correlation(x, 2.0 * x + 1.0)
     assert rho == pytest.approx(1.0)
     assert p < 1e-9
+
+
+def motion(rotation_deg=0.0, shift=(0.0, 0.0)):
+    before = np.array([[-10.0, 0.0], [10.0, 3.0], [2.0, -9.0], [-3.0, 8.0]])
+    return estimate_motion(before, turned(before, rotation_deg) + np.asarray(shift))
+
+
+def test_answers_that_agree_outvote_the_others():
+    memory = AnswerMemory(9, 0.5)
+    for ra, dec in [(359.9, 1.0), (40.0, 9.0), (0.1, 1.1), (200.0, -50.0), (0.0, 1.2), (1.5, 2.5)]:
+        memory.add(ra, dec, 179.9)
+    place = memory.place()
+    assert place.votes == 3
+    assert place.right_ascension_deg % 360.0 == pytest.approx(0.0, abs=1e-9)
+    assert place.declination_deg == pytest.approx(1.1)
+    assert place.roll_deg == pytest.approx(179.9)
+
+
+def test_the_memory_follows_the_camera():
+    lsi = lost_in_space(99.5)
+    frames = list(
+        sky_sequence(
+            np.random.default_rng(5), lsi.database.sky, 359.0, 12.0, NoiseModel(), count=20, wander=True
+        )
+    )
+    memory = AnswerMemory(30, 1e-6)
+    for before, now in pairwise(frames):
+        _, first, second = np.intersect1d(before.identity, now.identity, return_indices=True)
+        memory.add(before.right_ascension_deg, before.declination_deg, before.roll_deg)
+        memory.carry(estimate_motion(before.observed.positions[first], now.observed.positions[second]))
+    place = memory.place()
+    assert place.votes == 19
+    error = boresight_error(
+        place.right_ascension_deg, place.declination_deg, now.right_ascension_deg, now.declination_deg
+    )
+    assert float(error) < 1e-9
+    assert place.roll_deg == pytest.approx(now.roll_deg)
+
+
+def test_the_memory_forgets_what_is_too_old_and_all_when_cleared():
+    memory = AnswerMemory(2, 0.5)
+    for ra in (10.0, 10.1, 50.0, 50.1):
+        memory.add(ra, 0.0, 0.0)
+    memory.carry(motion(shift=(1.0, 0.0)))
+    assert memory.place().right_ascension_deg == pytest.approx(49.05)
+    memory.clear()
+    assert memory.place() is None
+
+
+def test_a_wrong_start_is_recovered_from_and_gross_answers_are_outvoted():
+    lsi = lost_in_space(99.5)
+    noise = NoiseModel.factor(0.34, 2)
+    settings = TrackFilterSettings(0.016, 0.01, max_rotation_deg=4.0, max_shift_deg=4.0)
+    errors = {}
+    for memory in (0, 15):
+        recursion = RecursiveIdentification(lsi, TrackFilter(settings), RsiSettings(memory=memory))
+        sequence = sky_sequence(
+            np.random.default_rng(7), lsi.database.sky, 108.41, 12.14, noise, count=150, wander=True
+        )
+        errors[memory] = []
+        for frame in sequence:
+            estimate = recursion.step(frame.observed).estimate
+            where = estimate.right_ascension_deg, estimate.declination_deg
+            truth = frame.right_ascension_deg, frame.declination_deg
+            errors[memory].append(float(boresight_error(*where, *truth)))
+    assert np.mean(errors[15][5:]) < min(0.18, np.mean(errors[0][5:]))
+    assert max(errors[15][20:]) < 1.0

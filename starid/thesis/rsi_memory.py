@@ -1,0 +1,103 @@
+"""Answers of the last frames, carried forward with the measured motion, vote for where the camera looks now.
+
+Our addition to the recursive algorithm. The camera's motion is measured to hundredths of a degree, while an answer is now
+and then wrong by a degree, or by half the sky: answers that agree once the motion between them is taken out are right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.thesis.cme import CameraMotion
+
+_RA, _DEC, _ROLL, _TURN, _X, _Y = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the camera looks.
+
+    Attributes
+    ----------
+    right_ascension_deg, declination_deg, roll_deg
+        Boresight and the angle by which the frame is turned, degrees.
+    votes
+        Number of answers that agree on it.
+    """
+
+    right_ascension_deg: float
+    declination_deg: float
+    roll_deg: float
+    votes: int
+
+
+class AnswerMemory:
+    """The last answers and the motion since each of them.
+
+    Parameters
+    ----------
+    size
+        Number of answers that are remembered.
+    agreement_deg
+        Distance within which two answers agree, degrees.
+    """
+
+    def __init__(self, size: int, agreement_deg: float) -> None:
+        self._size = size
+        self._agreement = agreement_deg
+        self._answers = np.empty((0, 6))
+
+    def clear(self) -> None:
+        """Forget all answers, as when the motion since them is not known."""
+        self._answers = np.empty((0, 6))
+
+    def add(self, right_ascension_deg: float, declination_deg: float, roll_deg: float) -> None:
+        """Remember the answer of the frame at hand, degrees."""
+        answer = np.array([[right_ascension_deg, declination_deg, roll_deg, 0.0, 0.0, 0.0]])
+        self._answers = np.concatenate([self._answers, answer])[-self._size :]
+
+    def carry(self, motion: CameraMotion) -> None:
+        """Go on to the next frame, to which the stars moved by `motion`."""
+        answers = self._answers
+        answers[:, _TURN] += motion.rotation_deg
+        answers[:, _X : _Y + 1] = motion.apply(answers[:, _X : _Y + 1])
+
+    def place(self) -> Place | None:
+        """The place in the frame at hand on which most answers agree; of equal numbers the latest; None without any.
+
+        The answers' rolls, each turned on by the motion since, are voted on first, as the motion in the sky depends on
+        them.
+        """
+        answers = self._answers
+        if answers.shape[0] == 0:
+            return None
+        rolls = _wrapped(answers[:, _ROLL] + answers[:, _TURN])
+        apart = np.abs(_wrapped(rolls[:, None] - rolls[None, :]))
+        middle = rolls[int(np.argmin(apart.sum(axis=1)))]
+        roll = middle + float(np.median(_wrapped(rolls - middle)))
+        c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+        x, y = answers[:, _X], answers[:, _Y]
+        ra = answers[:, _RA] - (c * x + s * y)
+        dec = answers[:, _DEC] - (c * y - s * x)
+        distance = np.hypot(_wrapped(ra[:, None] - ra[None, :]), dec[:, None] - dec[None, :])
+        agrees = distance <= self._agreement
+        votes = agrees.sum(axis=1)
+        winner = int(np.flatnonzero(votes == votes.max())[-1])
+        members = agrees[winner]
+        east = float(np.median(_wrapped(ra[members] - ra[winner])))
+        turn = float(np.median(_wrapped(rolls[members] - roll)))
+        return Place(
+            float((ra[winner] + east) % 360.0),
+            float(np.median(dec[members])),
+            float(_wrapped(np.array(roll + turn))),
+            int(votes[winner]),
+        )
+
+
+def _wrapped(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles into −180 … 180 degrees."""
+    return np.asarray((angle_deg + 180.0) % 360.0 - 180.0, dtype=np.float64)
