@@ -38,11 +38,11 @@ from emulator.clock import NANOSECONDS
 from emulator.device.cycle import Measurement, as_quaternion
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
-from emulator.profile import explain
 from emulator.truth.config import FixedConfig, TruthConfig
 from emulator.truth.live import LiveTruth
 from emulator.truth.log import compare
 from emulator.truth.source import TruthState
+from emulator.wording import explain
 from protocol.errors import ProtocolError
 from starid.errors import StaridError
 

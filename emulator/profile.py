@@ -6,16 +6,16 @@ checked; a wrong one is named with its file, its place and what to do.
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError
 
 from emulator.errors import EmulatorError
 from emulator.truth.config import FixedConfig, Strict, TruthConfig
+from emulator.wording import explain
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_DEPTH: Final = 8
@@ -226,12 +226,23 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        raise EmulatorError(f"profile {path}: {explain(error, Profile)}") from None
+        why = explain(error, Profile)
+        raise EmulatorError(f"{_culprit(path, overrides, why)}: {why}") from None
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
             raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
     profile._source = path  # noqa: SLF001 (not a key of the file)
     return profile
+
+
+def _culprit(path: Path, overrides: Sequence[str], why: str) -> str:
+    """Name what brought the key that `why` begins with: an override, or else the file."""
+    wrong = why.partition(": ")[0]
+    for override in reversed(overrides):
+        key = override.partition("=")[0].strip()
+        if f"{wrong}.".startswith(f"{key}."):
+            return f"--set {override}"
+    return f"profile {path}"
 
 
 def _read(path: Path, depth: int) -> dict[str, Any]:
@@ -298,57 +309,3 @@ def _override(values: dict[str, Any], override: str) -> None:
         for other in set(table) - ({"attitude"} if value != "file" else set()):
             del table[other]
     table[parts[-1]] = value
-
-
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """Say in one line where the first fault of a validation is, what it is and what to do."""
-    first = error.errors(include_url=False)[0]
-    loc = first["loc"]
-    where = ".".join(str(part) for part in loc if part not in _TAGS) or "as a whole"
-    if first["type"] == "extra_forbidden":
-        known = _keys_at(model, loc[:-1])
-        near = difflib.get_close_matches(str(loc[-1]), known, n=1)
-        remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-        return f"{where}: unknown key; {remedy}"
-    message = first["msg"].removeprefix("Value error, ")
-    shown = "" if isinstance(first["input"], (dict, list)) else f" (given: {first['input']!r})"
-    return f"{where}: {message[0].lower()}{message[1:]}{shown}"
-
-
-_TAGS: Final = frozenset({"fixed", "rate", "slew", "file", "live", "hold"})
-"""Names of the alternatives that pydantic puts between the keys of a place; no key has such a name."""
-
-
-def _keys_at(model: type[BaseModel], place: Sequence[Any]) -> list[str]:
-    """Return the keys that may stand at a place, which may hold the names of alternatives."""
-    models: list[type[BaseModel]] = [model]
-    for part in place:
-        if isinstance(part, int):
-            continue
-        if part in _TAGS:
-            models = [each for each in models if part in _tags_of(each)]
-        else:
-            models = [
-                below
-                for each in models
-                if part in each.model_fields
-                for below in _models_in(each.model_fields[part].annotation)
-            ]
-    return sorted({key for each in models for key in each.model_fields})
-
-
-def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
-    """Return the values by which a model is told from its alternatives."""
-    return tuple(
-        value
-        for name in ("kind", "do")
-        if name in model.model_fields
-        for value in getattr(model.model_fields[name].annotation, "__args__", ())
-    )
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models that an annotation names, however deep."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]

@@ -28,8 +28,9 @@ from pydantic import Field, ValidationError, model_validator
 from emulator.clock import NANOSECONDS
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
-from emulator.profile import configs_folder, explain
+from emulator.profile import configs_folder
 from emulator.truth.config import LiveConfig, Strict, TruthConfig
+from emulator.wording import explain
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import importlib
 import sys
-from typing import Final
+from typing import Any, Final, NoReturn
 
 import typer
 
 from emulator.errors import EmulatorError
+from emulator.wording import plain
 from hil_tests.errors import BenchError
 from protocol.errors import ProtocolError
 from starid.errors import StaridError
 
 EXIT_BAD_INPUT: Final = 2
 """Exit status for input that is refused; 1 says that all worked and that the result is not good."""
+
+EXIT_INTERRUPTED: Final = 130
+"""Exit status after Ctrl-C, as of shells."""
+
+USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
+"""What a refused option or argument raises; which library it is of depends on the version of typer."""
 
 COMMANDS: Final[dict[str, str]] = {
     "icd": "icd",
@@ -63,15 +70,36 @@ def describe_os_error(error: OSError) -> str:
     return " ".join(": ".join([" -> ".join(paths), reason] if paths else [reason]).split())
 
 
+def describe_refusal(error: Any) -> str:
+    """One line, `command: what is wrong; see its --help`, for an option or argument that was refused."""
+    path = "" if error.ctx is None else str(error.ctx.command_path)
+    command = path.removeprefix("starhil").strip()
+    what, value, why = str(error.format_message()).partition("': ")
+    said = " ".join(f"{plain(what)}{value}{plain(why)}".split()).rstrip(".")
+    help_of = f"starhil {command}".strip()
+    return f"{f'{command}: ' if command else ''}{said} (see {help_of} --help)"
+
+
 def main() -> None:
     """Run the command line; refused input ends in one line on stderr and exit status 2."""
     try:
-        build_app()()
+        status = build_app()(prog_name="starhil", standalone_mode=False)
     except (StaridError, ProtocolError, EmulatorError, BenchError) as error:
-        print(f"starhil: {error}", file=sys.stderr)
-        raise SystemExit(EXIT_BAD_INPUT) from None
+        refuse(str(error))
     except OSError as error:
-        print(f"starhil: {describe_os_error(error)}", file=sys.stderr)
-        raise SystemExit(EXIT_BAD_INPUT) from None
-    except KeyboardInterrupt:
-        raise SystemExit(130) from None
+        refuse(describe_os_error(error))
+    except (KeyboardInterrupt, typer.Abort):
+        raise SystemExit(EXIT_INTERRUPTED) from None
+    except USAGE_ERROR as error:
+        if (
+            type(error).__name__ == "NoArgsIsHelpError"
+        ):  # its message is the help, which is on the screen already
+            raise SystemExit(EXIT_BAD_INPUT) from None
+        refuse(describe_refusal(error))
+    raise SystemExit(status if isinstance(status, int) else 0)
+
+
+def refuse(why: str) -> NoReturn:
+    """End for bad input: one line on stderr."""
+    print(f"starhil: {' '.join(why.split())}", file=sys.stderr)
+    raise SystemExit(EXIT_BAD_INPUT) from None

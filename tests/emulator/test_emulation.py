@@ -135,7 +135,7 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
             assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
             bad = await control.do("set_truth", truth={"kind": "rate"})
-            assert bad == {"ok": False, "error": "rate_deg_s: field required"}
+            assert bad == {"ok": False, "error": "rate_deg_s: missing; give it"}
             assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
             assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
 
@@ -340,7 +340,7 @@ def test_every_scenario_of_the_product_is_valid(name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "at: field required"),
+        ("", "at: missing; give it"),
         ("[[at]]\nrun_time_s = 1.0\n", "give fault, truth or clear_faults"),
         (
             "[[at]]\nrun_time_s = 1.0\nfault = { optical = { false_star = 1 } }\n",

@@ -82,11 +82,14 @@ def test_overrides_are_toml_or_text():
     [
         ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean 'seed'?"),
         ("[rum]\nseed = 1\n", "rum: unknown key; did you mean 'run'?"),
-        ("[run]\nseed = -1\n", "run.seed: input should be greater than or equal to 0 (given: -1)"),
-        ("[run]\nseed = '1'\n", "run.seed: input should be a valid integer (given: '1')"),
+        ("[run]\nseed = -1\n", "run.seed: must be at least 0 (given: -1)"),
+        ("[run]\nseed = '1'\n", "run.seed: must be a valid integer (given: '1')"),
         ("[links.can]\naddress = 255\n", "links.can.address"),
-        ("[truth]\nkind = 'wobble'\n", "truth"),
-        ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: field required"),
+        ("[truth]\nkind = 'wobble'\n", "truth.kind: must be one of 'fixed', 'rate'"),
+        ("[truth]\nrate_deg_s = [0, 0, 1]\n", "truth.kind: must be one of 'file', 'fixed'"),
+        ("truth = 3\n", "truth: must be a"),
+        ("run = 3\n", "run: must be a table (given: 3)"),
+        ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: missing; give it"),
         ("[truth]\nkind = 'rate'\nrate_rad_s = [0, 0, 1]\n", "truth.rate_"),
         ("[truth]\nkind = 'fixed'\nattitude = {ra_deg = 1.0}\n", "give ra_deg and dec_deg"),
         ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),
@@ -119,3 +122,11 @@ def test_a_bad_override_is_named(override):
     assert override in refusal(
         "cubestar", [override, *(["run.seed=1"] if override == "run.seed.x=3" else [])]
     )
+
+
+def test_an_override_that_is_wrong_is_blamed_itself(tmp_path):
+    path = write(tmp_path, "[run]\nseed = 1\n")
+    assert refusal(path, ["run.seed=-1"]).startswith("--set run.seed=-1: run.seed: must be at least 0")
+    assert refusal(path, ["camera=3"]).startswith("--set camera=3: camera: must be a table")
+    bad = write(tmp_path, "[run]\nseed = -1\n")
+    assert path in refusal(bad, ["run.clock=real"])
