@@ -185,6 +185,10 @@ class Context:
         """Planar database of the thesis for an overlap ratio (a fraction), built once and kept in a file."""
         return _database(self.databases, overlap)
 
+    def database_file(self, overlap: float) -> Path:
+        """Where that database is kept."""
+        return _database_file(self.databases, overlap)
+
     def lost_in_space(self, overlap: float) -> LostInSpace:
         """The LSI algorithm on that database, kept in this process."""
         return _lost_in_space(self.databases, overlap)
@@ -282,13 +286,17 @@ def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None
     return sky_of(star_catalog(), parameters)
 
 
+def _database_file(folder: Path, overlap: float) -> Path:
+    return folder / f"planar-{100 * overlap:g}.features"
+
+
 @lru_cache(maxsize=3)
 def _database(folder: Path, overlap: float) -> FeatureDatabase:
     from starid.thesis.database import DatabaseParameters, build_database
     from starid.thesis.database_file import load_database, save_database
 
     catalog = star_catalog()
-    path = folder / f"planar-{100 * overlap:g}.features"
+    path = _database_file(folder, overlap)
     if path.exists():
         database = load_database(path)
         if database.catalog_identity == catalog.identity:

@@ -16,6 +16,7 @@ MODULES: Final[tuple[str, ...]] = (
     "lsi_accuracy",
     "lsi_noise",
     "lsi_run_time",
+    "memory",
     "fsf",
     "fsf_studies",
     "rsi",

@@ -74,7 +74,7 @@ def _section(finished: Finished) -> list[str]:
     tables = [f"[{name}]({experiment.name}/{name})" for name in outcome.files if not name.endswith(".png")]
     if tables:
         lines += ["Data: " + ", ".join(tables), ""]
-    lines += [f"`starhil reproduce {experiment.name}`, {finished.seconds:.0f} s of computing.", ""]
+    lines += [f"`starhil reproduce {experiment.name}`, {finished.seconds:.0f} s of processor time.", ""]
     return lines
 
 
@@ -89,7 +89,12 @@ def report_text(results: Sequence[Finished], *, quick: bool, seed: int) -> str:
             "from those of the full run within their statistical spread.",
             "",
         ]
-    lines += [f"Seed {seed}. {len(checks) - len(failed)} of {len(checks)} checks are met.", ""]
+    minutes = sum(result.seconds for result in results) / 60.0
+    met = f"{len(checks) - len(failed)} of {len(checks)} checks are met."
+    lines += [
+        f"Seed {seed}. {met} All took {minutes:.1f} minutes of processor time, on two cores half as long.",
+        "",
+    ]
     if failed:
         lines += ["## Not met", "", *_table(failed), ""]
     lines += ["## Contents", ""]

@@ -1,0 +1,42 @@
+"""A process of its own that loads a database, identifies with it, and says on stdout how much memory it took."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from pathlib import Path
+
+import numpy as np
+
+
+def peak_bytes() -> int:
+    """Greatest resident size of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def main(path: Path) -> None:
+    """Run lost-in-space on frames all over the sky, then the recursive algorithm on a sequence."""
+    from starid.thesis.database_file import load_database
+    from starid.thesis.lsi import LostInSpace
+    from starid.thesis.rsi import RecursiveIdentification, RsiSettings
+    from starid.thesis.scalable_filter import TrackFilter
+    from starid.thesis.simulation import NoiseModel, sky_sequence
+
+    lsi = LostInSpace(load_database(path))
+    sky = lsi.database.sky
+    loaded = peak_bytes()
+    for ra in np.arange(0.05, 360.0, 4.0):
+        for dec in (-60.0, 0.0, 60.0):
+            lsi.solve(sky.features(float(ra), dec))
+    recursion = RecursiveIdentification(lsi, TrackFilter(), RsiSettings(memory=15))
+    for frame in sky_sequence(
+        np.random.default_rng(1), sky, 108.41, 12.14, NoiseModel(), count=100, wander=True
+    ):
+        recursion.step(frame.observed)
+    print(json.dumps({"loaded": loaded, "peak": peak_bytes()}))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
