@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from emulator.claim import claim_symlink
 from emulator.clock import Clock, SteppedClock, make_clock
 from emulator.control import ControlServer
 from emulator.device.cycle import Measurement
@@ -31,6 +32,7 @@ from emulator.truth.config import LiveConfig, TruthConfig
 from emulator.truth.live import LiveFeed, LiveTruth
 from emulator.truth.log import TruthLog
 from emulator.truth.source import TruthSource
+from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition, load_icd
 from protocol.values import Value
 
@@ -155,15 +157,19 @@ class Emulation:
         if self.options.scenario:
             load_scenario(self.options.scenario).enter(self)
         device.power_on()
-        await self._open_links(device)
+        try:
+            await self._open_links(device)
+            if self.options.control != "off":
+                self.control = ControlServer(self, self.ended.set)
+                self.ready_words["control"] = await self.control.start(self.options.control)
+        except (EmulatorError, ProtocolError):
+            device.start_refused()
+            raise
         if isinstance(self.clock, SteppedClock):
             self.stepper = StepPump(device.scheduler, self.clock, self.imager)
         else:
             self._pump = ClockPump(device.scheduler, self.clock)
             self._pump.start()
-        if self.options.control != "off":
-            self.control = ControlServer(self, self.ended.set)
-            self.ready_words["control"] = await self.control.start(self.options.control)
         self._warming = asyncio.create_task(self._warm_up())
 
     @property
@@ -222,6 +228,8 @@ class Emulation:
 
             baud = int(device.parameters["serial_baud"])
             symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
+            if symlink is not None:
+                self._closers.append(claim_symlink(symlink).close)
             paced = None if links.serial.pace and not isinstance(self.clock, SteppedClock) else False
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(device, transport, seed)
@@ -252,6 +260,7 @@ class Emulation:
         try:
             self.warm = await self.imager.start()
         except EmulatorError as error:
+            self.device.start_refused()
             raise EmulatorError(f"profile {self.profile.source}: {error}") from None
         log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
         self.imager.on_failure = self._pipeline_failed

@@ -74,6 +74,14 @@ def command(
     if seed is not None:
         overrides.append(f"run.seed={seed}")
     loaded = load_profile(profile, overrides)
+    links = loaded.links
+    if (links.serial.port, links.can.channel, control) == ("off", "off", "off") and not (
+        links.canopen.node or truth_log
+    ):
+        raise EmulatorError(
+            "no link: nothing could reach the device, and nothing is recorded; "
+            "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
+        )
 
     async def run() -> None:
         import signal

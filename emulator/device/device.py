@@ -154,6 +154,11 @@ class Device:
         """Start: load what is stored, count the start, boot."""
         self._start("power_on")
 
+    def start_refused(self) -> None:
+        """Take back the count of a start that came to nothing, as a port or a file could not be had."""
+        self.boot_count = (self.boot_count - 1) & 0xFFFF
+        self._persist(lambda error: log.error("%s", error) if error else None)
+
     def reset(self, cause: str) -> None:
         """Restart, for a cause by its name in the interface definition."""
         self._start(cause)

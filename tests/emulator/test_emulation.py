@@ -15,6 +15,7 @@ from emulator.profile import Profile, RunConfig, configs_folder
 from emulator.scenario import load_scenario
 from emulator.truth.file import read_truth_file
 from emulator.truth.log import COLUMNS
+from protocol.errors import ProtocolError
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
 ORION = {"ra_deg": 83.8, "dec_deg": -1.2}
@@ -398,6 +399,46 @@ def test_what_cannot_be_had_is_said_in_one_line(run, options, overrides, said):
         run(scenario, options=options, **overrides)
     assert said in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_start_that_is_refused_is_not_counted(run, tmp_path, monkeypatch):
+    state = {"clock": "stepped", "state_dir": str(tmp_path)}
+    bad_port = {"can": {"channel": "off"}, "serial": {"port": "/dev/no_such"}}
+
+    async def scenario(emulation, _line):
+        return emulation.device.boot_count
+
+    assert run(scenario, run=state) == 1
+    with pytest.raises(ProtocolError):
+        run(scenario, run=state, links=bad_port)
+    with pytest.raises(EmulatorError):
+        run(scenario, run=state, options=RunOptions(control="127.0.0.1:99999"))
+    assert run(scenario, run=state) == 2
+
+    async def fail(_imager) -> Warm:
+        raise EmulatorError("no catalogue")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeImager, "start", fail)
+        with pytest.raises(EmulatorError, match="no catalogue"):
+            run(scenario, run=state)
+    assert run(scenario, run=state) == 3
+
+
+def test_a_symlink_in_use_is_refused_and_stays(run, tmp_path):
+    link = tmp_path / "tty"
+    links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
+
+    async def scenario(_emulation, _line):
+        first = link.readlink()
+        second = Emulation(Profile.model_validate({"run": {"clock": "stepped"}, "links": links}))
+        with pytest.raises(EmulatorError, match="in use by another emulator"):
+            await second.start()
+        await second.close()
+        assert link.readlink() == first
+
+    run(scenario, links=links)
+    assert not link.is_symlink()
 
 
 def test_a_truth_log_that_cannot_be_written_is_refused(run, tmp_path):

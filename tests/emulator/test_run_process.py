@@ -228,6 +228,7 @@ def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
     ("arguments", "said"),
     [
         (["no_such_profile"], "no_such_profile"),
+        (["--serial", "off"], "--control auto"),
         (["--set", "catalog.path=/no/such/file"], "/no/such/file"),
         (["--set", "sensor.apperture_m=0.01"], "apperture_m"),
         (["--serial", "/dev/no_such_tty"], "/dev/no_such_tty"),
