@@ -8,6 +8,7 @@ from hil_tests.conformance.link_probe import (
     BURST_ID,
     FIRST_TELEMETRY,
     Answer,
+    AnswerKind,
     LinkProbe,
     ProbeTimes,
 )
@@ -24,7 +25,10 @@ TELEMETRY: Final = 5
 TELEMETRY_NACK: Final = 6
 TELECOMMAND_SEGMENT: Final = 7
 TELEMETRY_SEGMENT: Final = 8
-UNSOLICITED: Final = (9, 10, 11, 12)
+UNSOLICITED_FIRST: Final = 10
+UNSOLICITED_BODY: Final = 11
+UNSOLICITED_LAST: Final = 12
+UNSOLICITED: Final = (9, UNSOLICITED_FIRST, UNSOLICITED_BODY, UNSOLICITED_LAST)
 ANSWERS: Final = (ACK, NACK, TELEMETRY, TELEMETRY_NACK, TELEMETRY_SEGMENT)
 
 
@@ -67,7 +71,7 @@ class CanProbe(LinkProbe):
         self.bus = bus
         self.host = host
         self.device = device
-        self.unsolicited: list[tuple[float, CanFrame]] = []
+        self.unsolicited: list[CanFrame] = []
         self._frames: list[CanFrame] = []
 
     def now(self) -> float:
@@ -106,7 +110,7 @@ class CanProbe(LinkProbe):
             return True
         self.log.append(f"{self.now():.4f} <- {format_frame(frame)}")
         if frame.id >> 24 in UNSOLICITED:
-            self.unsolicited.append((self.now(), frame))
+            self.unsolicited.append(frame)
         else:
             self._frames.append(frame)
         return True
@@ -122,6 +126,21 @@ class CanProbe(LinkProbe):
         """Return what comes without having been asked for."""
         self.sleep(quiet_s)
         return self._read(0.0) if self._frames else Answer("none")
+
+    def unasked(self, seconds: float) -> list[Answer]:
+        """Return the messages of unsolicited telemetry that come within a time."""
+        self.unsolicited.clear()
+        self.sleep(seconds)
+        found, data = [], b""
+        for frame in self.unsolicited:
+            kind, number, other = frame.id >> 24, frame.id >> 16 & 0xFF, frame.id & 0xFF
+            if kind in (UNSOLICITED_FIRST, UNSOLICITED_BODY):
+                data += frame.data[:-1]
+            elif kind == UNSOLICITED_LAST:
+                whole = data + frame.data[:-1] if data else frame.data
+                found.append(Answer("unsolicited", data=whole, identifier=number, other=other))
+                data = b""
+        return found
 
     def next_frame(self, timeout_s: float | None = None) -> CanFrame | None:
         """Return the next frame of the device that is not unsolicited, None if none comes."""
@@ -163,12 +182,9 @@ class CanProbe(LinkProbe):
         while frame is not None and frame.id == first.id and frame.data and frame.data[-1] == left:
             data += frame.data[:-1]
             if left == 0:
-                kind = "burst" if number == BURST_ID else "telemetry"
-                whole = len(data) > 8
-                if not whole:
-                    return Answer("malformed", data=data, identifier=number, other=other)
+                kind: AnswerKind = "burst" if number == BURST_ID else "telemetry"
                 return Answer(
-                    "burst" if kind == "burst" else "telemetry", data=data, identifier=number, other=other
+                    kind if len(data) > 8 else "malformed", data=data, identifier=number, other=other
                 )
             if len(frame.data) != 8:
                 break

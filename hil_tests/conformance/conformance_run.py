@@ -117,6 +117,7 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
         serial="off" if request.serial is None else request.serial,
         can=channel,
         seed=1,
+        settings=[f"links.serial.dialect={request.dialect}"],
         state_dir=folder,
         extra=extra,
     )

@@ -1,16 +1,12 @@
-"""Conformance of image and file download, unsolicited telemetry and recovery, on any link."""
+"""Conformance of image and file download, on any link."""
 
 from __future__ import annotations
 
-import random
 from typing import Final
 
-from hil_tests.conformance.can_probe import CanProbe
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
 from hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
-from hil_tests.conformance.serial_probe import SerialProbe
 from hil_tests.images import bmp_file_size, decode_bmp
-from protocol.can_framing import CanFrame
 from protocol.values import Value
 
 FRAMES: Final = "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)"
@@ -192,106 +188,6 @@ def out_of_range(probe: LinkProbe) -> None:
     check_equal((seen["ready"], seen["parameter_error"]), (False, True), "ready, parameter_error")
     row = probe.icd.telecommands["start_burst"]
     probe.expect_refusal(row.id, row.encode({}), SEQUENCE)
-
-
-# --- unsolicited telemetry ---
-
-
-@case(
-    _CASES,
-    "unsolicited.rate",
-    "unsolicited telemetry comes at its rate, and stops",
-    "types 10 to 12 (libCubeObc), use ours",
-    intrusive=True,
-)
-def unsolicited(probe: LinkProbe) -> None:
-    """identification, 8 bytes, at 10 Hz for two seconds."""
-    if not isinstance(probe, CanProbe):
-        raise CaseSkipped("only CAN, and serial dialect c, have unsolicited telemetry")
-    row = probe.icd.telemetry["identification"]
-    probe.command("set_unsolicited", telemetry=row.id, rate=10.0)
-    try:
-        probe.unsolicited.clear()
-        probe.sleep(2.0)
-        seen = list(probe.unsolicited)
-    finally:
-        probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
-    check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
-    kinds = {(frame.id >> 24, frame.id >> 16 & 0xFF, len(frame.data)) for _, frame in seen}
-    check_equal(kinds, {(12, row.id, row.size)}, "type, identifier, length")
-    probe.unsolicited.clear()
-    probe.sleep(0.5)
-    check(len(probe.unsolicited) <= 1, "no more", len(probe.unsolicited))
-
-
-@case(
-    _CASES,
-    "unsolicited.segments",
-    "a long row comes as first, body and last, counters down to 0",
-    "types 10 to 12 (libCubeObc), use ours",
-    intrusive=True,
-)
-def unsolicited_segments(probe: LinkProbe) -> None:
-    """star_tracker, 54 bytes: 8 frames."""
-    if not isinstance(probe, CanProbe):
-        raise CaseSkipped("only CAN, and serial dialect c, have unsolicited telemetry")
-    row = probe.icd.telemetry["star_tracker"]
-    probe.unsolicited.clear()
-    probe.command("set_unsolicited", telemetry=row.id, rate=5.0)
-    try:
-        probe.sleep(1.0)
-        seen = [frame for _, frame in probe.unsolicited][:8]
-    finally:
-        probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
-    check_equal([frame.id >> 24 for frame in seen], [10, *[11] * 6, 12], "types")
-    check_equal([frame.data[-1] if frame.data else -1 for frame in seen], list(range(7, -1, -1)), "counters")
-    check_equal(sum(len(frame.data) - 1 for frame in seen), row.size, "bytes")
-
-
-@case(
-    _CASES,
-    "unsolicited.refused",
-    "unsolicited telemetry of a row that does not exist is refused",
-    "published error codes",
-    intrusive=True,
-)
-def unsolicited_refused(probe: LinkProbe) -> None:
-    """Number 200."""
-    row = probe.icd.telecommands["set_unsolicited"]
-    probe.expect_refusal(row.id, row.encode({"telemetry": 200, "rate": 1.0}), INVALID_PARAMETER)
-
-
-# --- recovery ---
-
-
-@case(_CASES, "recovery.noise", "after noise the next good request is answered", OURS)
-def noise(probe: LinkProbe) -> None:
-    """Serial: 4000 random bytes; CAN: 400 random frames that are no requests."""
-    rng = random.Random(7)  # noqa: S311 -- noise, not a secret
-    if isinstance(probe, SerialProbe):
-        for _ in range(20):
-            probe.send(rng.randbytes(200).replace(b"\x7f", b"\x00"))
-            probe.sleep(0.01)
-    elif isinstance(probe, CanProbe):
-        for _ in range(400):
-            kind = rng.choice((0, 2, 3, 5, 6, 9, 13, 20, 31))
-            identifier = kind << 24 | rng.randrange(256) << 16 | probe.host << 8 | probe.device
-            probe.send(CanFrame(identifier, rng.randbytes(rng.randrange(9))))
-    probe.sleep(probe.times.quiet_s)
-    probe.drain()
-    probe.expect_alive()
-
-
-@case(_CASES, "recovery.flood", "a flood of requests is answered whole and in order", OURS)
-def flood(probe: LinkProbe) -> None:
-    """Two rows in turn, a hundred times."""
-    rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]
-    for _ in range(100):
-        for row in rows:
-            probe.post(row.id)
-    for _ in range(100):
-        for row in rows:
-            probe.expect_telemetry(row.id, 2.0)
 
 
 CASES: Final = tuple(_CASES)

@@ -111,6 +111,10 @@ class LinkProbe(ABC):
         """Return what comes without having been asked for within a time."""
 
     @abstractmethod
+    def unasked(self, seconds: float) -> list[Answer]:
+        """Return the messages of unsolicited telemetry that come within a time."""
+
+    @abstractmethod
     def drain(self) -> None:
         """Let go of all that has come."""
 

@@ -20,8 +20,6 @@ LONG_PAUSE_S: Final = 0.8
 SHORT_PAUSE_S: Final = 0.1
 CLOCK_GRAIN_S: Final = 1e-4
 LONGEST_MESSAGE: Final = 512
-HOST_TIMEOUT_S: Final = 0.3
-"""Time-out of the most impatient published flight software (AlbertaSat, first version)."""
 
 _CASES: list[Case[SerialProbe]] = []
 
@@ -256,22 +254,6 @@ def no_flag(probe: SerialProbe) -> None:
 
 
 # --- time ---
-
-
-@case(
-    _CASES,
-    "timing.reply",
-    "fifty requests are each answered within 300 ms",
-    "host time-out of AlbertaSat, first version",
-)
-def reply_time(probe: SerialProbe) -> None:
-    """The longest of them counts."""
-    worst = 0.0
-    for _ in range(50):
-        begin = probe.now()
-        probe.expect_alive()
-        worst = max(worst, probe.now() - begin)
-    check(worst <= HOST_TIMEOUT_S, f"at most {HOST_TIMEOUT_S:g} s", f"{worst:.3f} s")
 
 
 @case(_CASES, "timing.pace", "a long reply takes its time on the line", "8N1: ten bits a byte")

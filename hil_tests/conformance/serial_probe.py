@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from hil_tests.conformance.case import CaseFailed
 from hil_tests.conformance.link_probe import BURST_ID, FIRST_TELEMETRY, Answer, LinkProbe, ProbeTimes
 from hil_tests.conformance.ports import Port
 from protocol.icd import InterfaceDefinition
@@ -104,6 +105,17 @@ class SerialProbe(LinkProbe):
             if answer.kind != "unsolicited":
                 return answer
         return self._malformed() if self._buffer else Answer("none")
+
+    def unasked(self, seconds: float) -> list[Answer]:
+        """Return the messages of unsolicited telemetry that come within a time; anything else fails the case."""
+        self.sleep(seconds)
+        found = []
+        while (packet := self._packet()) is not None:
+            answer = self._answer(*packet)
+            if answer.kind != "unsolicited":
+                raise CaseFailed("nothing but unsolicited telemetry", str(answer))
+            found.append(answer)
+        return found
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
         """Return the next answer that was not yet looked at."""

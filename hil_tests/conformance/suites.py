@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from hil_tests.conformance import behaviour_cases, can_cases, image_cases, serial_cases
+from hil_tests.conformance import behaviour_cases, can_cases, image_cases, serial_cases, traffic_cases
 from hil_tests.conformance.can_probe import CanProbe
 from hil_tests.conformance.case import Case
 from hil_tests.conformance.row_cases import row_cases
@@ -25,7 +25,7 @@ def can_suite(icd: InterfaceDefinition) -> tuple[Case[CanProbe], ...]:
 
 
 def _common(icd: InterfaceDefinition) -> list[Case[Any]]:
-    return [*row_cases(icd), *behaviour_cases.CASES, *image_cases.CASES]
+    return [*row_cases(icd), *behaviour_cases.CASES, *image_cases.CASES, *traffic_cases.CASES]
 
 
 def _named(link: str, *tables: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:

@@ -17,11 +17,12 @@ pytestmark = pytest.mark.process
 SPEED = 0.5
 """Run time in a second: slow motion gives each rule about time the same meaning and a busy machine twice the patience."""
 SLOW_MOTION = ["--speed", str(SPEED)]
+TIME_OUT_S = 400.0
 
 
 def conform(*words: str, reports: tuple = ()) -> list[dict]:
     """Run cases and return their outcomes; none may have failed."""
-    done = starhil("conformance", *words, *reports, "--json")
+    done = starhil("conformance", *words, *reports, "--json", time_out_s=TIME_OUT_S)
     assert done.stderr == ""
     outcomes = json.loads(done.stdout)["outcomes"]
     assert [(o["id"], o["expected"], o["seen"], o["log"]) for o in outcomes if o["status"] == "failed"] == []

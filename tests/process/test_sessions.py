@@ -17,9 +17,9 @@ pytestmark = pytest.mark.process
 TIME_OUT_S = 120
 
 
-def starhil(*words: str) -> subprocess.CompletedProcess:
+def starhil(*words: str, time_out_s: float = TIME_OUT_S) -> subprocess.CompletedProcess:
     command = [sys.executable, "-c", STARHIL, *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIME_OUT_S, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=time_out_s, check=False)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,137 @@
+"""Conformance of the traffic on any link: how soon a reply comes, unsolicited telemetry, recovery from noise and floods."""
+
+from __future__ import annotations
+
+import random
+from typing import Final
+
+from hil_tests.conformance.can_probe import CanProbe
+from hil_tests.conformance.case import Case, case, check, check_equal
+from hil_tests.conformance.link_probe import INVALID_PARAMETER, Answer, LinkProbe, checked_values
+from hil_tests.conformance.serial_probe import SerialProbe
+from protocol.can_framing import CanFrame
+
+OURS: Final = "rule of this product (docs of the interface definition)"
+HOST_TIMEOUT_S: Final = 0.3
+"""Time-out of the most impatient published flight software (AlbertaSat, first version)."""
+
+_CASES: list[Case[LinkProbe]] = []
+
+
+# --- time ---
+
+
+@case(
+    _CASES,
+    "timing.reply",
+    "fifty requests are each answered within 300 ms",
+    "host time-out of AlbertaSat, first version",
+)
+def reply_time(probe: LinkProbe) -> None:
+    """The longest of them counts."""
+    worst = 0.0
+    for _ in range(50):
+        begin = probe.now()
+        probe.expect_alive()
+        worst = max(worst, probe.now() - begin)
+    check(worst <= HOST_TIMEOUT_S, f"at most {HOST_TIMEOUT_S:g} s", f"{worst:.3f} s")
+
+
+# --- unsolicited telemetry ---
+
+UNSOLICITED: Final = (
+    "types 10 to 12, start bytes 1F 4F (libCubeObc); serial dialects a and b have none (ours)"
+)
+
+
+def _unasked(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[Answer]:
+    """Return what comes of a row within a time; nothing may come in a serial dialect that has none."""
+    row = probe.icd.telemetry[name]
+    probe.command("set_unsolicited", telemetry=row.id, rate=rate)
+    try:
+        return probe.unasked(seconds)
+    finally:
+        probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
+
+
+@case(
+    _CASES,
+    "unsolicited.rate",
+    "unsolicited telemetry comes at its rate, and stops",
+    UNSOLICITED,
+    intrusive=True,
+)
+def unsolicited(probe: LinkProbe) -> None:
+    """identification, 8 bytes, at 10 Hz for two seconds."""
+    row = probe.icd.telemetry["identification"]
+    seen = _unasked(probe, "identification", 10.0, 2.0)
+    if isinstance(probe, SerialProbe) and probe.dialect != "c":
+        check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
+        return
+    check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
+    check_equal({(item.identifier, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
+    after = probe.unasked(0.5)
+    check(len(after) <= 1, "no more", f"{len(after)} messages")
+
+
+@case(_CASES, "unsolicited.long", "a long row comes unsolicited as a whole", UNSOLICITED, intrusive=True)
+def unsolicited_long(probe: LinkProbe) -> None:
+    """star_tracker, 54 bytes, with all values within their limits."""
+    row = probe.icd.telemetry["star_tracker"]
+    seen = _unasked(probe, "star_tracker", 5.0, 1.0)
+    if isinstance(probe, SerialProbe) and probe.dialect != "c":
+        check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
+        return
+    check(len(seen) >= 3, "3 messages or more in 1 s", len(seen))
+    check_equal({(item.identifier, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
+    for item in seen:
+        checked_values(row, item.data)
+
+
+@case(
+    _CASES,
+    "unsolicited.refused",
+    "unsolicited telemetry of a row that does not exist is refused",
+    "published error codes",
+    intrusive=True,
+)
+def unsolicited_refused(probe: LinkProbe) -> None:
+    """Number 200."""
+    row = probe.icd.telecommands["set_unsolicited"]
+    probe.expect_refusal(row.id, row.encode({"telemetry": 200, "rate": 1.0}), INVALID_PARAMETER)
+
+
+# --- recovery ---
+
+
+@case(_CASES, "recovery.noise", "after noise the next good request is answered", OURS)
+def noise(probe: LinkProbe) -> None:
+    """Serial: 4000 random bytes; CAN: 400 random frames that are no requests."""
+    rng = random.Random(7)  # noqa: S311 -- noise, not a secret
+    if isinstance(probe, SerialProbe):
+        for _ in range(20):
+            probe.send(rng.randbytes(200).replace(b"\x7f", b"\x00"))
+            probe.sleep(0.01)
+    elif isinstance(probe, CanProbe):
+        for _ in range(400):
+            kind = rng.choice((0, 2, 3, 5, 6, 9, 13, 20, 31))
+            identifier = kind << 24 | rng.randrange(256) << 16 | probe.host << 8 | probe.device
+            probe.send(CanFrame(identifier, rng.randbytes(rng.randrange(9))))
+    probe.sleep(probe.times.quiet_s)
+    probe.drain()
+    probe.expect_alive()
+
+
+@case(_CASES, "recovery.flood", "a flood of requests is answered whole and in order", OURS)
+def flood(probe: LinkProbe) -> None:
+    """Two rows in turn, a hundred times."""
+    rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]
+    for _ in range(100):
+        for row in rows:
+            probe.post(row.id)
+    for _ in range(100):
+        for row in rows:
+            probe.expect_telemetry(row.id, 2.0)
+
+
+CASES: Final = tuple(_CASES)

@@ -1,0 +1,25 @@
+"""Every conformance case of CAN and CANopen on a kernel vcan0 (on machines without one: in a guest)."""
+
+from __future__ import annotations
+
+import pytest
+
+from protocol.transports.can import kernel_can_is_up
+from tests.process.test_conformance import SLOW_MOTION, conform
+
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.socketcan,
+    pytest.mark.skipif(
+        not kernel_can_is_up("vcan0"),
+        reason="no vcan0 here; tools/test_on_vcan runs this test in a guest that has one",
+    ),
+]
+
+
+def test_every_case_passes_on_the_kernel_bus():
+    outcomes = conform("--start", "--can", "auto", "--canopen", "44", *SLOW_MOTION)
+    passed = [item["id"] for item in outcomes if item["status"] == "passed"]
+    assert len(passed) == len(outcomes)
+    assert sum(identifier.startswith("can.") for identifier in passed) >= 380
+    assert sum(identifier.startswith("canopen.") for identifier in passed) >= 140
