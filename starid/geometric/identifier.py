@@ -132,6 +132,9 @@ class Identifier:
         Stars closer than this are seen as one.
     effort : Effort
         Bounds of the search.
+    index_camera : Camera, optional
+        Camera whose index is taken, one of a rounded field say, so that similar cameras share one; by default
+        the camera itself.
     cache : bool or path
         Keep the index on disk: in the cache folder, in a folder given, or not at all.
 
@@ -150,6 +153,7 @@ class Identifier:
         fov_tolerance: float = 0.0,
         blend_px: float = BLEND_PX,
         effort: Effort | None = None,
+        index_camera: Camera | None = None,
         cache: bool | str | Path = True,
     ) -> None:
         if not 0.0 <= fov_tolerance <= WIDEST_TOLERANCE:
@@ -159,9 +163,12 @@ class Identifier:
         self._camera = camera
         self._catalog = load_catalog() if catalog is None else catalog
         self._effort = effort or Effort()
+        typical = camera if index_camera is None else index_camera
         if limiting_magnitude is None:
-            limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(camera))
-        settings = index_settings(camera, self._catalog, limiting_magnitude, blend_px, self._effort.window_px)
+            limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(typical))
+        settings = index_settings(
+            typical, self._catalog, limiting_magnitude, blend_px, self._effort.window_px
+        )
         self._stars = seen_stars(self._catalog, limiting_magnitude, settings.blend_rad)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
         self._index = obtain_index(self._stars, settings, cache)
