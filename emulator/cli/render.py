@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +13,9 @@ import typer
 from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
-    from emulator.imaging.sensor import Frame, SensorModel
+    from emulator.imaging.sensor import Frame
+    from emulator.imaging.sensor_model import SensorModel
+    from emulator.imaging.sky_objects import SkyObjects
     from starid.camera import Camera
 
 _NUMBERED_TO_MAGNITUDE = 3.6
@@ -39,7 +42,12 @@ def command(
         str | None, typer.Option(metavar="WIDTH[xHEIGHT]", help="Pixels, such as 1024x768.")
     ] = None,
     model: Annotated[str | None, typer.Option(help="Projection: pinhole or equidistant.")] = None,
-    profile: Annotated[str | None, typer.Option(help="Take camera and sensor from this profile.")] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            help="Picture of the device of this profile: camera, sensor, exposure, gain, catalogue and [sky]."
+        ),
+    ] = None,
     as_annotated: Annotated[
         bool, typer.Option("--annotate", help="Stretch the image and mark the stars on it.")
     ] = False,
@@ -58,15 +66,17 @@ def command(
             raise EmulatorError(f"--{name} {value}: a finite number of degrees is needed")
     if not -90.0 <= dec <= 90.0:
         raise EmulatorError(f"--dec {dec}: degrees from -90 to 90 are needed")
-    camera, sensor = _equipment(profile, fov, size, model)
+    scene = _scene(profile, fov, size, model)
+    camera = scene.camera
     changes = {
         "exposure_s": exposure,
         "limiting_magnitude": limit,
         "bits": bits,
         "gain": gain,
     }
-    sensor = sensor.with_(**{name: value for name, value in changes.items() if value is not None})
-    renderer = Renderer(camera, load_catalog(), sensor, seed)
+    sensor = scene.sensor.with_(**{name: value for name, value in changes.items() if value is not None})
+    catalog = load_catalog(scene.catalog_path or None, scene.epoch)
+    renderer = Renderer(camera, catalog, sensor, seed, scene.objects)
     frame = renderer.render(Attitude.from_radec_roll(ra, dec, roll), [math.radians(value) for value in rate])
     write_image(output, _marked(frame) if as_annotated else frame.image)
     if as_json:
@@ -78,32 +88,58 @@ def command(
         )
 
 
-def _equipment(
-    profile: str | None, fov: float | None, size: str | None, model: str | None
-) -> tuple[Camera, SensorModel]:
-    """Camera and sensor from a profile or the defaults, with the options put over them."""
+@dataclass(frozen=True)
+class _Scene:
+    """What makes the picture, and which stars and other objects there are."""
+
+    camera: Camera
+    sensor: SensorModel
+    objects: SkyObjects
+    catalog_path: str
+    epoch: float
+
+
+def _scene(profile: str | None, fov: float | None, size: str | None, model: str | None) -> _Scene:
+    """Scene of a profile, as its device sees it, or of the defaults, with the options put over it."""
     from emulator.imaging.sensor_model import SensorModel
+    from emulator.imaging.sky_objects import SkyObjects
     from starid.camera import Camera
+    from starid.catalog import DEFAULT_EPOCH
 
-    values: dict[str, Any] = {}
-    sensor = SensorModel()
-    if profile is not None:
+    if profile is None:
+        scene = _Scene(Camera.from_fov(), SensorModel(), SkyObjects(), "", DEFAULT_EPOCH)
+    else:
+        from emulator.device.device import profile_defaults
+        from emulator.device.parameters import Parameters
+        from emulator.emulation import pipeline_setup
         from emulator.profile import load_profile
+        from protocol.icd import load_icd
 
-        loaded = load_profile(profile)
-        values = loaded.camera.values()
-        sensor = sensor.with_(**loaded.sensor)
-    if fov is not None or size is not None or model is not None:
-        old = Camera.from_dict(values) if values else Camera.from_fov()
-        width, height = (old.width, old.height) if size is None else _size(size)
-        values = {
-            "fov_deg": old.fov_deg if fov is None else fov,
-            "width": width,
-            "height": height,
-            "model": old.model if model is None else model,
-            "distortion": old.distortion,
-        }
-    return (Camera.from_dict(values) if values else Camera.from_fov()), sensor
+        loaded, icd = load_profile(profile), load_icd()
+        parameters = Parameters(icd, profile_defaults(loaded, icd))
+        setup = pipeline_setup(loaded)
+        sensor = SensorModel().with_(**setup.sensor)
+        scene = _Scene(
+            Camera.from_dict(setup.camera),
+            sensor.with_(
+                exposure_s=float(parameters["exposure"]) / 1000.0, gain=float(parameters["analog_gain"])
+            ),
+            SkyObjects.from_dict(setup.sky),
+            setup.catalog_path,
+            setup.epoch,
+        )
+    if fov is None and size is None and model is None:
+        return scene
+    old = scene.camera
+    width, height = (old.width, old.height) if size is None else _size(size)
+    values = {
+        "fov_deg": old.fov_deg if fov is None else fov,
+        "width": width,
+        "height": height,
+        "model": old.model if model is None else model,
+        "distortion": old.distortion,
+    }
+    return replace(scene, camera=Camera.from_dict(values))
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -195,9 +195,10 @@ class Device:
         self._boot_over = self.scheduler.at(self.started_ns + boot_ns, self._boot_ends)
 
     def pipeline_ready(self, camera_constants: dict[str, Value]) -> None:
-        """Take note that frames can be made; the camera's constants become defaults of the parameters."""
+        """Take note that frames can be made; the camera's constants become defaults where the profile gives none."""
         self.warm = True
-        self.parameters.adopt_defaults(camera_constants)
+        own = self.profile.parameters  # a device may hold another idea of its camera than what the camera is
+        self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in own})
         if self._boot_over is None and self.modes.mode is Mode.BOOT:
             self._end_boot()
 

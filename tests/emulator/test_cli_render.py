@@ -94,6 +94,29 @@ def test_a_profile_gives_camera_and_sensor(tmp_path: Path, monkeypatch: pytest.M
     assert read_image(target).shape == (937, 937)
 
 
+def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = tmp_path / "mine.toml"
+
+    def picture(text: str, *options: str) -> tuple[np.ndarray, float]:
+        profile.write_text(text, encoding="utf-8")
+        target = tmp_path / "x.png"
+        arguments = ("--profile", str(profile), "--ra", "0", "--dec", "40", "-o", str(target), "--json")
+        assert run(monkeypatch, *arguments, *options) == 0
+        return read_image(target), json.loads(capsys.readouterr().out)["exposure_s"]
+
+    plain, exposure = picture('extends = "cubestar"\n')
+    assert exposure == 0.1
+    dark, _ = picture('extends = "cubestar"\nsky = { blank = true }\n')
+    assert np.count_nonzero(dark > 30) < np.count_nonzero(plain > 30) / 4  # hot pixels stay
+    longer, exposure = picture('extends = "cubestar"\nparameters = { exposure = 400, analog_gain = 2.0 }\n')
+    assert exposure == 0.4
+    assert np.median(longer) > np.median(plain)
+    _, exposure = picture('extends = "cubestar"\n', "--exposure", "0.3")
+    assert exposure == 0.3
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

@@ -629,3 +629,11 @@ def test_a_bad_default_is_refused_with_the_name_of_its_profile(make_bench, given
     with pytest.raises(EmulatorError) as refusal:
         make_bench(Profile(name="bench", parameters=given))
     assert str(refusal.value).startswith(said)
+
+
+def test_a_profile_may_give_the_device_another_idea_of_its_camera(make_bench):
+    bench = make_bench(Profile.model_validate({"parameters": {"focal_length": 1230.0}}))
+    bench.device.power_on()
+    bench.device.pipeline_ready({"focal_length": 1220.0, "k1": 0.01})
+    assert bench.device.parameters["focal_length"] == 1230.0
+    assert bench.device.parameters["k1"] == pytest.approx(0.01)
