@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from starid.cache import cached_tables
 from starid.errors import StaridError
 from starid.hipparcos import EPOCH, default_path, read_hip2
-from starid.photometry import absolute_magnitude, flux_ratio, v_from_hp
+from starid.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
 
 Band = Literal["v", "hp"]
 
@@ -26,6 +27,7 @@ DEFAULT_EPOCH: Final = 2026.0
 _RAD_PER_MAS: Final = math.pi / (180.0 * 3600.0 * 1000.0)
 _EPOCH_RANGE: Final = (1800.0, 2200.0)
 _FORMAT: Final = 1
+_CANDIDATES: Final = 200_000
 _PER_STAR: Final = (
     *("hip", "vectors", "ra_rad", "dec_rad", "hp", "v", "b_v", "v_i"),
     *("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr"),
@@ -263,7 +265,44 @@ def moved(
     return vectors
 
 
-def blend(catalog: StarCatalog, separation_rad: float, band: Band = "v") -> StarCatalog:
+def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: float) -> NDArray[np.intp]:
+    """Rows, ascending, of the stars fainter than a V magnitude that stand near one that is not.
+
+    Parameters
+    ----------
+    catalog : StarCatalog
+        The stars.
+    limiting_magnitude : float
+        V magnitude.
+    separation_rad : float
+        Angle within which a star is near, radians.
+    """
+    chord = 2.0 * math.sin(0.5 * min(separation_rad, math.pi))
+    bright = catalog.vectors[catalog.v <= limiting_magnitude]
+    faint = np.flatnonzero(catalog.v > limiting_magnitude)
+    faint = faint[np.argsort(catalog.vectors[faint, 2], kind="stable")]
+    vectors = catalog.vectors[faint]
+    x, z = np.ascontiguousarray(vectors[:, 0]), np.ascontiguousarray(vectors[:, 2])
+    first = np.searchsorted(z, bright[:, 2] - chord, side="left")
+    count = np.searchsorted(z, bright[:, 2] + chord, side="right") - first
+    is_near = np.zeros(len(faint), dtype=np.bool_)
+    # so many bright stars at a time that the candidates for their companions fill no more than some megabytes
+    portion = np.cumsum(count) // _CANDIDATES
+    for start, end in itertools.pairwise(
+        [*np.flatnonzero(np.diff(portion, prepend=-1)).tolist(), len(bright)]
+    ):
+        one = np.repeat(np.arange(start, end), count[start:end])
+        before = np.cumsum(count[start:end]) - count[start:end]
+        other = np.arange(len(one)) + np.repeat(first[start:end] - before, count[start:end])
+        close = np.flatnonzero(np.abs(x[other] - bright[one, 0]) <= chord)
+        gap = vectors[other[close]] - bright[one[close]]
+        is_near[other[close[np.einsum("ij,ij->i", gap, gap) <= chord * chord]]] = True
+    return np.sort(faint[is_near])
+
+
+def blend(
+    catalog: StarCatalog, separation_rad: float, band: Band = "v", *, as_fitted: bool = False
+) -> StarCatalog:
     """Merge stars that a sensor cannot tell apart.
 
     From the brightest down, each star takes in all fainter ones within the separation that no brighter
@@ -278,6 +317,8 @@ def blend(catalog: StarCatalog, separation_rad: float, band: Band = "v") -> Star
         Angle within which two stars are one, radians.
     band : {"v", "hp"}
         The band whose flux weights the position and ranks the members.
+    as_fitted : bool
+        Put the merged star where the fit of one spot finds it (`starid.photometry.fitted_share`), short of the centre of light.
 
     Returns
     -------
@@ -299,8 +340,13 @@ def blend(catalog: StarCatalog, separation_rad: float, band: Band = "v") -> Star
         if leader[bright] == bright and leader[faint] == faint:
             leader[faint] = bright
     flux = flux_ratio(catalog.magnitude(band))
+    places = catalog.vectors
+    if as_fitted:
+        gap = places - places[leader]
+        distance = np.linalg.norm(gap, axis=1) / max(chord, 1e-12)
+        places = places[leader] + fitted_share(distance, flux / flux[leader])[:, None] * gap
     sums = np.zeros((len(catalog), 3))
-    np.add.at(sums, leader, catalog.vectors * flux[:, None])
+    np.add.at(sums, leader, places * flux[:, None])
     kept = np.flatnonzero(leader == np.arange(len(catalog)))
     grown = np.bincount(leader, minlength=len(catalog))[kept] > 1
     vectors = catalog.vectors[kept].copy()

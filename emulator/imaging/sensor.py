@@ -18,19 +18,20 @@ from emulator.imaging.sky_light import AreaLight, AreaPainter, add_cosmic_rays, 
 from emulator.imaging.sky_objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.catalog import StarCatalog
+from starid.catalog import StarCatalog, companions
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
 _MOST_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
+_COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
 _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
 
 @dataclass(frozen=True)
 class StarTruth:
-    """Catalogue stars on a frame, brightest first.
+    """Catalogue stars on a frame, companions beyond the limiting magnitude among them, brightest first.
 
     Attributes
     ----------
@@ -120,7 +121,8 @@ class Renderer:
     camera : Camera
         Where directions fall on the pixels.
     catalog : StarCatalog
-        The sky; stars fainter than the sensor's limiting magnitude are left out.
+        The sky; stars fainter than the sensor's limiting magnitude are left out, but for the companions of brighter
+        ones that a sensor sees as one with them.
     sensor : SensorModel
         Optics and detector.
     seed : int
@@ -144,7 +146,9 @@ class Renderer:
         self.objects = objects
         self._painter = AreaPainter(camera, self.sensor)
         brightness = self.sensor_magnitudes()
-        rows = np.flatnonzero(catalog.v <= self.sensor.limiting_magnitude)
+        limit = self.sensor.limiting_magnitude
+        near = companions(catalog, limit, _COMPANION_PX * camera.pixel_scale_rad)
+        rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
         self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])

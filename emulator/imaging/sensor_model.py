@@ -95,7 +95,7 @@ class SensorModel:
     pattern_seed : int
         Chooses the fixed pattern: which pixels are hot or dead, and the two spreads.
     limiting_magnitude : float
-        Faintest stars that are drawn, V.
+        Faintest stars that are drawn, V; fainter companions within two pixels of one are drawn with it.
 
     Raises
     ------

@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.camera import Camera
-from starid.catalog import StarCatalog, blend
+from starid.catalog import StarCatalog, blend, companions
 from starid.errors import StaridError
 from starid.geometric.jit_kernels import entry, inner
+from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.geometric.sky_grid import FACES, build_sky_grid, cell_of
 
 INDEX_VERSION: Final = 4
@@ -38,7 +39,7 @@ BRIGHTEST_BIN: Final = -2.0
 BINS_PER_MAGNITUDE: Final = 4
 COUNT_CELLS: Final = 12
 _BLEND_DEPTH: Final = 1.5
-"""Stars this much fainter than the limit still join a blend."""
+"""Stars this much fainter than the limit join a blend wherever they are; fainter ones join a star within the limit."""
 
 
 class IndexArrays(NamedTuple):
@@ -138,27 +139,9 @@ class IndexSettings:
 
 def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float) -> StarCatalog:
     """Stars to a limit as the sensor sees them: doubles closer than `blend_rad` merged, brightest first."""
-    deep = catalog.brighter_than(limiting_magnitude + _BLEND_DEPTH)
-    return blend(deep, blend_rad).brighter_than(limiting_magnitude)
-
-
-@entry
-def _pick(
-    vectors: NDArray[np.float64],
-    neighbour_start: NDArray[np.int64],
-    neighbours: NDArray[np.int64],
-    quota: int,
-) -> NDArray[np.bool_]:
-    """Take stars by falling brightness while fewer than `quota` taken ones are their neighbours."""
-    taken = np.zeros(vectors.shape[0], dtype=np.bool_)
-    crowd = np.zeros(vectors.shape[0], dtype=np.int64)
-    for star in range(vectors.shape[0]):
-        if crowd[star] >= quota:
-            continue
-        taken[star] = True
-        for k in range(neighbour_start[star], neighbour_start[star + 1]):
-            crowd[neighbours[k]] += 1
-    return taken
+    deep = catalog.v <= limiting_magnitude + _BLEND_DEPTH
+    deep[companions(catalog, limiting_magnitude, blend_rad)] = True
+    return blend(catalog.subset(deep), blend_rad, as_fitted=True).brighter_than(limiting_magnitude)
 
 
 def _adjacency(
@@ -174,13 +157,6 @@ def _adjacency(
     start = np.zeros(vectors.shape[0] + 1, dtype=np.int64)
     np.cumsum(np.bincount(left, minlength=vectors.shape[0]), out=start[1:])
     return start, np.ascontiguousarray(right[order], dtype=np.int64)
-
-
-def pick_pattern_stars(vectors: NDArray[np.float64], cap_area_sr: float, quota: int) -> NDArray[np.int64]:
-    """Rows of the stars (brightest first in `vectors`) that patterns are made of; see the module."""
-    radius = math.acos(max(1.0 - cap_area_sr / (2.0 * math.pi), -1.0))
-    start, neighbours = _adjacency(vectors, radius)
-    return np.flatnonzero(_pick(vectors, start, neighbours, quota))
 
 
 @inner

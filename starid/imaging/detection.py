@@ -33,7 +33,7 @@ from starid.imaging.measurement import (
     find_neighbours,
     measure,
 )
-from starid.imaging.pairs import split_pairs
+from starid.imaging.pairs import doubt_close_pairs, split_pairs
 from starid.imaging.spot_shape import MOMENT_COLUMNS, SpotShape, moments_of, shape_from_moments
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import smooth_along_trails, trail_noise_factor
@@ -81,7 +81,7 @@ class DetectionSettings:
     follow_trails : bool
         Whether trails of a turning sensor are looked for.
     blend_px : float
-        Stars closer to each other than this count as one, at their common centre of light.
+        Stars closer to each other than this count as one, where one spot would be fitted to them.
     pixel_sigma : float
         Excess over the sky, in sigmas of the noise, from which a pixel counts as lit by a star.
     min_star_pixels, max_star_pixels : int
@@ -359,7 +359,6 @@ def _fitted(
         np.concatenate([stars, partners[:found]]),
         np.concatenate([flags, flags[owners]]),
     )
-    return windows, stars, flags
 
 
 def _measured(
@@ -396,13 +395,16 @@ def _measured(
     fits, marks = stars[good], flags[good]
     freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
     misfit = fits[:, CHI2] / freedom
-    inflation = np.sqrt(np.where(misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom), misfit, 1.0))
+    fits[:, [VAR_X, VAR_Y, VAR_FLUX]] *= np.where(
+        misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom), misfit, 1.0
+    )[:, None]
+    doubt_close_pairs(fits, np.argsort(-fits[:, Y], kind="stable"), settings.blend_px)
     unit = 1.0 if gain is None else gain
     return Detections(
         fits[:, [X, Y]],
         fits[:, FLUX] * unit,
-        np.sqrt(fits[:, VAR_FLUX]) * inflation * unit,
-        np.sqrt(fits[:, [VAR_X, VAR_Y]]) * inflation[:, None],
+        np.sqrt(fits[:, VAR_FLUX]) * unit,
+        np.sqrt(fits[:, [VAR_X, VAR_Y]]),
         (marks & SATURATED) != 0,
         (marks & AT_EDGE) != 0,
         background.median_level,

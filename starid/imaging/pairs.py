@@ -24,6 +24,7 @@ from starid.imaging.centroid import (
 )
 from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y
+from starid.photometry import EVEN_PAIR
 
 Array = npt.NDArray[np.float64]
 
@@ -41,6 +42,9 @@ _PAIR_SIGMA: Final = 2.5
 _FAR_SIGMA: Final = 4.0
 _CORE_SIGMA: Final = 1.0
 _ONE_PIXEL: Final = 0.5
+_DOUBTFUL: Final = 1.4
+"""Pairs closer than this many blending distances may be one star to who counts in angles: off the axis of a wide lens
+the same angle covers more pixels."""
 
 
 @compiled_loops
@@ -219,11 +223,59 @@ def _is_better(
 
 
 @compiled_loops
-def _merge(pair: Array, star: Array) -> None:
-    """Put one star in place of two: all their light at its centre, with the errors of the fit of one."""
+def _shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
+    """How far from a star towards its companion, as a share of their distance, one spot would be fitted."""
+    gaussian = math.exp(-(off_x * off_x + off_y * off_y) / (blend_px * blend_px))
+    share = 1.0 - (1.0 - gaussian) * max(1.0 - (ratio / EVEN_PAIR) ** 2, 0.0)
+    return share * ratio / (1.0 + ratio)
+
+
+@compiled_loops
+def doubt_close_pairs(stars: Array, order: npt.NDArray[np.int64], blend_px: float) -> None:
+    """Widen the errors of the brighter star of a pair that is told apart, but hardly.
+
+    A catalogue whose close pairs are blended may have it as one star, elsewhere by the shift of a blend.
+
+    Parameters
+    ----------
+    stars : ndarray (n, FIT_COLUMNS)
+        Fits; VAR_X and VAR_Y grow.
+    order : ndarray (n,)
+        Their numbers by falling Y.
+    blend_px : float
+        As in `split_pairs`.
+    """
+    reach = _DOUBTFUL * blend_px
+    for place in range(order.size):
+        one = stars[order[place]]
+        for later in range(place + 1, order.size):
+            other = stars[order[later]]
+            if one[Y] - other[Y] > reach:
+                break
+            off_x, off_y = other[X] - one[X], other[Y] - one[Y]
+            if off_x * off_x + off_y * off_y > reach * reach:
+                continue
+            brighter, ratio = (one, other[FLUX] / one[FLUX])
+            if ratio > 1.0:
+                brighter, ratio = other, 1.0 / ratio
+            shift = _shift(off_x, off_y, ratio, blend_px)
+            brighter[VAR_X] += (shift * off_x) ** 2
+            brighter[VAR_Y] += (shift * off_y) ** 2
+
+
+@compiled_loops
+def _merge(pair: Array, blend_px: float, star: Array) -> None:
+    """Put one star in place of two: all their light where one spot would be fitted, with the errors of the fit of one.
+
+    That place is the one of `starid.photometry.fitted_share`, so that pairs which are seen to be two and those which
+    are not stand where an index of blended stars has them.
+    """
+    faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
+    bright = pair[1 - faint]
+    off_x, off_y = pair[faint, X] - bright[X], pair[faint, Y] - bright[Y]
+    shift = _shift(off_x, off_y, pair[faint, FLUX] / bright[FLUX], blend_px)
+    star[X], star[Y] = bright[X] + shift * off_x, bright[Y] + shift * off_y
     total = pair[0, FLUX] + pair[1, FLUX]
-    for axis in (X, Y):
-        star[axis] = (pair[0, FLUX] * pair[0, axis] + pair[1, FLUX] * pair[1, axis]) / total
     star[FLUX] = total
     star[CHI2], star[PIXELS] = pair[0, CHI2], pair[0, PIXELS]
 
@@ -253,7 +305,7 @@ def split_pairs(
     suspects : ndarray (m,)
         Numbers of the stars to try.
     blend_px : float
-        Pairs closer than this stay one star, at their common centre of light.
+        Pairs closer than this stay one star, where one spot would be fitted to them.
     partners : ndarray (m, FIT_COLUMNS)
         Filled with the fits of the fainter stars.
     owners : ndarray (m,)
@@ -302,7 +354,7 @@ def split_pairs(
         todo[k] = False
         faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
         if math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y]) < blend_px:
-            _merge(pair, stars[k])
+            _merge(pair, blend_px, stars[k])
             continue
         stars[k] = pair[1 - faint]
         partners[found] = pair[faint]

@@ -16,6 +16,7 @@ from starid.catalog import StarCatalog, load_catalog
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 CLEAN = SensorModel(bits=16, hot_pixels=0, dead_pixels=0, prnu=0.0, dsnu=0.0, read_noise_e=2.0)
+BETA1_CAPRICORNI, BETA2_CAPRICORNI = 100345, 100325
 BETELGEUSE, RIGEL, BELLATRIX, SAIPH, SIRIUS, ALDEBARAN = 27989, 24436, 25336, 27366, 32349, 21421
 
 
@@ -93,9 +94,33 @@ def test_only_stars_to_the_limit_are_drawn(catalog: StarCatalog) -> None:
         frame = Renderer(DEFAULT_CAMERA, catalog, CLEAN.with_(limiting_magnitude=limit)).render(ORION)
         xy, inside = DEFAULT_CAMERA.project(ORION.to_sensor(catalog.vectors))
         expected = catalog.hip[inside & (catalog.v <= limit)]
-        assert set(frame.stars.hip.tolist()) == set(expected.tolist())
+        drawn = frame.stars.hip[frame.stars.magnitude <= limit]
+        assert set(drawn.tolist()) == set(expected.tolist())
+        faint = frame.stars.xy_px[frame.stars.magnitude > limit]
+        gaps = np.linalg.norm(faint[:, None] - xy[catalog.v <= limit], axis=2)
+        assert np.nanmin(gaps, axis=1, initial=np.inf).max(initial=0.0) < 2.7, "two pixels on the axis"
         assert np.isfinite(xy[inside]).all()
         assert np.all(np.diff(frame.stars.electrons) <= 0.0)
+
+
+def test_a_companion_beyond_the_limit_adds_its_light(catalog: StarCatalog) -> None:
+    """The two stars of beta Capricorni, V 3.1 and 6.1, 3.4' apart, are 1.3 pixels from each other."""
+    bright, faint = catalog.index_of([BETA1_CAPRICORNI, BETA2_CAPRICORNI])
+    attitude = Attitude.from_radec_roll(*np.degrees([catalog.ra_rad[bright], catalog.dec_rad[bright]]), 0.0)
+    sensor = CLEAN.with_(limiting_magnitude=6.0)
+    both = Renderer(DEFAULT_CAMERA, catalog, sensor).render(attitude)
+    single = Renderer(DEFAULT_CAMERA, catalog.subset(catalog.hip != BETA2_CAPRICORNI), sensor).render(
+        attitude
+    )
+    assert set(both.stars.hip.tolist()) - set(single.stars.hip.tolist()) == {BETA2_CAPRICORNI}
+    centre = 468
+    box = (slice(centre - 8, centre + 9), slice(centre - 8, centre + 9))
+    added = (both.image[box].astype(np.float64) - single.image[box]).sum() * sensor.gain_e_per_dn
+    electrons = sensor.electrons(float(catalog.v[faint]))
+    noise = np.sqrt(
+        2.0 * (sensor.electrons(float(catalog.v[bright])) + 289 * (sensor.read_noise_e**2 + 20.0))
+    )
+    assert added == pytest.approx(electrons, abs=4.0 * noise)
 
 
 def test_truth_is_the_middle_of_the_trail(renderer: Renderer) -> None:

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from starid import cache, catalog, hipparcos
-from starid.catalog import StarCatalog, blend, load_catalog
+from starid.catalog import StarCatalog, blend, companions, load_catalog
 from starid.errors import StaridError
-from starid.photometry import absolute_magnitude, flux_ratio, v_from_hp
+from starid.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
 
 ARCSECOND = math.radians(1 / 3600)
 HERE = Path(__file__).parent
@@ -189,6 +189,38 @@ def test_blend_adds_light_and_weighs_positions(sky: StarCatalog) -> None:
     assert float(np.linalg.norm(merged.vectors[0] - pair.vectors[0])) == pytest.approx(share * gap, rel=1e-6)
     assert float(np.linalg.norm(merged.vectors[0])) == pytest.approx(1.0, abs=1e-15)
     assert len(blend(pair, 0.1 * gap)) == 2
+
+
+@pytest.mark.parametrize(("limit", "arcseconds"), [(6.0, 330.0), (4.0, 1500.0), (-2.0, 330.0), (20.0, 330.0)])
+def test_companions_are_the_faint_stars_near_bright_ones(
+    sky: StarCatalog, limit: float, arcseconds: float
+) -> None:
+    found = companions(sky, limit, arcseconds * ARCSECOND)
+    faint = np.flatnonzero(sky.v > limit)
+    bright = sky.vectors[sky.v <= limit]
+    expected = faint[:0]
+    if len(bright) and len(faint):
+        gap, _ = cKDTree(bright).query(sky.vectors[faint])
+        expected = faint[gap <= 2.0 * math.sin(0.5 * arcseconds * ARCSECOND)]
+    np.testing.assert_array_equal(found, expected)
+
+
+@given(distance=st.floats(0.0, 3.0), ratio=st.floats(0.0, 1.0))
+@settings(max_examples=50, deadline=None)
+def test_a_companion_draws_a_fit_less_the_farther_and_fainter_it_is(distance: float, ratio: float) -> None:
+    share = fitted_share(np.array([distance, distance + 0.1, 0.0]), np.array([ratio, ratio, ratio]))
+    brighter = fitted_share(np.array([distance]), np.array([min(ratio + 0.1, 1.0)]))
+    assert 0.0 <= share[1] <= share[0] <= brighter[0] <= share[2] == 1.0
+
+
+def test_a_blend_as_fitted_lies_short_of_the_centre_of_light(sky: StarCatalog) -> None:
+    pair = sky.subset(sky.index_of([95947, 95951]))
+    gap = float(np.linalg.norm(pair.vectors[0] - pair.vectors[1]))
+    ratio = flux_ratio(pair.v[1]) / flux_ratio(pair.v[0])
+    merged = blend(pair, gap / 0.8, as_fitted=True)
+    share = (1.0 - (1.0 - math.exp(-0.64)) * (1.0 - (ratio / 0.45) ** 2)) * ratio / (1.0 + ratio)
+    assert float(np.linalg.norm(merged.vectors[0] - pair.vectors[0])) == pytest.approx(share * gap, rel=1e-5)
+    assert merged.v[0] == blend(pair, gap / 0.8).v[0]
 
 
 def test_blend_leaves_no_close_pair_of_leaders_and_no_light_behind(sky: StarCatalog) -> None:

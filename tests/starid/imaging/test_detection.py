@@ -13,6 +13,7 @@ from scipy.special import erf
 
 from starid.errors import StaridError
 from starid.imaging.detection import Detections, DetectionSettings, detect
+from starid.photometry import fitted_share
 
 SIGMA = 0.8
 SKY, NOISE, GAIN = 40.0, 3.0, 2.0
@@ -201,6 +202,33 @@ def test_a_close_pair_is_one_star_at_its_centre_of_light(separation: float) -> N
         assert len(found) == 1
         assert found.xy_px[0] == pytest.approx((50.2 + separation / 3.0, 50.0), abs=0.05)
         assert found.flux[0] == pytest.approx(9000.0 * GAIN, rel=0.06)
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.15])
+@pytest.mark.parametrize("separation", [0.8, 1.3, 1.9])
+def test_a_faint_companion_draws_a_star_as_a_blended_catalogue_expects(
+    ratio: float, separation: float
+) -> None:
+    """Whether the pair is seen to be one or not: the light of the brighter star decides that here."""
+    shape = (60, 60)
+    share = float(fitted_share(np.array([separation / 2.0]), np.array([ratio]))[0])
+    shift = share * separation * ratio / (1.0 + ratio)
+    for flux in (6000.0, 60000.0):
+        light = spot(shape, 30.2, 30.0, flux) + spot(shape, 30.2 + separation, 30.0, ratio * flux)
+        known = DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA)
+        places = np.array([detect(photograph(light, seed), known).xy_px[0] for seed in range(20)])
+        assert places.mean(axis=0) == pytest.approx((30.2 + shift, 30.0), abs=0.015 + 0.15 * shift)
+
+
+def test_a_pair_that_is_hardly_told_apart_has_wider_errors() -> None:
+    shape = (60, 120)
+    known = DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA)
+    light = spot(shape, 30.0, 30.0, 6000.0) + spot(shape, 90.0, 30.0, 6000.0)
+    pair = detect(photograph(light + spot(shape, 32.4, 30.0, 1500.0)), known)
+    assert len(pair) == 3
+    doubtful, alone = np.argsort(pair.xy_px[:2, 0])
+    assert pair.xy_sigma_px[doubtful, 0] > 5.0 * pair.xy_sigma_px[alone, 0]
+    assert pair.xy_sigma_px[doubtful, 1] < 2.0 * pair.xy_sigma_px[alone, 1]
 
 
 def test_a_close_pair_can_be_told_apart() -> None:
