@@ -18,6 +18,7 @@ MODULES: Final[tuple[str, ...]] = (
     "lsi_run_time",
     "memory",
     "fsf",
+    "fsf_limits",
     "fsf_studies",
     "rsi",
     "spherical",
