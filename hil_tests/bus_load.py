@@ -17,6 +17,7 @@ from typing import Final
 
 from hil_tests.errors import BenchError
 from hil_tests.load_figures import CanLoad, Spread
+from hil_tests.realtime import give_realtime
 from protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition, load_icd
@@ -98,12 +99,14 @@ async def _talk_until_told(spec: str, rate: float, pipe: Connection) -> None:
 class OtherTraffic:
     """The process that keeps the bus busy."""
 
-    def __init__(self, spec: str, rate: float) -> None:
+    def __init__(self, spec: str, rate: float, *, realtime: bool = False) -> None:
         self._pipe, far = mp.Pipe()
         self._process = mp.get_context("spawn").Process(target=_talk, args=(spec, rate, far), daemon=True)
         self._process.start()
         far.close()
         self._hear()
+        if realtime and self._process.pid is not None:
+            give_realtime(self._process.pid)
         self._pipe.send("go")
 
     def stop(self) -> tuple[float, int, int, int, int]:
@@ -173,7 +176,9 @@ def _is_right(icd: InterfaceDefinition, reply: Reply, identifier: int) -> bool:
     return True
 
 
-async def load_can(spec: str, seconds: float, rate: float, *, device: int = DEVICE) -> CanLoad:
+async def load_can(
+    spec: str, seconds: float, rate: float, *, device: int = DEVICE, realtime: bool = False
+) -> CanLoad:
     """Ask a device for telemetry while other nodes fill the bus.
 
     Parameters
@@ -186,6 +191,8 @@ async def load_can(spec: str, seconds: float, rate: float, *, device: int = DEVI
         Frames a second of the other traffic.
     device
         CAN address of the device.
+    realtime
+        Give the process of the other traffic real-time priority.
     """
     icd = load_icd()
     transport = open_can(spec)
@@ -196,7 +203,7 @@ async def load_can(spec: str, seconds: float, rate: float, *, device: int = DEVI
         echo.take(frame)
 
     await transport.start(take)
-    traffic = await asyncio.to_thread(OtherTraffic, spec, rate)
+    traffic = await asyncio.to_thread(OtherTraffic, spec, rate, realtime=realtime)
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
     end = time.monotonic() + seconds
     wrong = 0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from itertools import pairwise
+from math import inf
 from statistics import fmean
 from typing import Final
 
@@ -31,6 +33,8 @@ PRODUCER_HEARTBEAT: Final = 0x1017
 TPDO_COMMUNICATION: Final = 0x1800
 DISABLED: Final = 0x8000_0000
 EVERY_SYNC: Final = 1
+EVENT_DRIVEN: Final = 255
+RESET_COMMUNICATION: Final = 130
 OPERATIONAL: Final = 1
 PRE_OPERATIONAL: Final = 128
 SETTLE_S: Final = 0.2
@@ -47,9 +51,9 @@ class _Arrivals:
         if self._wanted(frame):
             self.times.append(time.perf_counter())
 
-    def jitter(self, what: str) -> Jitter:
-        """Sum up the intervals. Raises BenchError if there are too few."""
-        times = self.times[WARM_UP:]
+    def jitter(self, what: str, end: float = inf) -> Jitter:
+        """Sum up the intervals of what came before `end`. Raises BenchError if there are too few."""
+        times = [moment for moment in self.times[WARM_UP:] if moment < end]
         if len(times) < 3:
             raise BenchError(f"jitter of {what}: only {len(self.times)} messages came; is it switched on?")
         intervals = [later - earlier for earlier, later in pairwise(times)]
@@ -149,30 +153,65 @@ class _Node:
             )
         return content
 
+    async def prepare_tpdo(self, transmission: int, event_ms: int) -> int:
+        """Set up the first TPDO, start the node, and return the TPDO's identifier."""
+        self.send(NMT, bytes((PRE_OPERATIONAL, self._node)))
+        identifier = await self.read(TPDO_COMMUNICATION, 1)
+        await self.write(TPDO_COMMUNICATION, 1, identifier | DISABLED, 4)
+        await self.write(TPDO_COMMUNICATION, 2, transmission, 1)
+        await self.write(TPDO_COMMUNICATION, 5, event_ms, 2)
+        await self.write(TPDO_COMMUNICATION, 1, identifier & ~DISABLED, 4)
+        self.send(NMT, bytes((OPERATIONAL, self._node)))
+        return identifier & MAX_STANDARD_ID
+
     def send(self, identifier: int, data: bytes = b"") -> None:
         """Send a frame with an 11-bit identifier."""
         self._transport.send(CanFrame(identifier, data, extended=False))
 
 
-async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
-    """Set a node's heartbeat period and measure the intervals."""
-    arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
+@asynccontextmanager
+async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> AsyncIterator[_Node]:
+    """Join the bus as master of a node, which is back at its stored settings afterwards."""
     transport = open_can(spec)
     master = _Node(transport, node)
 
-    def take(frame: CanFrame) -> None:
-        arrivals.take(frame)
+    def receive(frame: CanFrame) -> None:
+        take(frame)
         master.take(frame)
 
-    await transport.start(take)
+    await transport.start(receive)
     try:
+        yield master
+        master.send(NMT, bytes((RESET_COMMUNICATION, node)))
+        await transport.drain()
+        await asyncio.sleep(SETTLE_S)
+    finally:
+        await transport.close()
+
+
+async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
+    """Set a node's heartbeat period and measure the intervals."""
+    arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
+    async with _joined(spec, node, arrivals.take) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
         arrivals.times.clear()
         await asyncio.sleep(seconds)
+        end = time.perf_counter()
+    return arrivals.jitter(f"heartbeat every {period_ms} ms", end)
+
+
+async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
+    """Have a node send its first TPDO by the event timer, and measure the intervals."""
+    pdo = -1
+    arrivals = _Arrivals(lambda frame: frame.id == pdo and not frame.extended)
+    async with _joined(spec, node, arrivals.take) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, 0, 2)
-    finally:
-        await transport.close()
-    return arrivals.jitter(f"heartbeat every {period_ms} ms")
+        pdo = await master.prepare_tpdo(EVENT_DRIVEN, period_ms)
+        await asyncio.sleep(SETTLE_S)
+        arrivals.times.clear()
+        await asyncio.sleep(seconds)
+        end = time.perf_counter()
+    return arrivals.jitter(f"TPDO by event timer every {period_ms} ms", end)
 
 
 async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> Jitter:
@@ -183,26 +222,16 @@ async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) 
     delays: list[float] = []
     sent_at: float | None = None
     pdo = -1
-    transport = open_can(spec)
-    master = _Node(transport, node)
 
     def take(frame: CanFrame) -> None:
         nonlocal sent_at
-        master.take(frame)
         if sent_at is not None and frame.id == pdo and not frame.extended:
             delays.append(time.perf_counter() - sent_at)
             sent_at = None
 
-    await transport.start(take)
     syncs = 0
-    try:
-        master.send(NMT, bytes((PRE_OPERATIONAL, node)))
-        identifier = await master.read(TPDO_COMMUNICATION, 1)
-        await master.write(TPDO_COMMUNICATION, 1, identifier | DISABLED, 4)
-        await master.write(TPDO_COMMUNICATION, 2, EVERY_SYNC, 1)
-        await master.write(TPDO_COMMUNICATION, 1, identifier & ~DISABLED, 4)
-        pdo = identifier & MAX_STANDARD_ID
-        master.send(NMT, bytes((OPERATIONAL, node)))
+    async with _joined(spec, node, take) as master:
+        pdo = await master.prepare_tpdo(EVERY_SYNC, 0)
         await asyncio.sleep(SETTLE_S)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -210,8 +239,6 @@ async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) 
             master.send(SYNC)
             syncs += 1
             await asyncio.sleep(period_s)
-    finally:
-        await transport.close()
     if len(delays) < syncs:
         raise BenchError(
             f"jitter: {syncs - len(delays)} of {syncs} SYNCs were followed by no PDO of node {node}"

@@ -18,6 +18,8 @@ from protocol.serial_framing import Dialect, HostReceiver, encode_request
 from protocol.transports import SerialTransport, open_serial
 
 REPLY_WITHIN_S: Final = 1.0
+MAPS_BETWEEN_STARS: Final = (6, 6, 6, 7)
+"""Long telecommands after each long telemetry: with these, as many bytes go out as come in."""
 PIPELINE: Final = 60
 """Exchanges under way at once, so that both directions of the line stay busy."""
 
@@ -29,10 +31,10 @@ class _SerialPipeline:
         stars = icd.telemetry["identified_stars"]
         hole_map = icd.telecommands["set_hole_map_1"]
         self._receiver = HostReceiver(dialect)
-        self._cycle = [(Request.of(stars.id), stars.size)]
-        self._cycle += [
-            (Request.of(hole_map.id, bytes((value,)) * MAP_PART_SIZE), 0) for value in range(1, 6)
-        ]
+        maps = [(Request.of(hole_map.id, bytes((value,)) * MAP_PART_SIZE), 0) for value in range(1, 8)]
+        self._cycle = []
+        for count in MAPS_BETWEEN_STARS:
+            self._cycle += [(Request.of(stars.id), stars.size), *maps[:count]]
         self._next = 0
         self._under_way: deque[tuple[Request, int]] = deque()
         self.answered = asyncio.Event()

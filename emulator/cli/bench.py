@@ -144,13 +144,19 @@ def bus(
     rate: Annotated[float, typer.Option(min=0.0, help="Frames a second of other nodes on CAN.")] = 7000.0,
     baud: Annotated[int, typer.Option(min=1200, help="Serial bit rate.")] = 921_600,
     p99_limit_ms: Annotated[
-        float, typer.Option(help="Most that CAN replies may be later than a process that only answers.")
+        float, typer.Option(help="Latency of CAN replies that 99 % of them must keep, milliseconds.")
     ] = 5.0,
     can: Annotated[str | None, typer.Option(help="CAN of a running device, e.g. vcan0.")] = None,
     serial: Annotated[str | None, typer.Option(help="Serial port of a running device.")] = None,
     canopen: Annotated[int | None, typer.Option(help="CANopen node of a running device.")] = None,
     device_address: Annotated[int, typer.Option(help="CAN address of the device.")] = 4,
     dialect: Annotated[str, typer.Option(help="Serial dialect of the device.")] = "b",
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime", help="Measure with real-time priority, so that other work does not count (as root)."
+        ),
+    ] = False,
     json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Load the links of a device to the full and measure what is lost, wrong, late or irregular.
@@ -165,6 +171,7 @@ def bus(
 
     from emulator.cli.bench_bus import Target, measure, own_device, print_figures
     from emulator.errors import EmulatorError
+    from hil_tests.realtime import give_realtime
     from protocol.serial_framing import Dialect
 
     if dialect not in set(Dialect):
@@ -172,8 +179,10 @@ def bus(
     progress = Console(stderr=True)
     given = Target(can, serial, canopen, device_address, baud, Dialect(dialect))
     own = can is None and serial is None
-    with own_device(baud, progress.print) if own else nullcontext(given) as target:
-        figures = measure(target, seconds, rate, progress.print)
+    with own_device(baud, realtime, progress.print) if own else nullcontext(given) as target:
+        if realtime and not own:
+            give_realtime()
+        figures = measure(target, seconds, rate, progress.print, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if json_out:
         print(json.dumps({**figures.as_dict(), "good": good}))

@@ -181,8 +181,13 @@ class TransmitPdo:
     def tick(self) -> None:
         """Send what is due by event or timer."""
         deadline = self.next_deadline
-        if deadline is not None and self._context.now >= deadline:
-            self._send()
+        if deadline is None or self._context.now < deadline:
+            return
+        due = None if self._event else self._event_at
+        self._send()
+        period = self.records.event_s
+        if due is not None and period and due + period > self._context.now:
+            self._event_at = due + period  # that it was sent a little late does not shift the next one
 
     def _restart_timer(self) -> None:
         period = self.records.event_s

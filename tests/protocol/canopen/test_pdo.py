@@ -146,6 +146,21 @@ def test_event_timer(quiet):
     assert [round(time - start, 6) for time, _, _ in quiet.advance(0.12)] == [0.35]
 
 
+def test_lateness_of_the_event_timer_does_not_add_up(quiet):
+    configure_tpdo(quiet, event_ms=100)
+    quiet.operational()
+    start, times = quiet.now, []
+    for late in (0.003, 0.001, 0.002):
+        quiet.now = quiet.slave.next_deadline() + late
+        times += [quiet.now - start for _ in quiet.slave.tick(quiet.now)]
+    assert times == pytest.approx([0.103, 0.201, 0.302])
+    quiet.now = (
+        quiet.slave.next_deadline() + 0.5
+    )  # whole periods too late: those in between are not made up for
+    assert len(quiet.slave.tick(quiet.now)) == 1
+    assert quiet.slave.next_deadline() == pytest.approx(quiet.now + 0.1)
+
+
 def test_event_timer_waits_for_the_inhibit_time(quiet):
     configure_tpdo(quiet, event_ms=10, inhibit=250)
     quiet.operational()
