@@ -57,7 +57,7 @@ def _write(path: Path, text: str) -> None:
         fresh.replace(path)
     except OSError as error:
         fresh.unlink(missing_ok=True)
-        raise EmulatorError(f"{path}: cannot write: {error.strerror}") from None
+        raise EmulatorError(f"{path}: cannot write: {error.strerror}; choose another file with -o") from None
 
 
 @group.command("list")

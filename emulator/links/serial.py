@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from emulator.device.device import Device
 from emulator.links.base import DeviceLink
 from protocol.messages import Reply
 from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
-from protocol.transports.base import Transport
+
+if TYPE_CHECKING:
+    from protocol.transports.serial import SerialTransport
 
 JUNK_BYTES: Final = 8
 
@@ -34,10 +36,28 @@ class SerialPieces:
 
 
 class SerialLink(DeviceLink[bytes, Dialect]):
-    """Binds a device to a serial transport; unsolicited telemetry goes out in dialect c only."""
+    """Binds a device to a serial transport, at the bit rate of its parameter `serial_baud`.
 
-    def __init__(self, device: Device, transport: Transport[bytes], seed: int = 0) -> None:
+    Unsolicited telemetry goes out in dialect c only.
+    """
+
+    def __init__(self, device: Device, transport: SerialTransport, seed: int = 0) -> None:
         super().__init__(device, transport, SerialPieces(), seed)
+        self._port = transport
+        self._baud = self._wanted_baud()
+        device.parameters.observe(self._parameters_changed)
+
+    def _wanted_baud(self) -> int:
+        return int(self._device.parameters["serial_baud"])
+
+    def _parameters_changed(self, names: frozenset[str]) -> None:
+        if "serial_baud" in names:  # the acknowledge is still to be sent, at the old rate
+            self._loop.call_soon(self._change_rate)
+
+    def _change_rate(self) -> None:
+        if self._baud != self._wanted_baud():
+            self._baud = self._wanted_baud()
+            self._port.set_baud(self._baud)
 
     def _new_receiver(self) -> DeviceReceiver:
         return DeviceReceiver()

@@ -37,7 +37,7 @@ class PacedWriter:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._write = write
-        self._schedule = schedule
+        self.schedule = schedule
         self._statistics = statistics
         self._queue: deque[tuple[float, bytes]] = deque()
         """Messages with the time at which their first byte begins."""
@@ -47,6 +47,7 @@ class PacedWriter:
         self._timer: asyncio.TimerHandle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
+        self._then: Callable[[], None] | None = None
 
     @property
     def backlog(self) -> int:
@@ -60,8 +61,8 @@ class PacedWriter:
             return False
         if data:
             begin = self._loop.time()
-            if self._schedule is not None:
-                begin, _ = self._schedule.reserve(begin, len(data))
+            if self.schedule is not None:
+                begin, _ = self.schedule.reserve(begin, len(data))
             self._queue.append((begin, data))
             self._backlog += len(data)
             self._idle.clear()
@@ -73,6 +74,19 @@ class PacedWriter:
         """Wait until nothing is waiting."""
         await self._idle.wait()
 
+    def when_idle(self, action: Callable[[], None]) -> None:
+        """Do this as soon as nothing is waiting; what was to be done then is forgotten."""
+        self._then = action
+        if self._idle.is_set():
+            self._rest()
+
+    def _rest(self) -> None:
+        """Note that nothing is waiting."""
+        self._idle.set()
+        action, self._then = self._then, None
+        if action is not None:
+            action()
+
     def clear(self) -> None:
         """Drop what is waiting."""
         self._statistics.dropped += self._backlog
@@ -81,7 +95,7 @@ class PacedWriter:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._idle.set()
+        self._rest()
 
     def _work(self) -> None:
         """Write what is due, and come back when more is."""
@@ -100,14 +114,14 @@ class PacedWriter:
         if self._queue:
             self._timer = self._loop.call_at(max(next_time, now), self._work)
         else:
-            self._idle.set()
+            self._rest()
 
     def _due(self, now: float) -> tuple[bytes, float]:
         """Return the bytes whose stop bit has passed by `now`, and when to look again."""
-        if self._schedule is None:
+        if self.schedule is None:
             whole = b"".join(data for _, data in self._queue)
             return whole[self._gone :], now
-        byte_s = self._schedule.seconds_per_byte
+        byte_s = self.schedule.seconds_per_byte
         pieces: list[bytes] = []
         gone = self._gone
         for begin, data in self._queue:

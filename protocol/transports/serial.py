@@ -9,6 +9,7 @@ import os
 import select
 import tty
 from abc import abstractmethod
+from functools import partial
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -21,8 +22,17 @@ from protocol.transports.paced_writer import PacedWriter
 
 READ_SIZE: Final = 65536
 DEFAULT_BAUD: Final = 115200
+RATE_RETRY_S: Final = 0.002
+"""Time until the next look whether the kernel has sent all, before the bit rate changes."""
 
-SerialTransport = Transport[bytes]
+
+class SerialTransport(Transport[bytes]):
+    """A serial port."""
+
+    @abstractmethod
+    def set_baud(self, baud: int) -> None:
+        """Go on at another bit rate as soon as all that was queued has left."""
+
 
 
 def open_serial(
@@ -77,13 +87,26 @@ def _host_and_port(spec: str) -> tuple[str, int]:
     return host, port
 
 
-class _PacedTransport(Transport[bytes]):
+class _PacedTransport(SerialTransport):
     """Common part: the paced writer in front of the port."""
 
     def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
         super().__init__(description)
         self._schedule = schedule
         self._writer: PacedWriter | None = None
+
+    def set_baud(self, baud: int) -> None:
+        if self._writer is None:
+            self._change_rate(baud)
+        else:
+            self._writer.when_idle(partial(self._change_rate, baud))
+
+    def _change_rate(self, baud: int) -> None:
+        """Take another bit rate into use; nothing is queued."""
+        if self._schedule is not None:
+            self._schedule = PacingSchedule(baud)
+            if self._writer is not None:
+                self._writer.schedule = self._schedule
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
@@ -223,7 +246,9 @@ class TtyTransport(_ReturningSerial):
     async def _attach(self) -> None:
         path = Path(self._path)
         if path.exists() and not path.is_char_device():
-            raise TransportError(f"serial {self._path}: is no tty")
+            raise TransportError(
+                f"serial {self._path}: is no tty; name a serial port such as /dev/ttyUSB0, or auto for a pseudo-terminal"
+            )
         try:
             self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:
@@ -244,6 +269,21 @@ class TtyTransport(_ReturningSerial):
             self._take(data)
         elif _hung_up(self._port.fileno()):
             self._lost("hung up")
+
+    def _change_rate(self, baud: int) -> None:
+        if self._port is not None:
+            if self._port.out_waiting:  # the kernel's buffer still leaves at the old rate
+                asyncio.get_running_loop().call_later(RATE_RETRY_S, self.set_baud, baud)
+                return
+            try:
+                self._port.baudrate = baud
+            except (OSError, ValueError):
+                self._complain(
+                    f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} is kept"
+                )
+                return
+        self._baud = baud
+        super()._change_rate(baud)
 
     def _write(self, data: bytes) -> int:
         if self._port is None:

@@ -40,6 +40,9 @@ class Wire(Transport):
     def arrive(self, item) -> None:
         self._receive(item)
 
+    def set_baud(self, baud: int) -> None:
+        self.sent.append(baud)
+
     def take(self) -> list:
         sent, self.sent = self.sent, []
         return sent
@@ -92,6 +95,20 @@ def test_serial_answers_in_each_dialect(bench, dialect):
         assert (reply.kind, reply.id) == (ReplyKind.ACK, 96)
         (reply,) = linked.over_serial(96, b"\x09")
         assert (reply.kind, reply.code) == (ReplyKind.NACK, ErrorCode.INVALID_PARAMETER)
+
+    in_loop(scenario())
+
+
+def test_the_answer_to_a_change_of_the_bit_rate_goes_out_at_the_old_one(bench):
+    async def scenario():
+        linked = await Linked(bench).start()
+        number = bench.icd.parameters["serial_baud"].id
+        for baud in (57600, 57600, 115200):
+            value = bench.icd.telecommands["set_parameter"].encode({"parameter": number, "value": baud})
+            linked.uart.arrive(encode_request(Request.of(98, value)))
+            await asyncio.sleep(0)
+        acknowledge = b"\x1f\x7f\x00\x1f\xff"
+        assert linked.uart.take() == [acknowledge, 57600, acknowledge, acknowledge, 115200]
 
     in_loop(scenario())
 

@@ -1,0 +1,139 @@
+"""The CAN bus over TCP from its clients' side: a hub that goes, hangs, comes back, or is none."""
+
+from __future__ import annotations
+
+import asyncio
+
+import can
+import pytest
+
+from protocol.can_framing import CanFrame
+from protocol.hub import CanHub
+from protocol.transports import TransportError, open_can
+from protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
+from tests.protocol.transports.pairs import FRAMES, HAS_VCAN, CanPair, bare, until
+
+
+def test_a_hub_that_goes_and_comes_back_is_found_again() -> None:
+    async def main() -> None:
+        hub = CanHub(port=0)
+        await hub.start()
+        pair = CanPair(*(open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0") for _ in range(2)))
+        await pair.start()
+        await hub.close()
+        await until(lambda: len(pair.errors) == 2)
+        assert "lost" in str(pair.errors[0])
+        assert not pair.one.send(FRAMES[0])
+        again = CanHub(port=hub.port)
+        await again.start()
+        await until(lambda: pair.one.statistics.reconnects == pair.two.statistics.reconnects == 1)
+        pair.one.send(FRAMES[0])
+        await until(lambda: pair.got_two == FRAMES[:1])
+        assert len(pair.errors) == 2
+        await pair.one.close()
+        await pair.two.close()
+        await again.close()
+
+    asyncio.run(main())
+
+
+def test_a_hub_that_stops_reading_neither_blocks_nor_fills_memory() -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"< hi >")
+        for _ in range(3):
+            await reader.readuntil(b">")
+            writer.write(b"< ok >")
+        await asyncio.Event().wait()
+
+    async def main() -> None:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0, limit=64)
+        transport = open_can(f"socketcand:127.0.0.1:{server.sockets[0].getsockname()[1]}/vcan0")
+        await transport.start(lambda _: None)
+        for number in range(1_000_000):
+            if not transport.send(FRAMES[0]):
+                break
+            if number % 500 == 0:
+                await asyncio.sleep(0)
+        assert transport.statistics.dropped == 1
+        assert transport._connection.transport.get_write_buffer_size() < HUB_BACKLOG + 100_000  # type: ignore[attr-defined]
+        await transport.close()
+        server.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
+def test_auto_starts_a_hub_joins_it_and_takes_over_when_its_owner_leaves() -> None:
+    async def main() -> None:
+        probe = CanHub(port=0)
+        await probe.start()
+        port = probe.port
+        await probe.close()
+        one, two, three = (open_can("auto", hub_port=port) for _ in range(3))
+        got: list[CanFrame] = []
+        await one.start(lambda _: None)
+        await two.start(lambda _: None)
+        await three.start(lambda frame: got.append(bare(frame)))
+        assert one.description == two.description == f"socketcand:127.0.0.1:{port}/vcan0"
+        await one.close()
+        await until(lambda: two.statistics.reconnects == three.statistics.reconnects == 1)
+        two.send(FRAMES[0])
+        await until(lambda: got == FRAMES[:1])
+        await two.close()
+        await three.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
+def test_auto_with_port_0_is_a_bus_of_its_own() -> None:
+    async def main() -> None:
+        one, two = open_can("auto", hub_port=0), open_can("auto", hub_port=0)
+        await one.start(lambda _: None)
+        await two.start(lambda _: None)
+        assert one.description != two.description
+        await one.close()
+        await two.close()
+
+    asyncio.run(main())
+
+
+def test_python_can_joins_the_bus_that_auto_made() -> None:
+    def send(description: str) -> None:
+        address, _, bus_name = description.removeprefix("socketcand:").partition("/")
+        host, _, port = address.rpartition(":")
+        with can.Bus(interface="socketcand", host=host, port=int(port), channel=bus_name) as bus:
+            bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\x1f"))
+
+    async def main() -> None:
+        hub = CanHub(port=0)
+        await hub.start()
+        transport = open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0")
+        got: list[CanFrame] = []
+        await transport.start(lambda frame: got.append(bare(frame)))
+        await asyncio.to_thread(send, transport.description)
+        await until(lambda: got == [FRAMES[1]])
+        await transport.close()
+        await hub.close()
+
+    asyncio.run(main())
+
+
+async def _wrong_server(greeting: bytes) -> asyncio.Server:
+    async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(greeting)
+        await writer.drain()
+        writer.close()
+
+    return await asyncio.start_server(serve, "127.0.0.1", 0)
+
+
+@pytest.mark.parametrize("greeting", [b"SSH-2.0-OpenSSH", b"< error busy >", b"", b"< hi >"])
+def test_a_server_that_is_no_socketcand_is_told(greeting: bytes) -> None:
+    async def main() -> None:
+        async with await _wrong_server(greeting) as server:
+            port = server.sockets[0].getsockname()[1]
+            with pytest.raises(TransportError, match="is this a socketcand server"):
+                await open_can(f"socketcand:127.0.0.1:{port}/vcan0").start(lambda _: None)
+
+    asyncio.run(main())

@@ -1,0 +1,296 @@
+"""Serial ports: one behaviour suite over every kind, and their failures."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import tty
+from pathlib import Path
+
+import pytest
+import serial
+
+from protocol.errors import ProtocolError
+from protocol.transports import TransportError, open_serial
+from protocol.transports.paced_writer import BACKLOG_LIMIT
+from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
+
+
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
+def test_bytes_of_every_value_pass_both_ways(kind: str, tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serial_pair(kind, tmp_path) as pair:
+            data = bytes(range(256)) * 8
+            assert pair.one.send(data)
+            assert pair.two.send(data[::-1])
+            await until(lambda: len(pair.got_one) >= len(data) and len(pair.got_two) >= len(data))
+            assert bytes(pair.got_two) == data
+            assert bytes(pair.got_one) == data[::-1]
+            assert pair.one.statistics.sent == pair.two.statistics.received == len(data)
+            assert not pair.errors
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
+def test_bytes_leave_no_faster_than_the_bit_rate(kind: str, tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serial_pair(kind, tmp_path, baud=115200) as pair:
+            loop = asyncio.get_running_loop()
+            received_at: list[tuple[float, int]] = []
+            pair.two._on_receive = lambda data: (
+                pair.got_two.extend(data),
+                received_at.append((loop.time(), len(pair.got_two))),
+            )  # type: ignore[assignment]
+            begin = loop.time()
+            pair.one.send(bytes(576))
+            pair.one.send(bytes(576))
+            await until(lambda: len(pair.got_two) == 1152)
+            for moment, count in received_at:
+                assert moment - begin >= count * 10 / 115200 - 1e-6
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
+def test_a_peer_that_does_not_read_neither_blocks_nor_fills_memory(kind: str, tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serial_pair(kind, tmp_path, baud=4_000_000) as pair:
+            if kind == "pty and tty":
+                asyncio.get_running_loop().remove_reader(pair.two._port.fileno())  # type: ignore[attr-defined]
+            else:
+                pair.two._stream.pause_reading()  # type: ignore[attr-defined]
+            refused = 0
+            while refused < 3:
+                refused += not pair.one.send(bytes(1024))
+                if pair.one.statistics.sent > 50_000_000:
+                    pytest.fail("the peer's buffers never fill")
+                await asyncio.sleep(0)
+            assert pair.one.statistics.dropped == 3 * 1024
+            assert pair.one._writer.backlog <= BACKLOG_LIMIT  # type: ignore[attr-defined]
+            pair.two.send(b"still alive")
+            await until(lambda: bytes(pair.got_one) == b"still alive")
+
+    asyncio.run(main())
+
+
+def test_a_vanished_port_is_told_once_and_comes_back_by_itself(tmp_path: Path) -> None:
+    async def main() -> None:
+        link = tmp_path / "tty"
+        async with serial_pair("pty and tty", tmp_path) as pair:
+            await pair.one.close()
+            await until(lambda: bool(pair.errors))
+            assert str(pair.errors[0]).startswith(f"serial {link}: lost: ")
+            assert not pair.two.send(b"into the void")
+            assert pair.two.statistics.dropped == len(b"into the void")
+            again = open_serial("pty", symlink=link)
+            got = bytearray()
+            await again.start(got.extend)
+            await until(lambda: pair.two.statistics.reconnects == 1)
+            pair.two.send(b"hello again")
+            await until(lambda: bytes(got) == b"hello again")
+            assert len(pair.errors) == 1
+            await again.close()
+
+    asyncio.run(main())
+
+
+def test_a_lost_connection_comes_back_by_itself() -> None:
+    async def main() -> None:
+        one = open_serial("listen://127.0.0.1:0")
+        await one.start(lambda _: None)
+        port = int(one.description.rpartition(":")[2])
+        two = open_serial(one.description)
+        errors: list[ProtocolError] = []
+        await two.start(lambda _: None, errors.append)
+        await one.close()
+        await until(lambda: bool(errors))
+        again = open_serial(f"listen://127.0.0.1:{port}")
+        got = bytearray()
+        await again.start(got.extend)
+        await until(lambda: two.statistics.reconnects == 1)
+        two.send(b"back")
+        await until(lambda: bytes(got) == b"back")
+        await two.close()
+        await again.close()
+
+    asyncio.run(main())
+
+
+def test_a_listening_port_serves_one_peer_at_a_time_and_the_next_after_it() -> None:
+    async def main() -> None:
+        one = open_serial("listen://127.0.0.1:0")
+        got = bytearray()
+        await one.start(got.extend)
+        host, _, port = one.description.removeprefix("socket://").rpartition(":")
+        _, first = await asyncio.open_connection(host, int(port))
+        first.write(b"first")
+        await until(lambda: bytes(got) == b"first")
+        reader, _ = await asyncio.open_connection(host, int(port))
+        assert await reader.read() == b""
+        first.close()
+        for _ in range(100):
+            reader, third = await asyncio.open_connection(host, int(port))
+            third.write(b"third")
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(until(lambda: got.endswith(b"third")), 0.2)
+            if got.endswith(b"third"):
+                break
+        one.send(b"reply")
+        assert await asyncio.wait_for(reader.readexactly(5), DEADLINE_S) == b"reply"
+        third.close()
+        await one.close()
+
+    asyncio.run(main())
+
+
+def test_pyserial_opens_our_pseudo_terminal_and_our_socket(tmp_path: Path) -> None:
+    def echo(url: str) -> bytes:
+        with serial.serial_for_url(url, 115200, timeout=DEADLINE_S) as port:
+            port.write(b"\x1f\x7f\x80\x1f\xff")
+            return bytes(port.read(5))
+
+    async def main() -> None:
+        for spec, link in (("pty", tmp_path / "star"), ("listen://127.0.0.1:0", None)):
+            transport = open_serial(spec, symlink=link)
+            await transport.start(transport.send)
+            assert await asyncio.to_thread(echo, transport.description) == b"\x1f\x7f\x80\x1f\xff"
+            await transport.close()
+
+    asyncio.run(main())
+
+
+def test_the_symlink_replaces_a_stale_one_and_goes_at_close(tmp_path: Path) -> None:
+    async def main() -> None:
+        link = tmp_path / "tty"
+        link.symlink_to("/nowhere")
+        transport = open_serial("auto", symlink=link)
+        await transport.start(lambda _: None)
+        assert os.path.realpath(link).startswith("/dev/pts/")
+        assert transport.description == str(link)
+        await transport.close()
+        await transport.close()
+        assert list(tmp_path.iterdir()) == []
+
+    asyncio.run(main())
+
+
+def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
+    async def main() -> None:
+        link = tmp_path / "tty"
+        one, two = open_serial("pty", symlink=link), open_serial("pty", symlink=link)
+        await one.start(lambda _: None)
+        await two.start(lambda _: None)
+        await one.close()
+        assert link.is_symlink()
+        await two.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("/dev/does-not-exist", "no such port"),
+        ("/etc/passwd", "is no tty"),
+        ("/dev/null", "cannot open"),
+        ("socket://127.0.0.1:1", "cannot connect"),
+        ("socket://127.0.0.1", "must be socket://HOST:PORT"),
+        ("listen://127.0.0.1:x", "must be listen://HOST:PORT"),
+        ("rfc2217://host:1", "must be auto, a tty's path"),
+    ],
+)
+def test_ports_that_cannot_be_had_are_told_in_one_line(spec: str, message: str) -> None:
+    async def main() -> None:
+        with pytest.raises(TransportError, match=message) as caught:
+            await open_serial(spec).start(lambda _: None)
+        assert str(caught.value).startswith(f"serial {spec}")
+        assert "\n" not in str(caught.value)
+
+    asyncio.run(main())
+
+
+def test_a_busy_port_is_told() -> None:
+    async def main() -> None:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        path = os.ttyname(slave)
+        with serial.Serial(path, exclusive=True), pytest.raises(TransportError, match="busy"):
+            await open_serial(path).start(lambda _: None)
+        os.close(slave)
+        os.close(master)
+
+    asyncio.run(main())
+
+
+def test_a_file_in_the_symlinks_place_is_not_overwritten(tmp_path: Path) -> None:
+    async def main() -> None:
+        link = tmp_path / "precious"
+        link.write_text("data")
+        transport = open_serial("pty", symlink=link)
+        with pytest.raises(TransportError, match="is no symlink"):
+            await transport.start(lambda _: None)
+        await transport.close()
+        assert link.read_text() == "data"
+
+    asyncio.run(main())
+
+
+def test_closing_twice_or_unopened_is_harmless(tmp_path: Path) -> None:
+    async def main() -> None:
+        for transport in (
+            open_serial("pty", symlink=tmp_path / "t"),
+            open_serial("listen://127.0.0.1:0"),
+            open_serial("/dev/nope"),
+        ):
+            await transport.close()
+            await transport.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
+def test_a_new_bit_rate_begins_when_all_before_it_has_left(kind: str, tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serial_pair(kind, tmp_path, baud=19200) as pair:
+            loop = asyncio.get_running_loop()
+            begin = loop.time()
+            pair.one.send(bytes(192))
+            pair.one.set_baud(9600)
+            await pair.one.drain()
+            assert loop.time() - begin >= 0.1 - 1e-6
+            begin = loop.time()
+            pair.one.send(bytes(96))
+            await pair.one.drain()
+            assert loop.time() - begin >= 0.1 - 1e-6
+            await until(lambda: len(pair.got_two) == 288)
+
+    asyncio.run(main())
+
+
+def test_a_tty_takes_another_bit_rate_and_keeps_it_when_it_comes_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
+            pair.two.send(b"before")
+            pair.two.set_baud(115200)
+            await until(lambda: pair.two._port.baudrate == 115200)  # type: ignore[attr-defined]
+            assert bytes(pair.got_one) == b"before"
+            pair.two._lost("pulled")  # type: ignore[attr-defined]
+            await until(lambda: pair.two.statistics.reconnects == 1)
+            assert pair.two._port.baudrate == 115200  # type: ignore[attr-defined]
+            assert len(pair.errors) == 1
+
+    asyncio.run(main())
+
+
+def test_a_bit_rate_that_a_tty_cannot_have_is_told_and_the_old_one_kept(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
+            pair.two.set_baud(-1)
+            await until(lambda: bool(pair.errors))
+            assert "bit rate -1 is not possible here; 19200 is kept" in str(pair.errors[0])
+            pair.two.send(b"alive")
+            await until(lambda: bytes(pair.got_one) == b"alive")
+
+    asyncio.run(main())
