@@ -45,7 +45,7 @@ def command(
     profile: Annotated[
         str | None,
         typer.Option(
-            help="Picture of the device of this profile: camera, sensor, exposure, gain, catalogue and [sky]."
+            help="Picture of the device of this profile: camera, sensor, exposure, gain, catalogue and sky."
         ),
     ] = None,
     as_annotated: Annotated[

@@ -7,6 +7,7 @@ as such is set aside under another name, reported, and the device starts from it
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import json
@@ -116,6 +117,8 @@ class FileStore:
             finally:
                 os.close(folder)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
             raise EmulatorError(
                 f"state file {self.path}: cannot be written ({error.strerror}); the state before it is kept"
             ) from None

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
+import logging
+import os
+import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +17,8 @@ from emulator.clock import NANOSECONDS
 from emulator.device.cycle import Measurement, as_quaternion
 from emulator.errors import EmulatorError
 from starid.attitude import Attitude
+
+log = logging.getLogger("starhil.truth")
 
 COLUMNS: Final = (
     "frame", "time_of_exposure_s", "run_time_s", "mode", "valid", "reason",
@@ -71,33 +78,65 @@ def compare(measurement: Measurement) -> dict[str, Any]:
 
 
 class TruthLog:
-    """A CSV file that gets a row a frame, each on the disk before the next.
+    """A CSV file that gets a row a frame, each in the file before the next, and never half a row.
+
+    When no more can be written, a full disk say, the log is told so once, the file ends with the last whole row and the
+    run goes on.
 
     Raises
     ------
     EmulatorError
-        The file cannot be written.
+        The file cannot be made.
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
+        self._whole = 0
         try:
-            self._file = path.open("w", encoding="utf-8", newline="")
+            self._file: io.FileIO | None = path.open("wb", buffering=0)
+            self._add(COLUMNS)
         except OSError as error:
             raise EmulatorError(
                 f"truth log {path}: cannot be written ({error.strerror}); choose another file"
             ) from None
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(COLUMNS)
-        self._file.flush()
 
     def write(self, measurement: Measurement) -> None:
         """Add a frame."""
-        self._writer.writerow([_cell(name, value) for name, value in compare(measurement).items()])
-        self._file.flush()
+        if self._file is None:
+            return
+        try:
+            self._add([_cell(name, value) for name, value in compare(measurement).items()])
+        except OSError as error:
+            log.warning(
+                "truth log %s: cannot be written (%s); it ends before frame %d, the run goes on",
+                self._path,
+                error.strerror,
+                measurement.counter,
+            )
+            self.close()
+
+    def _add(self, cells: Iterable[str]) -> None:
+        """Write a row, or none of it."""
+        if self._file is None:
+            return
+        text = io.StringIO()
+        csv.writer(text).writerow(cells)
+        row = memoryview(text.getvalue().encode())
+        size = len(row)
+        try:
+            while row:
+                row = row[self._file.write(row) :]
+        except OSError:
+            if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+                self._file.truncate(self._whole)
+            raise
+        self._whole += size
 
     def close(self) -> None:
         """End the file."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 def _cell(name: str, value: Any) -> str:

@@ -1,7 +1,9 @@
 """A whole run in one process, with a pipeline that makes no pictures: control channel, feeds, files, pumps."""
 
 import asyncio
+import csv
 import json
+import resource
 
 import pytest
 
@@ -284,6 +286,31 @@ def test_the_truth_log_has_a_row_a_frame(run, tmp_path):
     assert float(records[0]["cross_boresight_arcsec"]) < 1e-3
     assert records[-1]["measured_qx"] == ""
     assert records[-1]["reason"] == "no_match"
+
+
+def test_a_truth_log_on_a_full_disk_ends_with_a_whole_row_and_the_run_goes_on(run, tmp_path, caplog):
+    path = tmp_path / "truth.csv"
+    room = len(",".join(COLUMNS)) + 700  # the head, a frame, and a part of the next
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+        await emulation.stepper.step(6.0)
+        return emulation.device.cycle.published
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+    try:
+        frames = run(scenario, options=RunOptions(truth_log=path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    assert 1 < len(rows) < frames
+    assert {len(row) for row in rows} == {len(COLUMNS)}
+    (said,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert str(path) in said
+    assert f"it ends before frame {len(rows)}" in said
 
 
 def test_a_truth_log_can_be_replayed(run, tmp_path):

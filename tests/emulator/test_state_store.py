@@ -1,5 +1,6 @@
 import json
 import os
+import resource
 import subprocess
 import sys
 import textwrap
@@ -122,3 +123,18 @@ def test_a_killed_writer_leaves_a_whole_state(tmp_path):
         assert state["boot_count"] >= last
         assert json.dumps(state)
         store.close()
+
+
+def test_a_full_disk_leaves_the_state_before_it_and_nothing_half_written(tmp_path):
+    store = FileStore(tmp_path)
+    store.save({"boot_count": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(EmulatorError, match="the state before it is kept"):
+            store.save({"boot_count": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert store.load() == {"boot_count": 1}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["device.json", "lock"]
+    store.close()
