@@ -40,7 +40,7 @@ def command(
     ] = None,
     log: Annotated[str, typer.Option(help="debug, info, warning or error; to stderr.")] = "warning",
 ) -> None:
-    """Run the emulator until SIGINT or SIGTERM.
+    """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
     One line on stdout, `ready serial=… can=… seed=…`, tells that it takes commands and where.
     """
@@ -88,7 +88,10 @@ def command(
 
         emulation = Emulation(loaded, RunOptions(truth_log, control, scenario), worker=worker)
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        ends = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
+            ends.append(signal.SIGHUP)
+        for number in ends:
             loop.add_signal_handler(number, emulation.ended.set)
         try:
             await emulation.start()

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from typing import Any
 
+from emulator.imaging.parenthood import end_with_parent
 from starid.projection import back_project_kernel
 
 
@@ -26,6 +27,7 @@ def start_helper() -> subprocess.Popen[bytes]:
 
 def main() -> None:
     """Compile the identifier's kernels and leave them in the cache."""
+    end_with_parent()
     from starid.geometric.identifier import Identifier
 
     Identifier().warm_up()

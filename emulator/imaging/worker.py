@@ -10,6 +10,7 @@ import sys
 from typing import Any, Final
 
 from emulator.imaging.frames import LENGTH, Failure
+from emulator.imaging.parenthood import end_with_parent
 
 NICE: Final = 5
 """How much the worker stands back where processors are short: the links of the emulator come first."""
@@ -17,6 +18,8 @@ NICE: Final = 5
 
 def main() -> None:
     """Take the setup, then requests, until the emulator closes the socket."""
+    end_with_parent()  # closing the socket ends it too, but not in the middle of a long compilation
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
     link = socket.socket(fileno=int(sys.argv[1]))

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import tty
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -222,6 +223,30 @@ def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
     names, row = lines[0].split(","), lines[-1].split(",")
     values = dict(zip(names, row, strict=True))
     assert math.isfinite(float(values["cross_boresight_arcsec"]))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_run_in_good_order(tmp_path, number):
+    link = tmp_path / "tty"
+    emulator = Emulator("--symlink", str(link), "--set", "links.serial.dialect=a")
+    assert emulator.end(number) == (0, [])
+    assert not link.is_symlink()
+
+
+def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place(tmp_path):
+    link = tmp_path / "tty"
+    arguments = ("--symlink", str(link), "--state-dir", str(tmp_path), "--set", "links.serial.dialect=a")
+    emulator = Emulator(*arguments)
+    pid = emulator.process.pid
+    (worker,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    code, _ = emulator.end(signal.SIGKILL)  # waits until the worker too has closed its end of the pipes
+    assert code == -signal.SIGKILL
+    status = Path(f"/proc/{worker}/stat")
+    assert not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z"
+    assert link.is_symlink()
+    emulator = Emulator(*arguments)
+    assert emulator.read("boot_status")["boot_count"] == 2
+    assert emulator.end() == (0, [])
 
 
 @pytest.mark.parametrize(
