@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import sys
-from typing import Any, Final, NoReturn
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 
@@ -45,6 +46,12 @@ These modules import at the top only what is quick; numerics come in inside the 
 """
 
 
+def _print_version(value: bool) -> None:
+    if value:
+        print(f"starhil {importlib.metadata.version('starhil')}")
+        raise typer.Exit
+
+
 def build_app() -> typer.Typer:
     """Assemble the command line from the modules named in `COMMANDS`."""
     app = typer.Typer(
@@ -54,6 +61,7 @@ def build_app() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
     )
+    app.callback()(_options)
     for name, module_name in COMMANDS.items():
         module = importlib.import_module(f"emulator.cli.{module_name}")
         if hasattr(module, "group"):
@@ -61,6 +69,14 @@ def build_app() -> typer.Typer:
         else:
             app.command(name)(module.command)
     return app
+
+
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Options of the command itself."""
 
 
 def describe_os_error(error: OSError) -> str:

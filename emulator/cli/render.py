@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from starid.camera import Camera
 
 _NUMBERED_TO_MAGNITUDE = 3.6
+_TURN_DEG = 360.0
+_FASTEST_DEG_S = 1000.0
 
 
 def command(
@@ -62,10 +64,14 @@ def command(
     from starid.imaging.image_io import write_image
 
     for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
-        if not math.isfinite(value):
-            raise EmulatorError(f"--{name} {value}: a finite number of degrees is needed")
+        if not -_TURN_DEG <= value <= _TURN_DEG:
+            raise EmulatorError(f"--{name} {value:g}: degrees from -360 to 360 are needed")
     if not -90.0 <= dec <= 90.0:
         raise EmulatorError(f"--dec {dec}: degrees from -90 to 90 are needed")
+    if not math.hypot(*rate) <= _FASTEST_DEG_S:
+        raise EmulatorError(
+            f"--rate {' '.join(f'{value:g}' for value in rate)}: at most {_FASTEST_DEG_S:g} degrees/s in all are needed"
+        )
     scene = _scene(profile, fov, size, model)
     camera = scene.camera
     changes = {

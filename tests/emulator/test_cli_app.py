@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -109,3 +110,11 @@ def test_no_command_at_all_is_answered_with_the_help(
         app.main()
     assert caught.value.code == 2
     assert "Usage: starhil" in capsys.readouterr().out
+
+
+def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil", "--version"])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    assert caught.value.code == 0
+    assert re.fullmatch(r"starhil \d+\.\d+\.\d+\n", capsys.readouterr().out)

@@ -121,7 +121,7 @@ def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
     ("arguments", "text"),
     [
         (("--dec", "95"), "--dec 95.0: degrees from -90 to 90"),
-        (("--ra", "nan"), "--ra nan: a finite number"),
+        (("--ra", "nan"), "--ra nan: degrees from -360 to 360"),
         (("--bits", "9"), "bits: 9 given, 8, 12 or 16 needed"),
         (("--exposure", "-1"), "exposure_s: -1.0 given"),
         (("--size", "3"), "--size 3: 16 to 8192"),
@@ -129,7 +129,7 @@ def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
         (("--fov", "200"), "fov_deg: 200.0 given"),
         (("--limit", "99"), "limiting_magnitude: 99.0 given"),
         (("--seed", "-3"), "seed: -3 given"),
-        (("--rate", "0", "0", "99999"), "body rate"),
+        (("--rate", "0", "0", "99999"), "--rate 0 0 99999: at most 1000 degrees/s"),
         (("--model", "fish"), "camera model: 'fish'"),
         (("-o", "picture.foo"), "suffix '.foo' given"),
         (("--profile", "nowhere"), "nowhere"),
