@@ -226,7 +226,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        why = explain(error, Profile)
+        why = explain(error, Profile, "extends")
         raise EmulatorError(f"{_culprit(path, overrides, why)}: {why}") from None
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
@@ -248,8 +248,10 @@ def _culprit(path: Path, overrides: Sequence[str], why: str) -> str:
 def _read(path: Path, depth: int) -> dict[str, Any]:
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise EmulatorError(f"profile {path}: cannot be read ({error})") from None
+    except OSError as error:
+        raise EmulatorError(f"profile {path}: cannot be read ({error.strerror}); give a TOML file") from None
+    except UnicodeDecodeError as error:
+        raise EmulatorError(f"profile {path}: not UTF-8 ({error.reason}); give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise EmulatorError(f"profile {path}: not TOML ({error})") from None
     base = values.pop("extends", None)

@@ -86,8 +86,10 @@ def load_scenario(name_or_path: str) -> Scenario:
         raise EmulatorError(
             f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}"
         ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise EmulatorError(f"scenario {path}: cannot be read ({error})") from None
+    except OSError as error:
+        raise EmulatorError(f"scenario {path}: cannot be read ({error.strerror}); give a TOML file") from None
+    except UnicodeDecodeError as error:
+        raise EmulatorError(f"scenario {path}: not UTF-8 ({error.reason}); give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise EmulatorError(f"scenario {path}: not TOML ({error})") from None
     try:

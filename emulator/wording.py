@@ -9,13 +9,21 @@ from typing import Any, Final
 from pydantic import BaseModel, ValidationError
 
 
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """Say in one line where the first fault of a validation is, what it is and what to do."""
+def explain(error: ValidationError, model: type[BaseModel], *also: str) -> str:
+    """Say in one line where the first fault of a validation is, what it is and what to do.
+
+    Parameters
+    ----------
+    error, model
+        What was refused, and by which model.
+    also
+        Keys that may stand at the top beside those of the model.
+    """
     first = error.errors(include_url=False)[0]
     loc = first["loc"]
     where = ".".join(str(part) for part in loc if part not in _TAGS) or "as a whole"
     if first["type"] == "extra_forbidden":
-        known = _keys_at(model, loc[:-1])
+        known = sorted([*_keys_at(model, loc[:-1]), *(also if len(loc) == 1 else ())])
         near = difflib.get_close_matches(str(loc[-1]), known, n=1)
         remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
         return f"{where}: unknown key; {remedy}"

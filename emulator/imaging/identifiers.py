@@ -6,17 +6,27 @@ answers meanwhile.
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 from emulator.errors import EmulatorError
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.interface import StarIdentifier, make_identifier
+from starid.interface import ALGORITHMS, StarIdentifier, make_identifier
+
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "float": (int, float),
+    "int": (int,),
+    "bool": (bool,),
+    "str": (str,),
+}
+"""Word in an annotation → what a profile may give for it."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +59,33 @@ class IdentifierChoice:
             No such option, or no index can be made of these values.
         """
         options = dict(self.options)
+        self._check(options)
         if self.algorithm == "geometric":
             from starid.geometric.identifier import Effort
 
             nominal = Effort()
             options["effort"] = replace(nominal, tolerance_px=nominal.tolerance_px * self.margin)
-        try:
-            return make_identifier(self.algorithm, self.camera, catalog, **options)
-        except TypeError as error:
-            raise EmulatorError(f"identifier {self.algorithm}: {error}") from None
+        return make_identifier(self.algorithm, self.camera, catalog, **options)
+
+    def _check(self, options: dict[str, Any]) -> None:
+        """Refuse an option that the algorithm does not have, or of another type."""
+        module, name = ALGORITHMS[self.algorithm]
+        parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
+        known = {
+            name: str(parameter.annotation)
+            for name, parameter in parameters.items()
+            if any(kind in str(parameter.annotation) for kind in _KINDS)
+        }
+        for option, value in options.items():
+            if option not in known:
+                raise EmulatorError(
+                    f"identifier.{option}: no option of the algorithm {self.algorithm}; known: {', '.join(sorted(known))}"
+                )
+            allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
+            if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
+                raise EmulatorError(
+                    f"identifier.{option}: {value!r} given, {known[option].removesuffix(' | None')} needed"
+                )
 
 
 @dataclass(frozen=True)

@@ -117,8 +117,9 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else f"not UTF-8, {error.reason}"
         raise EmulatorError(
-            f"truth file {path}: cannot be read ({error}); give a CSV file of times and attitudes"
+            f"truth file {path}: cannot be read ({reason}); give a CSV file of times and attitudes"
         ) from None
     lines = [
         (n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"

@@ -115,9 +115,25 @@ def test_without_a_thread_each_one_is_waited_for(factory):
     assert factory.made == [DEEP, SHALLOW, DEEP]
 
 
-def test_an_option_that_the_algorithm_does_not_have_is_named():
-    with pytest.raises(EmulatorError, match=r"identifier geometric: .*nonsense"):
-        replace(DEEP, options=(("nonsense", 1),)).make(None)
+@pytest.mark.parametrize(
+    ("algorithm", "option", "value", "said"),
+    [
+        (
+            "geometric",
+            "nonsense",
+            1,
+            r"identifier\.nonsense: no option of the algorithm geometric; known: blend_px, cache",
+        ),
+        ("geometric", "catalog", 1, "no option"),
+        ("geometric", "blend_px", "x", r"identifier\.blend_px: 'x' given, float needed"),
+        ("geometric", "blend_px", True, "True given, float needed"),
+        ("lsi", "neighbours", 2.5, "2.5 given, int needed"),
+        ("rsi", "limiting_magnitude", "x", "'x' given, float needed"),
+    ],
+)
+def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, value, said):
+    with pytest.raises(EmulatorError, match=said):
+        IdentifierChoice(algorithm, DEFAULT_CAMERA, 1.0, ((option, value),)).make(None)
 
 
 def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_holds():
