@@ -17,7 +17,6 @@ from starid.imaging.matched_filter import (
     INTEGER_TAPS_SUM,
     find_peaks,
     find_peaks_in_bytes,
-    find_peaks_in_smooth,
     integer_taps,
     noise_factor,
     spot_taps,
@@ -36,7 +35,7 @@ from starid.imaging.measurement import (
 from starid.imaging.pairs import doubt_close_pairs, split_pairs
 from starid.imaging.spot_shape import MOMENT_COLUMNS, SpotShape, moments_of, shape_from_moments
 from starid.imaging.spot_width import spot_widths
-from starid.imaging.trail_filter import smooth_along_trails, trail_noise_factor
+from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
 
 Grid: TypeAlias = npt.NDArray[np.float32]
@@ -268,12 +267,17 @@ def _trail_peaks(
     threshold_sigma: float,
 ) -> tuple[npt.NDArray[np.int32], Grid]:
     """As `_peaks`, with the filter for the frame's trails."""
-    smooth = smooth_along_trails(counts, shape.sigma_px, shape.flow)
+    steps = trail_steps(shape.flow, counts.shape[1], counts.shape[0])
+    sums, scale = sum_along_trails(counts, shape.flow, steps)
+    taps = spot_taps(shape.sigma_px)
 
     def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
-        return find_peaks_in_smooth(smooth, threshold, background.block_px, peaks, heights)
+        count = find_peaks(sums, np.float32(scale) * threshold, background.block_px, taps, peaks, heights)
+        heights[:count] /= np.float32(scale)
+        return count
 
-    return _search(search, background, threshold_sigma * trail_noise_factor(shape.sigma_px, shape.trail_px))
+    factor = trail_noise_factor(shape.sigma_px, shape.trail_px, steps)
+    return _search(search, background, threshold_sigma * factor)
 
 
 def _search(

@@ -158,35 +158,20 @@ def _between(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[n
 
 
 @compiled_loops
-def _is_top(
-    row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    before: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    after: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    x: int,
-    has_before: bool,
-    has_after: bool,
-) -> bool:
-    """Whether no neighbour is higher, nor an earlier one as high."""
-    value = row[x]
-    a, b = max(x - 1, 0), min(x + 1, row.size - 1)
-    if has_before and (before[a] >= value or before[x] >= value or before[b] >= value):
-        return False
-    if has_after and (after[a] > value or after[x] > value or after[b] > value):
-        return False
-    return not ((a < x and row[a] >= value) or row[b] > value)
-
-
-@compiled_sums
 def _flag_groups(
-    row: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], flags: npt.NDArray[np.uint8]
+    row: npt.NDArray[np.float32],
+    limit: npt.NDArray[np.float32],
+    above: npt.NDArray[np.uint8],
+    flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Mark the groups of 32 pixels in which one lies above its limit."""
+    """Mark the groups of 32 pixels in which one lies above its limit; `above` is scratch of 32 bytes a group, zeros."""
+    for x in range(row.size):
+        above[x] = row[x] > limit[x]
+    words = above.view(np.uint64)
     for group in range(flags.size):
-        start = group * _GROUP
-        most = np.float32(0.0)
-        for k in range(start, min(start + _GROUP, row.size)):
-            most = max(most, row[k] - limit[k])
-        flags[group] = most > np.float32(0.0)
+        first = 4 * group
+        any_above = words[first] | words[first + 1] | words[first + 2] | words[first + 3]
+        flags[group] = any_above != np.uint64(0)
 
 
 @compiled_sums
@@ -209,7 +194,6 @@ def _flag_groups_integer(
 @compiled_loops
 def _peaks_of_row(
     y: int,
-    height: int,
     row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
     before: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
     after: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
@@ -219,19 +203,38 @@ def _peaks_of_row(
     peaks: npt.NDArray[np.int32],
     heights: npt.NDArray[np.float32],
 ) -> int:
-    """Add the peaks of row y above its limit, in the groups that are marked, to the list; return how many there are."""
+    """Add the peaks of row y above its limit, in the groups that are marked, to the list; return how many there are.
+
+    A peak is a pixel with no higher neighbour, nor an earlier one as high. The three rows have a zero more at either end.
+    """
+    is_top = np.empty(_GROUP, np.bool_)
     for group in range(flags.size):
         if flags[group] == 0:
             continue
         start = group * _GROUP
-        for x in range(start, min(start + _GROUP, row.size)):
-            if not row[x] > limit[x] or not _is_top(row, before, after, x, y > 0, y < height - 1):
+        size = min(_GROUP, limit.size - start)
+        for k in range(size):
+            x = start + k
+            value = row[x + 1]
+            is_top[k] = (
+                (value > limit[x])
+                & (row[x] < value)
+                & (row[x + 2] <= value)
+                & (before[x] < value)
+                & (before[x + 1] < value)
+                & (before[x + 2] < value)
+                & (after[x] <= value)
+                & (after[x + 1] <= value)
+                & (after[x + 2] <= value)
+            )
+        for k in range(size):
+            if not is_top[k]:
                 continue
             if count == peaks.shape[0]:
                 return count
-            peaks[count, 0] = x
+            peaks[count, 0] = start + k
             peaks[count, 1] = y
-            heights[count] = np.float32(row[x])
+            heights[count] = np.float32(row[start + k + 1])
             count += 1
     return count
 
@@ -282,47 +285,26 @@ def find_peaks(
     height, width = image.shape
     reach = taps.size - 1
     padded = np.empty(width + 2 * reach, np.float32)
-    smooth = np.empty((3, width), np.float32)
+    smooth = np.zeros((3, width + 2), np.float32)
     lines = np.empty((2, width), np.float32)
     limit = np.empty(width, np.float32)
     flags = np.empty(-(-width // _GROUP), np.uint8)
+    above = np.zeros(_GROUP * flags.size, np.uint8)
     count = 0
     line = -1
     for y in range(height + 1):
         if y < height:
             _smooth_down(image, y, taps, padded[reach : reach + width])
-            _smooth_along(padded, taps, smooth[y % 3])
+            _smooth_along(padded, taps, smooth[y % 3, 1 : width + 1])
+        else:
+            smooth[y % 3] = 0.0
         if y > 0:
             # row y − 1 has both neighbours now
             line, q = _set_lines(threshold, block, y - 1, line, lines)
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
             _between(lines, q, limit)
-            _flag_groups(row, limit, flags)
-            count = _peaks_of_row(y - 1, height, row, before, after, limit, flags, count, peaks, heights)
-    return count
-
-
-@compiled_loops
-def find_peaks_in_smooth(
-    smooth: npt.NDArray[np.float32],
-    threshold: npt.NDArray[np.float32],
-    block: float,
-    peaks: npt.NDArray[np.int32],
-    heights: npt.NDArray[np.float32],
-) -> int:
-    """As `find_peaks`, in an image (h, w) that has been smoothed already."""
-    height, width = smooth.shape
-    lines = np.empty((2, width), np.float32)
-    limit = np.empty(width, np.float32)
-    flags = np.empty(-(-width // _GROUP), np.uint8)
-    count = 0
-    line = -1
-    for y in range(height):
-        line, q = _set_lines(threshold, block, y, line, lines)
-        before, after = smooth[max(y - 1, 0)], smooth[min(y + 1, height - 1)]
-        _between(lines, q, limit)
-        _flag_groups(smooth[y], limit, flags)
-        count = _peaks_of_row(y, height, smooth[y], before, after, limit, flags, count, peaks, heights)
+            _flag_groups(row[1 : width + 1], limit, above, flags)
+            count = _peaks_of_row(y - 1, row, before, after, limit, flags, count, peaks, heights)
     return count
 
 
@@ -369,28 +351,30 @@ def find_peaks_in_bytes(
     """As `find_peaks`, several times faster, with the taps of `integer_taps`."""
     height, width = image.shape
     padded = np.empty(width + 4, np.uint16)
-    smooth = np.empty((3, width), np.uint16)
+    smooth = np.zeros((3, width + 2), np.uint16)
     lines = np.empty((2, width), np.float32)
     limit = np.empty(width, np.uint16)
     flags = np.empty(-(-width // _GROUP), np.uint8)
     scale = np.float32(INTEGER_TAPS_SUM**2)
-    highest = np.float32(65535.0)
+    highest = np.int32(65535)
     count = 0
     line = -1
     for y in range(height + 1):
         if y < height:
             _smooth_down_integer(image, y, taps, padded[2 : 2 + width])
-            _smooth_along_integer(padded, taps, smooth[y % 3])
+            _smooth_along_integer(padded, taps, smooth[y % 3, 1 : width + 1])
+        else:
+            smooth[y % 3] = 0
         if y > 0:
             if (y - 1) % _LINE_STEP == 0:
                 line, q = _set_lines(threshold, block, y - 1 + _LINE_STEP // 2, line, lines)
                 upper, lower = lines[0], lines[1]
                 for x in range(width):
-                    value = scale * (upper[x] + q * (lower[x] - upper[x]))
-                    limit[x] = np.int32(min(max(value, np.float32(0.0)), highest))
+                    value = np.int32(scale * (upper[x] + q * (lower[x] - upper[x])))
+                    limit[x] = np.uint16(min(max(value, np.int32(0)), highest))
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
-            _flag_groups_integer(row, limit, flags)
-            count = _peaks_of_row(y - 1, height, row, before, after, limit, flags, count, peaks, heights)
+            _flag_groups_integer(row[1 : width + 1], limit, flags)
+            count = _peaks_of_row(y - 1, row, before, after, limit, flags, count, peaks, heights)
     for k in range(count):
         heights[k] /= scale
     return count

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.background import interpolate_at
+from starid.imaging.background import interpolate_at, median
 from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, typical_trail
 
@@ -185,10 +185,10 @@ def shape_from_moments(
         return SpotShape(known_sigma_px or assumed_sigma_px, still, 0.0, 0)
     c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
     mean, split = 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
-    across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else float(np.median(mean - split))
+    across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else median(mean - split)
     across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
     # a short trail of length L makes the split L²/24
-    if math.sqrt(24.0 * float(np.median(split))) > _ROUND_BELOW_PX:
+    if math.sqrt(24.0 * median(split)) > _ROUND_BELOW_PX:
         length = trail_length(mean + split, across)
         angle = 0.5 * np.arctan2(2.0 * c_xy, c_xx - c_yy)
         trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -197,9 +197,9 @@ def shape_from_moments(
         flow = np.zeros(FLOW_TERMS)
         fit_flow(places, trails, flow)
         typical, off = typical_trail(flow, places, trails)
-        if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * float(np.median(length)):
+        if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * median(length):
             return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
-    return SpotShape(_sigma(float(np.median(mean)), known_sigma_px), still, 0.0, len(table))
+    return SpotShape(_sigma(median(mean), known_sigma_px), still, 0.0, len(table))
 
 
 def _sigma(variance: float, known: float | None) -> float:

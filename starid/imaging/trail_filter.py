@@ -1,4 +1,8 @@
-"""The matched filter for trails: an image smoothed along the path that its stars take during the exposure."""
+"""The matched filter for trails, first half: an image summed along the path that its stars take during the exposure.
+
+Summed first, in integers, and smoothed with the round spot afterwards (`starid.imaging.matched_filter.find_peaks`):
+the order of the two makes no difference, but for the time.
+"""
 
 from __future__ import annotations
 
@@ -9,55 +13,96 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.imaging.jit_loops import compiled_loops
-from starid.imaging.matched_filter import smooth_image, spot_taps
+from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
 
-_TILE_PX: Final = 64
+_TILE_COLUMNS: Final = 128
+_TILE_ROWS: Final = 32
 _MOST_STEPS: Final = 96
 
 
 @compiled_loops
-def _smooth_along(
-    smooth: npt.NDArray[np.float32], flow: npt.NDArray[np.float64], out: npt.NDArray[np.float32]
+def _sum_along(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    flow: npt.NDArray[np.float64],
+    steps: int,
+    shift: int,
+    sums: npt.NDArray[np.uint16] | npt.NDArray[np.uint32],
+    out: npt.NDArray[np.uint16],
 ) -> None:
-    """Mean of the image along the trail of each tile, at steps of about a pixel."""
-    height, width = smooth.shape
-    for top in range(0, height, _TILE_PX):
-        for left in range(0, width, _TILE_PX):
-            bottom, right = min(top + _TILE_PX, height), min(left + _TILE_PX, width)
-            trail_x, trail_y = trail_at(
-                flow, 0.5 * (left + right - 1), 0.5 * (top + bottom - 1), width, height
-            )
-            steps = min(max(math.ceil(math.hypot(trail_x, trail_y)), 1), _MOST_STEPS)
-            share = np.float32(1.0 / steps)
-            out[top:bottom, left:right] = 0.0
+    """Sum of the image at `steps` places along the trail of each tile, shifted right; `sums` is a tile's row.
+
+    Indices are unsigned, so that no negative one need be thought of and the loops become vector instructions.
+    """
+    height, width = image.shape
+    pixels, target = image.reshape(image.size), out.reshape(out.size)
+    offset = np.empty((2, steps), np.int64)
+    for top in range(0, height, _TILE_ROWS):
+        for left in range(0, width, _TILE_COLUMNS):
+            bottom, columns = min(top + _TILE_ROWS, height), min(_TILE_COLUMNS, width - left)
+            middle_x, middle_y = left + 0.5 * (columns - 1), 0.5 * (top + bottom - 1)
+            trail_x, trail_y = trail_at(flow, middle_x, middle_y, width, height)
             for step in range(steps):
                 part = (step + 0.5) / steps - 0.5
-                dx, dy = round(part * trail_x), round(part * trail_y)
-                first = max(left, -dx)
-                last = min(right, width - dx)
-                for y in range(top, bottom):
-                    source = min(max(y + dy, 0), height - 1)
-                    to = out[y, first:last]
-                    source_row = smooth[source, first + dx : last + dx]
-                    for x in range(last - first):
-                        to[x] += share * source_row[x]
+                offset[0, step], offset[1, step] = round(part * trail_x), round(part * trail_y)
+            for y in range(top, bottom):
+                sums[:] = 0
+                for step in range(steps):
+                    row = min(max(y + offset[1, step], 0), height - 1)
+                    start = left + offset[0, step]
+                    first = min(max(0, -start), columns)
+                    last = max(min(columns, width - start), first)
+                    to, source = np.uint64(first), np.uint64(row * width + start + first)
+                    for k in range(np.uint64(last - first)):
+                        sums[to + k] += pixels[source + k]
+                begin = np.uint64(y * width + left)
+                for k in range(np.uint64(columns)):
+                    target[begin + k] = sums[k] >> shift
 
 
-def smooth_along_trails(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], sigma_px: float, flow: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float32]:
-    """Smooth an image (h, w) with the spot, and then along the trails of a flow (`starid.imaging.trail_flow`)."""
-    out = np.empty(image.shape, dtype=np.float32)
-    _smooth_along(smooth_image(image, spot_taps(sigma_px)), flow, out)
-    return out
+def trail_steps(flow: npt.NDArray[np.float64], width: int, height: int) -> int:
+    """Places along a trail that are about a pixel apart on the longest trail of the field."""
+    corners = [(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]
+    lengths = [
+        math.hypot(*trail_at(flow, x * (width - 1), y * (height - 1), width, height)) for x, y in corners
+    ]
+    return min(max(math.ceil(max(lengths)), 1), _MOST_STEPS)
 
 
-def trail_noise_factor(sigma_px: float, trail_px: float) -> float:
-    """Noise of an image smoothed so, over that of a pixel, for trails of a length."""
+def sum_along_trails(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], flow: npt.NDArray[np.float64], steps: int
+) -> tuple[npt.NDArray[np.uint16], float]:
+    """Sum an image (h, w) along the trails of a flow (`starid.imaging.trail_flow`).
+
+    Parameters
+    ----------
+    image : ndarray (h, w)
+        Counts.
+    flow : ndarray (5,)
+        Trails.
+    steps : int
+        From `trail_steps`.
+
+    Returns
+    -------
+    sums : ndarray (h, w), uint16
+        What lies beyond the left and right edges counts nothing.
+    scale : float
+        Sum where every count is 1.
+    """
+    out = np.empty(image.shape, dtype=np.uint16)
+    if image.dtype == np.uint8:
+        _sum_along(image, flow, steps, 0, np.empty(_TILE_COLUMNS, np.uint16), out)
+        return out, float(steps)
+    shift = math.ceil(math.log2(steps))
+    _sum_along(image, flow, steps, shift, np.empty(_TILE_COLUMNS, np.uint32), out)
+    return out, steps / 2.0**shift
+
+
+def trail_noise_factor(sigma_px: float, trail_px: float, steps: int) -> float:
+    """Noise of an image summed so and smoothed with the spot, over `steps` times that of a pixel, for a trail's length."""
     taps = spot_taps(sigma_px).astype(np.float64)
     spot = np.concatenate([taps[:0:-1], taps])
-    steps = max(math.ceil(trail_px), 1)
     offsets = np.rint(((np.arange(steps) + 0.5) / steps - 0.5) * trail_px).astype(int)
     line = np.bincount(offsets - offsets.min()) / steps
     return float(np.sqrt(np.sum(np.convolve(spot, line) ** 2) * np.sum(spot**2)))

@@ -18,7 +18,6 @@ from starid.imaging.matched_filter import (
     INTEGER_TAPS_SUM,
     find_peaks,
     find_peaks_in_bytes,
-    find_peaks_in_smooth,
     integer_taps,
     noise_factor,
     smooth_image,
@@ -27,7 +26,7 @@ from starid.imaging.matched_filter import (
 from starid.imaging.normal_table import normal
 from starid.imaging.spot_shape import trail_length
 from starid.imaging.spot_width import spot_widths
-from starid.imaging.trail_filter import smooth_along_trails, trail_noise_factor
+from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.trail_flow import fit_flow, trail_at, typical_trail
 
 RNG_SEED = 12
@@ -102,8 +101,6 @@ def test_peaks_are_the_local_maxima(shape: tuple[int, int]) -> None:
     found = {(int(x), int(y)) for x, y in peaks[:count]}
     assert found == brute_force(smooth, np.full(shape, 210.0))
     assert heights[:count] == pytest.approx(smooth[peaks[:count, 1], peaks[:count, 0]])
-    again = find_peaks_in_smooth(smooth, grid, 32.0, peaks, heights)
-    assert {(int(x), int(y)) for x, y in peaks[:again]} == found
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.9])
@@ -261,18 +258,40 @@ def test_the_length_of_a_trail_from_its_adapted_variance(length: float) -> None:
     assert trail_length(np.array([variance]), across)[0] == pytest.approx(length, rel=0.01)
 
 
-def test_smoothing_along_trails_lifts_them_above_the_noise() -> None:
+@pytest.mark.parametrize(("dtype", "level", "noise"), [(np.uint16, 5000.0, 100.0), (np.uint8, 60.0, 12.0)])
+def test_summing_along_trails_lifts_them_above_the_noise(dtype: type, level: float, noise: float) -> None:
     flow = np.array([10.0, 6.0, 0.0, 0.0, 0.0])
-    image = noisy((200, 200), 5000.0, 100.0)
-    smooth = smooth_along_trails(image, 0.8, flow)
-    expected = 100.0 * trail_noise_factor(0.8, math.hypot(10.0, 6.0))
+    taps = spot_taps(0.8)
+    steps = trail_steps(flow, 200, 200)
+    assert steps == 12, "a pixel apart on a trail of 11.7"
+    sums, scale = sum_along_trails(noisy((200, 200), level, noise).astype(dtype), flow, steps)
+    smooth = smooth_image(sums, taps) / scale
+    expected = noise * trail_noise_factor(0.8, math.hypot(10.0, 6.0), steps)
+    assert smooth[20:-20, 20:-20].mean() == pytest.approx(level, abs=0.5 + 0.01 * noise)
     assert smooth[20:-20, 20:-20].std() == pytest.approx(expected, rel=0.15)
     line = np.zeros((200, 200))
     for part in np.linspace(-0.5, 0.5, 200):
-        line[round(100 + 6 * part), round(100 + 10 * part)] += 1.0
-    response = smooth_along_trails((5000 + 200 * line).astype(np.uint16), 0.8, flow) - 5000.0
+        line[round(100 + 6 * part), round(100 + 10 * part)] += 0.01 * noise
+    sums, scale = sum_along_trails((level + 2.0 * line).astype(dtype), flow, steps)
+    response = smooth_image(sums, taps) / scale - level
     y, x = np.unravel_index(np.argmax(response), response.shape)
     assert (x, y) == pytest.approx((100, 100), abs=1.5)
+
+
+def test_sums_along_trails_are_plain_sums() -> None:
+    image = np.random.default_rng(3).integers(0, 256, (70, 300)).astype(np.uint8)
+    flow = np.array([7.0, -4.0, 0.0, 0.0, 0.0])
+    sums, scale = sum_along_trails(image, flow, 8)
+    parts = (np.arange(8) + 0.5) / 8 - 0.5
+    for x, y in ((150, 35), (5, 30), (297, 20), (150, 0), (127, 69), (128, 32)):
+        expected = 0
+        for part in parts:
+            column, row = x + round(7.0 * part), min(max(y + round(-4.0 * part), 0), 69)
+            expected += int(image[row, column]) if 0 <= column < 300 else 0
+        assert sums[y, x] == expected
+    assert scale == 8.0
+    bright = sum_along_trails(np.full((40, 40), 65535, np.uint16), flow, 96)
+    assert bright[0][20, 20] == pytest.approx(65535 * bright[1], abs=1.0)
 
 
 @pytest.mark.parametrize("sigma", [0.4, 0.7, 1.2, 2.5])
