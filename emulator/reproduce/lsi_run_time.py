@@ -73,7 +73,7 @@ def _milliseconds(count: int, work: Callable[[int], object]) -> NDArray[np.float
 def _work(context: Context, part: Part) -> Results:
     from starid.thesis.features import extract_features
     from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
-    from starid.thesis.lsi import fill_dictionary
+    from starid.thesis.lsi import fill_dictionary, lsi_work
     from starid.thesis.subcell import SubcellSearch
 
     lsi = context.lost_in_space(part.values["percent"] / 100.0)
@@ -89,11 +89,10 @@ def _work(context: Context, part: Part) -> Results:
         lsi.estimate(observation, cell, 0.0).dictionary
         for observation, cell in zip(observations, nearest, strict=True)
     ]
-    cells, ra, dec, theta = np.empty(9, dtype=np.int64), np.empty(9), np.empty(9), np.empty(9)
-    dictionary, path, error = np.empty((5, 9)), np.empty((LAMBDAS.size, 9)), np.empty(LAMBDAS.size)
+    work, path, error = lsi_work(), np.empty((LAMBDAS.size, 9)), np.empty(LAMBDAS.size)
 
     def fill(i: int) -> None:
-        fill_dictionary(lsi.arrays, lsi.stored, nearest[i], lsi.exact, cells, ra, dec, dictionary, theta)
+        fill_dictionary(lsi.searched, nearest[i], work)
 
     def regress(i: int) -> None:
         lasso_path(dictionaries[i], observations[i], LAMBDAS, path)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.jit import compiled
-from starid.thesis.frame_sky import BIN_DEG, BRIGHTNESS, DEC_BINS, FOCAL, HALF_WIDTH, RA_BINS, UX, UY, UZ
+from starid.thesis.frame_sky import BRIGHTNESS, FOCAL, HALF_WIDTH, bins_near, gnomonic, stars_of_bins, turn_to
 
 MAX_STARS: Final = 256
 """Most catalogue stars of a cell that are considered."""
@@ -43,27 +43,14 @@ def stars_near(
     """
     limit = (frame[HALF_WIDTH] + margin) ** 2
     reach = math.degrees(math.atan((frame[HALF_WIDTH] + margin) / frame[FOCAL]))
-    a, d = math.radians(ra_deg), math.radians(dec_deg)
-    cos_a, sin_a, cos_d, sin_d = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
-    window = 180.0
-    if abs(dec_deg) + reach < 90.0:
-        window = math.degrees(math.asin(min(math.sin(math.radians(reach)) / cos_d, 1.0)))
-    low = max(math.floor((dec_deg - reach + 90.0) / BIN_DEG), 0)
-    high = min(math.floor((dec_deg + reach + 90.0) / BIN_DEG), DEC_BINS - 1)
-    first = math.floor((ra_deg - window) / BIN_DEG)
-    last = min(math.floor((ra_deg + window) / BIN_DEG), first + RA_BINS - 1)
+    turn = turn_to(ra_deg, dec_deg)
+    low, high, first, bins = bins_near(ra_deg, dec_deg, reach, spherical=True)
     count = 0
     for band in range(low, high + 1):
-        for place in range(first, last + 1):
-            b = band * RA_BINS + place % RA_BINS
-            for i in range(bin_start[b], bin_start[b + 1]):
-                east = cos_a * stars[i, UY] - sin_a * stars[i, UX]
-                level = cos_a * stars[i, UX] + sin_a * stars[i, UY]
-                depth = cos_d * level + sin_d * stars[i, UZ]
-                if depth <= 0.0:
-                    continue
-                x = -frame[FOCAL] * east / depth
-                y = -frame[FOCAL] * (cos_d * stars[i, UZ] - sin_d * level) / depth
+        for part in range(2):
+            begin, end = stars_of_bins(bin_start, band, first, bins, part)
+            for i in range(begin, end):
+                x, y = gnomonic(stars, i, turn, frame[FOCAL])
                 if x * x + y * y <= limit and count < found.shape[0]:
                     found[count, 0] = x
                     found[count, 1] = y

@@ -36,6 +36,56 @@ class SkyError(StaridError):
 
 
 @compiled
+def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) -> tuple[int, int, int, int]:
+    """Bins that stars within reach of a place lie in: first and last band, first bin along α, and how many of these."""
+    low = max(math.floor((dec_deg - reach_deg + 90.0) / BIN_DEG), 0)
+    high = min(math.floor((dec_deg + reach_deg + 90.0) / BIN_DEG), DEC_BINS - 1)
+    window = reach_deg
+    if spherical:
+        window = 180.0
+        if abs(dec_deg) + reach_deg < 90.0:
+            ratio = math.sin(math.radians(reach_deg)) / math.cos(math.radians(dec_deg))
+            window = math.degrees(math.asin(min(ratio, 1.0)))
+    first = math.floor((ra_deg - window) / BIN_DEG)
+    count = min(math.floor((ra_deg + window) / BIN_DEG) - first + 1, RA_BINS)
+    return low, high, first % RA_BINS, count
+
+
+@compiled
+def stars_of_bins(
+    bin_start: NDArray[np.int64], band: int, first: int, count: int, part: int
+) -> tuple[int, int]:
+    """First star, and one past the last, of the bins of a band: up to the end of the band (part 0), or beyond (part 1)."""
+    end = min(first + count, RA_BINS)
+    start = band * RA_BINS + (first if part == 0 else 0)
+    stop = band * RA_BINS + (end if part == 0 else first + count - RA_BINS)
+    if stop <= start:
+        return 0, 0
+    return bin_start[start], bin_start[stop]
+
+
+@compiled
+def turn_to(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
+    """Cosine and sine of a place's α and of its δ."""
+    a, d = math.radians(ra_deg), math.radians(dec_deg)
+    return math.cos(a), math.sin(a), math.cos(d), math.sin(d)
+
+
+@compiled
+def gnomonic(
+    stars: NDArray[np.float64], i: int, turn: tuple[float, float, float, float], focal: float
+) -> tuple[float, float]:
+    """Offset of a star in the frame at a place (`turn_to`), north up, +x right, +y down; infinite behind the camera."""
+    cos_a, sin_a, cos_d, sin_d = turn
+    level = cos_a * stars[i, UX] + sin_a * stars[i, UY]
+    depth = cos_d * level + sin_d * stars[i, UZ]
+    if depth <= 0.0:
+        return math.inf, math.inf
+    east = cos_a * stars[i, UY] - sin_a * stars[i, UX]
+    return -focal * east / depth, -focal * (cos_d * stars[i, UZ] - sin_d * level) / depth
+
+
+@compiled
 def cell_sums(
     stars: NDArray[np.float64],
     bin_start: NDArray[np.int64],
@@ -47,39 +97,17 @@ def cell_sums(
     """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360; flat or gnomonic offsets."""
     clear_sums(sums)
     half = frame[HALF_WIDTH]
-    reach = frame[REACH]
+    half2 = half * half
     spherical = frame[SPHERICAL] > 0.5
     full = frame[FULL_FIELD] > 0.5
-    low_dec = max(math.floor((dec_deg - reach + 90.0) / BIN_DEG), 0)
-    high_dec = min(math.floor((dec_deg + reach + 90.0) / BIN_DEG), DEC_BINS - 1)
-    window = reach
-    cos_a = sin_a = cos_d = sin_d = 0.0
-    if spherical:
-        a = math.radians(ra_deg)
-        d = math.radians(dec_deg)
-        cos_a, sin_a, cos_d, sin_d = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
-        ratio = math.sin(math.radians(reach)) / max(cos_d, 1e-12)
-        window = 180.0 if abs(dec_deg) + reach >= 90.0 else math.degrees(math.asin(min(ratio, 1.0)))
-    first_ra = math.floor((ra_deg - window) / BIN_DEG)
-    bins = min(math.floor((ra_deg + window) / BIN_DEG) - first_ra + 1, RA_BINS)
-    first_ra %= RA_BINS
-    end_ra = min(first_ra + bins, RA_BINS)
-    half2 = half * half
-    for band in range(low_dec, high_dec + 1):
+    turn = turn_to(ra_deg, dec_deg) if spherical else (1.0, 0.0, 1.0, 0.0)
+    low, high, first, count = bins_near(ra_deg, dec_deg, frame[REACH], spherical)
+    for band in range(low, high + 1):
         for part in range(2):
-            first = band * RA_BINS + (first_ra if part == 0 else 0)
-            last = band * RA_BINS + (end_ra if part == 0 else first_ra + bins - RA_BINS)
-            if last <= first:
-                continue
-            for i in range(bin_start[first], bin_start[last]):
+            begin, end = stars_of_bins(bin_start, band, first, count, part)
+            for i in range(begin, end):
                 if spherical:
-                    east = cos_a * stars[i, UY] - sin_a * stars[i, UX]
-                    level = cos_a * stars[i, UX] + sin_a * stars[i, UY]
-                    depth = cos_d * level + sin_d * stars[i, UZ]
-                    if depth <= 0.0:
-                        continue
-                    x = -frame[FOCAL] * east / depth
-                    y = -frame[FOCAL] * (cos_d * stars[i, UZ] - sin_d * level) / depth
+                    x, y = gnomonic(stars, i, turn, frame[FOCAL])
                 else:
                     y = stars[i, DECLINATION] - dec_deg
                     x = stars[i, RIGHT_ASCENSION] - ra_deg
@@ -87,7 +115,9 @@ def cell_sums(
                         x -= 360.0
                     elif x < -180.0:
                         x += 360.0
-                if (full and abs(x) <= half and abs(y) <= half) or (not full and x * x + y * y <= half2):
+                if (full and abs(x) <= half and abs(y) <= half) or (
+                    not full and x * x + y * y <= half * half
+                ):
                     add_star(sums, stars[i, BRIGHTNESS], x, y, frame[PIVOT])
 
 

@@ -165,9 +165,11 @@ def lars_path(
             sign[joining] = 1.0 if rest[joining] > 0.0 else -1.0
             idle[joining] = False
             size += 1
-            if not _solve_active(gram, active, size, sign, work, direction):
-                size -= 1
-        if size == 0 or not _solve_active(gram, active, size, sign, work, direction):
+        solved = _solve_active(gram, active, size, sign, work, direction)
+        if not solved and joining >= 0:
+            size -= 1
+            solved = _solve_active(gram, active, size, sign, work, direction)
+        if size == 0 or not solved:
             return 0
         joining, length = _next_joining(
             gram, rest, level, idle, active, size, direction, dropped, level - end

@@ -36,11 +36,59 @@ SUM, RA, DEC, THETA, ERROR, LAMBDA, BORESIGHT, POINTER = 0, 1, 2, 3, 4, 5, 6, 9
 """Places in a row of results: Σω, α, δ (degrees), θ (radians), ε_ψ, λ, boresight and pointer vectors."""
 
 
-class StoredCells(NamedTuple):
-    """The stored codes of a database, for dictionaries made of them."""
+class SearchedCells(NamedTuple):
+    """A database for the kernels: its cells as the stars make them, the codes stored of them, and which of the two count.
 
+    Attributes
+    ----------
+    arrays
+        Stars, grid and normalisation.
+    features, theta
+        Stored codes, (m, 5) and (m,); a cell without stars has the polar angle 255.
+    exact
+        Distances and dictionaries in full precision, not from the codes.
+    """
+
+    arrays: CellArrays
     features: NDArray[np.uint8]
     theta: NDArray[np.uint8]
+    exact: bool
+
+
+class LsiWork(NamedTuple):
+    """What the kernels fill in; made by `lsi_work`.
+
+    Attributes
+    ----------
+    cells, dictionary
+        Cells of the dictionary (9,) and their normalised features T, (5, 9).
+    places
+        Their right ascensions and declinations, degrees, and polar angles, radians, (3, 9).
+    weights, results
+        Weights and numbers of the two estimates, (2, 9) and (2, 16).
+    found
+        Distance of the nearest cell and number of cells looked at, (2,).
+    """
+
+    cells: NDArray[np.int64]
+    dictionary: NDArray[np.float64]
+    places: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    results: NDArray[np.float64]
+    found: NDArray[np.float64]
+
+
+def lsi_work() -> LsiWork:
+    """Room for one estimate."""
+    nine = DICTIONARY_SIZE
+    return LsiWork(
+        np.empty(nine, dtype=np.int64),
+        np.empty((5, nine)),
+        np.empty((3, nine)),
+        np.empty((2, nine)),
+        np.empty((2, _RESULT_SIZE)),
+        np.empty(2),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,81 +185,60 @@ class LsiSolution:
 
 
 @compiled
-def fill_dictionary(
-    arrays: CellArrays,
-    stored: StoredCells,
-    cell: int,
-    exact: bool,
-    cells: NDArray[np.int64],
-    right_ascension: NDArray[np.float64],
-    declination: NDArray[np.float64],
-    dictionary: NDArray[np.float64],
-    theta: NDArray[np.float64],
-) -> None:
+def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
     """Set up the dictionary about a cell: its features, the boresights F of eq. 2.16 and the angles Θ of eq. 2.18."""
+    arrays = searched.arrays
     first_row = dictionary_cells(
         arrays.row_start,
         arrays.row_columns,
         arrays.row_ra_step,
         arrays.first_ra,
         cell,
-        cells,
-        right_ascension,
+        work.cells,
+        work.places[0],
     )
     sums = np.empty(8)
     vector = np.empty(5)
     for j in range(9):
-        declination[j] = arrays.row_dec[first_row + j // 3]
-        if exact:
-            theta[j] = exact_vector(arrays, cells[j], sums, vector)
+        work.places[1, j] = arrays.row_dec[first_row + j // 3]
+        if searched.exact:
+            work.places[2, j] = exact_vector(arrays, work.cells[j], sums, vector)
             for f in range(5):
-                dictionary[f, j] = vector[f]
+                work.dictionary[f, j] = vector[f]
         else:
-            theta[j] = stored.theta[cells[j]] * (2.0 * math.pi / 255.0)
+            work.places[2, j] = searched.theta[work.cells[j]] * (2.0 * math.pi / 255.0)
             for f in range(5):
-                dictionary[f, j] = stored.features[cells[j], f] / 2.55
+                work.dictionary[f, j] = searched.features[work.cells[j], f] / 2.55
 
 
 @compiled
-def _flat_estimate(
-    omega: NDArray[np.float64],
-    right_ascension: NDArray[np.float64],
-    declination: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    result: NDArray[np.float64],
-) -> None:
+def _flat_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np.float64]) -> None:
     """Combine boresights and angles in the flat plane, with weights scaled to a sum of one."""
     cos_sum = 0.0
     sin_sum = 0.0
     ra = 0.0
     dec = 0.0
     for j in range(9):
-        ra += omega[j] * right_ascension[j]
-        dec += omega[j] * declination[j]
-        cos_sum += omega[j] * math.cos(theta[j])
-        sin_sum += omega[j] * math.sin(theta[j])
+        ra += omega[j] * work.places[0, j]
+        dec += omega[j] * work.places[1, j]
+        cos_sum += omega[j] * math.cos(work.places[2, j])
+        sin_sum += omega[j] * math.sin(work.places[2, j])
     result[1] = (ra / result[0]) % 360.0
     result[2] = dec / result[0]
     result[3] = math.atan2(sin_sum, cos_sum)
 
 
 @compiled
-def _sphere_estimate(
-    omega: NDArray[np.float64],
-    right_ascension: NDArray[np.float64],
-    declination: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    result: NDArray[np.float64],
-) -> None:
+def _sphere_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np.float64]) -> None:
     """Combine boresights and frame-object directions as vectors, so that poles and 0°/360° are like any other place."""
     boresight = np.zeros(3)
     pointer = np.zeros(3)
     for j in range(9):
-        a = math.radians(right_ascension[j])
-        d = math.radians(declination[j])
+        a = math.radians(work.places[0, j])
+        d = math.radians(work.places[1, j])
         ca, sa, cd, sd = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
-        east = -math.cos(theta[j])
-        north = -math.sin(theta[j])
+        east = -math.cos(work.places[2, j])
+        north = -math.sin(work.places[2, j])
         boresight[0] += omega[j] * cd * ca
         boresight[1] += omega[j] * cd * sa
         boresight[2] += omega[j] * sd
@@ -238,38 +265,31 @@ def _sphere_estimate(
 
 @compiled
 def estimate_from_cell(
-    arrays: CellArrays,
-    stored: StoredCells,
+    searched: SearchedCells,
     cell: int,
-    exact: bool,
     observation: NDArray[np.float64],
     lambdas: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    dictionary: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    results: NDArray[np.float64],
+    work: LsiWork,
 ) -> None:
     """Dictionary, LASSO and estimates about a cell.
 
     The boresight is F·ω (eq. 2.15, printed again as eq. 2.36) and the angle Θ·ω (eq. 2.37) with weights scaled to a
     sum of one; the reconstruction is T·ω (eq. 2.35). Should the weights cancel, the cell itself is the estimate.
     """
-    right_ascension = np.empty(9)
-    declination = np.empty(9)
-    theta = np.empty(9)
-    fill_dictionary(arrays, stored, cell, exact, cells, right_ascension, declination, dictionary, theta)
+    fill_dictionary(searched, cell, work)
+    dictionary = work.dictionary
     path = np.empty((lambdas.size, 9))
     error = np.empty(lambdas.size)
     lasso_path(dictionary, observation, lambdas, path)
     chosen = choose_lambdas(dictionary, observation, path, error)
     for row in range(2):
-        omega = weights[row]
-        result = results[row]
+        omega = work.weights[row]
+        result = work.results[row]
         omega[:] = path[chosen[row]]
         total = omega.sum()
         if total < _LEAST_WEIGHT:
             for j in range(9):
-                omega[j] = 1.0 if cells[j] == cell else 0.0
+                omega[j] = 1.0 if work.cells[j] == cell else 0.0
             total = 1.0
         square = 0.0
         for f in range(5):
@@ -280,48 +300,38 @@ def estimate_from_cell(
         result[0] = total
         result[4] = math.sqrt(square)
         result[5] = lambdas[chosen[row]]
-        if arrays.frame[0] > 0.5:
-            _sphere_estimate(omega, right_ascension, declination, theta, result)
+        if searched.arrays.frame[0] > 0.5:
+            _sphere_estimate(omega, work, result)
         else:
-            _flat_estimate(omega, right_ascension, declination, theta, result)
+            _flat_estimate(omega, work, result)
             result[6:12] = 0.0
 
 
 @compiled
 def lsi_kernel(
     index: CellIndex,
-    arrays: CellArrays,
-    stored: StoredCells,
-    exact: bool,
+    searched: SearchedCells,
     observation: NDArray[np.float64],
     lambdas: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    dictionary: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    results: NDArray[np.float64],
-    found: NDArray[np.float64],
+    work: LsiWork,
 ) -> int:
     """Search and estimate in one go; return the nearest cell, −1 if there is none."""
-    if exact:
-        cell = exact_nearest(index, arrays, observation, found)
+    if searched.exact:
+        cell = exact_nearest(index, searched.arrays, observation, work.found)
     else:
         distances = np.empty(1)
         nearest = np.empty(1, dtype=np.int64)
         stored_neighbours(index, observation * 2.55, distances, nearest)
         cell = nearest[0]
-        found[0] = math.sqrt(distances[0]) / 2.55
+        work.found[0] = math.sqrt(distances[0]) / 2.55
     if cell >= 0:
-        estimate_from_cell(
-            arrays, stored, cell, exact, observation, lambdas, cells, dictionary, weights, results
-        )
+        estimate_from_cell(searched, cell, observation, lambdas, work)
     return cell
 
 
 @compiled
 def region_nearest(
-    arrays: CellArrays,
-    stored: StoredCells,
-    exact: bool,
+    searched: SearchedCells,
     observation: NDArray[np.float64],
     ra_deg: float,
     dec_deg: float,
@@ -337,6 +347,7 @@ def region_nearest(
     found
         Output (2,): distance on the normalised scale and number of cells in the region.
     """
+    arrays = searched.arrays
     sums = np.empty(8)
     vector = np.empty(5)
     best_cell = -1
@@ -355,18 +366,18 @@ def region_nearest(
         last = min(math.floor((ra_deg + width - arrays.first_ra) / step), first + columns - 1)
         for place in range(first, last + 1):
             cell = arrays.row_start[row] + place % columns
-            if stored.theta[cell] == 255:
+            if searched.theta[cell] == 255:
                 continue
             count += 1
             d = 0.0
             for f in range(5):
-                gap = abs(stored.features[cell, f] - observation[f] * 2.55)
-                if exact:
+                gap = abs(searched.features[cell, f] - observation[f] * 2.55)
+                if searched.exact:
                     gap = max(gap - 0.5 - 1e-9, 0.0)
                 d += gap * gap
             if d >= best:
                 continue
-            if exact:
+            if searched.exact:
                 exact_vector(arrays, cell, sums, vector)
                 d = 0.0
                 for f in range(5):
@@ -404,10 +415,9 @@ class LostInSpace:
         if precision not in ("exact", "stored"):
             raise DatabaseError(f"LSI: precision {precision!r} is unknown; one of exact, stored is needed")
         self.database = database
-        self.exact = precision == "exact"
         self.index = make_cell_index(database)
         self.arrays = cell_arrays(database)
-        self.stored = StoredCells(database.features, database.theta)
+        self.searched = SearchedCells(self.arrays, database.features, database.theta, precision == "exact")
 
     def solve(self, features: FeatureVector) -> LsiSolution:
         """Estimate boresight and roll from the features of one frame, searching the whole database."""
@@ -422,27 +432,15 @@ class LostInSpace:
             If the observation is not five finite numbers.
         """
         self._check(observation)
-        cells, dictionary, weights, results, found = _outputs()
-        nearest = lsi_kernel(
-            self.index,
-            self.arrays,
-            self.stored,
-            self.exact,
-            observation,
-            LAMBDAS,
-            cells,
-            dictionary,
-            weights,
-            results,
-            found,
-        )
-        return LsiSolution(observation, nearest, float(found[0]), cells, dictionary, weights, results)
+        work = lsi_work()
+        nearest = lsi_kernel(self.index, self.searched, observation, LAMBDAS, work)
+        return _solution(observation, nearest, float(work.found[0]), work)
 
     def nearest(self, observation: NDArray[np.float64]) -> tuple[int, float]:
         """Nearest cell of the whole database and its distance, for a normalised observation; the search alone."""
         self._check(observation)
         found = np.empty(2)
-        if self.exact:
+        if self.searched.exact:
             return exact_nearest(self.index, self.arrays, observation, found), float(found[0])
         cells = np.empty(1, dtype=np.int64)
         stored_neighbours(self.index, observation * 2.55, found[:1], cells)
@@ -454,41 +452,22 @@ class LostInSpace:
         """Nearest cell of a square region, its distance, and how many cells the region holds; cell −1 if none."""
         self._check(observation)
         found = np.empty(2)
-        cell = region_nearest(
-            self.arrays, self.stored, self.exact, observation, ra_deg, dec_deg, side_deg, found
-        )
+        cell = region_nearest(self.searched, observation, ra_deg, dec_deg, side_deg, found)
         return cell, float(found[0]), int(found[1])
 
     def estimate(self, observation: NDArray[np.float64], cell: int, distance: float) -> LsiSolution:
         """Dictionary, LASSO and estimates about a given cell."""
         self._check(observation)
-        cells, dictionary, weights, results, _ = _outputs()
-        estimate_from_cell(
-            self.arrays,
-            self.stored,
-            cell,
-            self.exact,
-            observation,
-            LAMBDAS,
-            cells,
-            dictionary,
-            weights,
-            results,
-        )
-        return LsiSolution(observation, cell, distance, cells, dictionary, weights, results)
+        work = lsi_work()
+        estimate_from_cell(self.searched, cell, observation, LAMBDAS, work)
+        return _solution(observation, cell, distance, work)
 
     def _check(self, observation: NDArray[np.float64]) -> None:
         if observation.shape != (5,) or not np.isfinite(observation).all():
             raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
 
 
-def _outputs() -> tuple[
-    NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
-]:
-    return (
-        np.empty(DICTIONARY_SIZE, dtype=np.int64),
-        np.empty((5, DICTIONARY_SIZE)),
-        np.empty((2, DICTIONARY_SIZE)),
-        np.empty((2, _RESULT_SIZE)),
-        np.empty(2),
+def _solution(observation: NDArray[np.float64], nearest: int, distance: float, work: LsiWork) -> LsiSolution:
+    return LsiSolution(
+        observation, nearest, distance, work.cells, work.dictionary, work.weights, work.results
     )
