@@ -27,6 +27,7 @@ demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
 
 test: $(VENV)/.developer
+	-@tools/install_test_packages tshark:tshark
 	$(BIN)/python -m pytest -m "not socketcan"
 	tools/test_on_vcan $(BIN)/python
 

@@ -53,6 +53,12 @@ def emulator_command(
     return [*command, *extra]
 
 
+def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
+    """Return the command line that starts a CAN hub, at a free port by default, with this very Python."""
+    command = [sys.executable, "-c", STARHIL, "hub", "--port", str(port)]
+    return command if log is None else [*command, "--log", str(log)]
+
+
 def parse_ready_line(line: str) -> dict[str, str]:
     """Return the words `key=value` of a ready line.
 

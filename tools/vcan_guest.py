@@ -11,7 +11,7 @@ handed on.
 
 Exit status of the script's own: 2 for a wrong call, 69 when a needed program is missing, 124 after a
 time-out, 125 when the guest did not come up or died (its console is printed then). Root is not needed. Needs
-the Debian packages user-mode-linux, can-utils, kmod and iproute2; see tools/install_guest_packages. Only the
+the Debian packages user-mode-linux, can-utils, kmod and iproute2; see tools/install_test_packages. Only the
 standard library is used, and no file is left behind.
 """
 
@@ -96,7 +96,7 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
     if missing:
         packages = " ".join(sorted(missing.values()))
         raise GuestError(
-            f"{', '.join(missing)} not found: install {packages} (tools/install_guest_packages)",
+            f"{', '.join(missing)} not found: install {packages} (tools/install_test_packages)",
             EXIT_UNAVAILABLE,
         )
     with tempfile.TemporaryDirectory(prefix="vcan-guest-") as name:

@@ -12,7 +12,7 @@ from typing import Any
 
 from hil_tests.bus_load import DEVICE, load_can
 from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
 from hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from hil_tests.realtime import give_realtime
@@ -89,15 +89,6 @@ def own_device(baud: int, realtime: bool, report: Callable[[str], None]) -> Iter
             client.command("set_mode", mode="lost_in_space")
             client.wait_for("device_status", lambda status: status["mode"] == "tracking", within_s=WARM_UP_S)
         yield Target(hub.ready["can"], emulator.ready["serial"], NODE, baud=baud)
-
-
-def hub_command() -> list[str]:
-    """Command line of a hub at a free port."""
-    import sys
-
-    from hil_tests.emulator_process import STARHIL
-
-    return [sys.executable, "-c", STARHIL, "hub", "--port", "0"]
 
 
 def measure(

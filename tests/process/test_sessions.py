@@ -11,6 +11,7 @@ import pytest
 
 from hil_tests.emulator_process import STARHIL
 from protocol.candump import read_candump
+from tests.protocol.dissection import dissect
 
 pytestmark = pytest.mark.process
 
@@ -46,6 +47,7 @@ def test_a_session_passes(name, links, tmp_path):
         assert " TX 1F 7F " in (tmp_path / "serial.log").read_text()
     if "--can" in links:
         assert sum(1 for _ in read_candump(tmp_path / "can.log")) > result["steps"]
+        assert [frame for frame in dissect(tmp_path / "can.log") if frame.malformed] == []
 
 
 def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(emulator, tmp_path):

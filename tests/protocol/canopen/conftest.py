@@ -206,7 +206,7 @@ def simulated_probe(package=protocol.canopen) -> CanopenProbe:
     return CanopenProbe(SimulatedBus(slave), NODE, import_eds(eds, NODE), eds)
 
 
-@pytest.fixture(name="simulated_probe")
+@pytest.fixture(name="simulated_probe", scope="session")
 def simulated_probe_fixture():
     return simulated_probe
 

@@ -1,0 +1,67 @@
+"""Recordings of sessions on a bus of several processes, with a CANopen node that talks meanwhile, as Wireshark reads them."""
+
+from __future__ import annotations
+
+import canopen
+import pytest
+
+from hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from protocol.candump import read_candump
+from protocol.canopen import build_dictionary, build_eds
+from tests.process.test_sessions import starhil
+from tests.protocol.dissection import dissect
+
+pytestmark = pytest.mark.process
+
+NODE = 44
+
+
+def talk_canopen(hub: str, folder) -> None:
+    """Drive the node as a master does: heartbeat, PDOs by event and by SYNC, a block upload, an abort."""
+    host, _, port = hub.removeprefix("socketcand:").partition("/")[0].rpartition(":")
+    eds = folder / "unit.eds"
+    eds.write_text(build_eds(build_dictionary()), encoding="ascii")
+    network = canopen.Network()
+    network.connect(interface="socketcand", host=host, port=int(port), channel="vcan0")
+    try:
+        node = network.add_node(NODE, str(eds))
+        node.sdo["Producer heartbeat time"].raw = 100
+        node.tpdo.read()
+        node.tpdo[2].trans_type = 1
+        node.tpdo[2].save()
+        node.nmt.state = "OPERATIONAL"
+        network.sync.transmit()
+        with pytest.raises(canopen.SdoAbortedError):
+            node.sdo.upload(0x5FFF, 0)
+        with node.sdo[0x1021].open("rb", block_transfer=True) as file:
+            assert len(file.read()) > 10_000
+    finally:
+        network.disconnect()
+
+
+def test_no_frame_of_sessions_with_a_canopen_node_is_malformed(tmp_path):
+    recording = tmp_path / "hub.log"
+    with EmulatorProcess(hub_command(log=recording)) as hub:
+        channel = hub.ready["can"]
+        command = emulator_command(
+            serial="off",
+            can=channel,
+            seed=1,
+            settings=["truth.attitude.roll_deg=30"],  # what first_light expects
+            state_dir=tmp_path / "state",
+            extra=["--canopen", str(NODE)],
+        )
+        with EmulatorProcess(command):
+            talk_canopen(channel, tmp_path)
+            for name in ("first_light", "errors"):
+                done = starhil("session", name, "--can", channel, "--log", tmp_path / name)
+                assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    frames = dissect(recording)
+    assert len(frames) == sum(1 for _ in read_candump(recording)) > 1_000
+    assert [frame for frame in frames if frame.malformed] == []
+    of_node = [frame for frame in frames if not frame.extended and frame.identifier & 0x7F == NODE]
+    assert len(of_node) > 1_000
+    assert [frame for frame in of_node if frame.protocols[-1] != "canopen"] == []
+    words = {frame.words for frame in frames if not frame.extended}
+    for service in ("Boot-up", "Operational", "SYNC", "PDO2 (tx)", "Block upload", "Abort transfer"):
+        assert any(service in word for word in words), service
