@@ -33,6 +33,7 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "30–150 random points": SceneSettings(5.5, random_points=(30, 150)),
     "0.5, half covered": SceneSettings(5.5, 0.5, covered=0.5),
     "0.5, 100 false, V ≤ 4.75": SceneSettings(4.75, 0.5, false_stars=100),
+    "0.5, 200 false in half the field": SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5),
 }
 """Row of the table → scene: "σ px, false, missing" of stars to V 5.5 where nothing else is said."""
 

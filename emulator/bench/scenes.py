@@ -39,6 +39,8 @@ class SceneSettings:
         Instead of stars, that many points at uniform positions with magnitudes of the field's stars.
     covered : float
         Share of the field behind a straight edge of random direction, in which no star is seen.
+    cluttered : float
+        Share of the field behind such an edge to which the false stars keep.
     """
 
     limiting_magnitude: float = 5.5
@@ -49,6 +51,7 @@ class SceneSettings:
     brightest: int = 20
     random_points: tuple[int, int] | None = None
     covered: float = 0.0
+    cluttered: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -113,12 +116,19 @@ class SceneMaker:
         rows, xy = np.delete(rows, victims), np.delete(xy, victims, axis=0)
         magnitudes = np.delete(magnitudes, victims)
         xy = xy + settings.sigma_px * rng.standard_normal(xy.shape)
-        xy = np.concatenate([xy, self._uniform(false.size, rng)])
+        xy = np.concatenate([xy, self._clutter(false.size, settings.cluttered, rng)])
         star = np.concatenate([rows, np.full(false.size, -1)])
         return self._shuffled(attitude, xy, np.concatenate([magnitudes, false]), star, settings, rng)
 
     def _uniform(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         return rng.random((count, 2)) * [self.camera.width, self.camera.height] - 0.5
+
+    def _clutter(self, count: int, share: float, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Uniform positions in a share of the field behind a straight edge of random direction."""
+        if share >= 1.0:
+            return self._uniform(count, rng)
+        places = self._uniform(int(2.0 * count / share) + 64, rng)
+        return places[~self._uncovered(places, share, rng)][:count]
 
     def _uncovered(
         self, xy: NDArray[np.float64], share: float, rng: np.random.Generator

@@ -22,6 +22,7 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.answer import Answer
+from starid.geometric.given import checked_detections
 from starid.geometric.index_choice import (
     default_limiting_magnitude,
     index_settings,
@@ -39,6 +40,7 @@ from starid.geometric.settings import (
     MAGNITUDE_GATE,
     MAX_TRIANGLES,
     NOISY,
+    PART_STARS,
     PX_PER_RAD,
     SCALE_TOLERANCE,
     SEARCH_TOLERANCE,
@@ -49,11 +51,13 @@ from starid.geometric.settings import (
     WINDOW,
 )
 from starid.geometric.tracking import track_kernel
+from starid.geometric.verification import ROTATIONS
 from starid.solution import Mode, Reason, Solution
 
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
 WIDEST_TOLERANCE: Final = 0.3
+MOST_PART_STARS: Final = 30
 _QUICK_TRIANGLES: Final = 60
 """Triangles tried at each of several focal lengths before any gets the whole effort."""
 
@@ -78,7 +82,10 @@ class Effort:
     magnitude_gate : float
         Largest deviation of a star's magnitude from what its flux says.
     max_triangles : int
-        Triangles of detections looked up before giving up.
+        Triangles of detections looked up before giving up on the field as a whole.
+    part_stars : int
+        Brightest detections of each part of the field, quadrants and middle, of which every triangle is
+        tried after that; 0 for none.
     max_false_probability, max_false_probability_tracking : float
         Largest bound on the probability of a false answer that is accepted, lost in space and near a
         predicted attitude.
@@ -88,14 +95,18 @@ class Effort:
     window_px: float = 12.0
     test_window_px: float = 10.0
     magnitude_gate: float = 1.5
-    max_triangles: int = 2400
+    max_triangles: int = 1600
+    part_stars: int = 8
     max_false_probability: float = 1e-5
     max_false_probability_tracking: float = 1e-5
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not 0.0 < value < math.inf:
+            if field.name == "part_stars":
+                if not 0 <= value <= MOST_PART_STARS:
+                    raise StaridError(f"identifier part_stars: {value} given, 0…{MOST_PART_STARS} needed")
+            elif not 0.0 < value < math.inf:
                 raise StaridError(f"identifier {field.name}: {value} given, a positive number needed")
 
     def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
@@ -104,6 +115,7 @@ class Effort:
         numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
         numbers[MAGNITUDE_GATE] = self.magnitude_gate
         numbers[MAX_TRIANGLES] = self.max_triangles
+        numbers[PART_STARS] = self.part_stars
         numbers[WINDOW] = self.window_px
         numbers[TEST_WINDOW] = self.test_window_px / px_per_rad
         numbers[LARGEST_SIGMA] = self.window_px / 3.0
@@ -212,7 +224,7 @@ class Identifier:
             The arrays do not fit each other, or hold values that are not finite.
         """
         begin = time.perf_counter()
-        xy, brightness, sigmas = _checked(xy_px, flux, xy_sigma_px)
+        xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
         numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
         if self._fov_tolerance > 0.0:
             return self._identify_any_scale(xy, brightness, sigmas, numbers, begin)
@@ -229,7 +241,8 @@ class Identifier:
     ) -> Solution:
         """Try focal lengths from the nominal one outward, each with its share of the tolerance.
 
-        All of them get a little effort before any gets the whole.
+        All of them get a little effort before any gets the whole. Each bounds the probability of a false answer
+        of its own: the bound on that of any of them is as many times as high.
         """
         steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
         share = self._fov_tolerance / (2 * steps - 1)
@@ -239,15 +252,20 @@ class Identifier:
             scaled_camera(self._camera, 1.0 + 2.0 * share * step)
             for step in sorted(range(1 - steps, steps), key=abs)
         ]
+        numbers[LOG_CHANCE] -= math.log(len(cameras))
         solution = Solution.invalid(Reason.NO_MATCH)
-        for triangles in (_QUICK_TRIANGLES, self._effort.max_triangles):
-            numbers[MAX_TRIANGLES] = triangles
+        for triangles, part_stars in (
+            (_QUICK_TRIANGLES, 0),
+            (self._effort.max_triangles, self._effort.part_stars),
+        ):
+            numbers[MAX_TRIANGLES], numbers[PART_STARS] = triangles, part_stars
             for camera in cameras:
                 answer = identify_kernel(self._index, camera.params, xy, brightness, sigmas, numbers)
                 solution = self._solution(answer, "lost_in_space", begin)
                 if solution.valid:
                     found = scaled_camera(camera, 1.0 / float(answer.numbers[3]))
-                    return dataclasses.replace(solution, camera=found)
+                    false = min(solution.probability_false * len(cameras), 1.0)
+                    return dataclasses.replace(solution, camera=found, probability_false=false)
         return solution
 
     def track(
@@ -275,18 +293,64 @@ class Identifier:
         StaridError
             The arrays do not fit each other, or hold values that are not finite.
         """
-        begin = time.perf_counter()
-        xy, brightness, sigmas = _checked(xy_px, flux, xy_sigma_px)
         window = TRACKING_WINDOW_PX if window_px is None else window_px
-        if not 0.0 < window < math.inf:
-            raise StaridError(f"tracking window_px: {window} given, a positive number of pixels needed")
+        return self._near(xy_px, flux, predicted, xy_sigma_px, window, anywhere=False)
+
+    def verify(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        suspected: Attitude | ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        window_px: float,
+    ) -> Solution:
+        """Attitude near one that somebody picked from the whole sky: held to what `identify` demands.
+
+        Parameters
+        ----------
+        xy_px, flux, suspected, xy_sigma_px, window_px
+            As in `track`. That the attitude is near the suspected one is no evidence for it.
+
+        Raises
+        ------
+        StaridError
+            As in `track`.
+        """
+        return self._near(xy_px, flux, suspected, xy_sigma_px, window_px, anywhere=True)
+
+    def _near(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        predicted: Attitude | ArrayLike,
+        xy_sigma_px: ArrayLike | None,
+        window_px: float,
+        *,
+        anywhere: bool,
+    ) -> Solution:
+        """Look near an attitude, which is worth something beforehand or (`anywhere`) is not."""
+        begin = time.perf_counter()
+        xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
+        if not 0.0 < window_px < math.inf:
+            raise StaridError(f"tracking window_px: {window_px} given, a positive number of pixels needed")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        window = window_px / self._px_per_rad
+        prior = self._turns_within(window)
+        if anywhere:
+            prior, numbers = ROTATIONS, numbers.copy()
+            numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
         answer = track_kernel(
-            self._index, self._camera.params, xy, brightness, sigmas, numbers, attitude.matrix,
-            window / self._px_per_rad,
-        )  # fmt: skip
+            self._index, self._camera.params, xy, brightness, sigmas, numbers, attitude.matrix, window, prior
+        )
         return self._solution(answer, "tracking", begin)
+
+    def _turns_within(self, window_rad: float) -> float:
+        """Volume of the turns that leave every star of the field within a window, rad³."""
+        # a star at the border of the field stays within it after a roll of window/(field's radius)
+        radius = math.sqrt(self._camera.width * self._camera.height / math.pi) / self._px_per_rad
+        return min(2.0 * math.pi * window_rad**2 * min(window_rad / radius, math.pi), ROTATIONS)
 
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""
@@ -294,10 +358,19 @@ class Identifier:
         self.identify(xy, np.ones(6))
         self.track(xy, np.ones(6), Attitude.identity())
 
-    def with_camera(self, camera: Camera) -> Identifier:
-        """Identifier for a camera refined from this one (same size, focal length within the tolerance).
+    def with_camera(
+        self, camera: Camera, *, fov_tolerance: float = 0.0, effort: Effort | None = None
+    ) -> Identifier:
+        """Identifier for a camera like this one (same size, focal length within the tolerance), sharing the index.
 
-        It shares the index, and takes the focal length as known.
+        Parameters
+        ----------
+        camera : Camera
+            The other camera.
+        fov_tolerance : float
+            Relative uncertainty of its focal length.
+        effort : Effort, optional
+            Bounds of its search, by default those of this one; no window may be wider than this one's.
         """
         if (camera.width, camera.height) != (self._camera.width, self._camera.height):
             raise StaridError(
@@ -307,9 +380,10 @@ class Identifier:
         other = object.__new__(Identifier)
         other.__dict__.update(self.__dict__)
         other._camera = camera
-        other._fov_tolerance = 0.0
+        other._fov_tolerance = fov_tolerance
+        other._effort = effort or self._effort
         other._px_per_rad = pixels_per_radian(camera)
-        other._numbers = self._effort.numbers(camera, other._px_per_rad)
+        other._numbers = other._effort.numbers(camera, other._px_per_rad)
         other._numbers_with_errors = other._numbers.copy()
         other._numbers_with_errors[SIGMAS_KNOWN] = 1.0
         return other
@@ -348,31 +422,3 @@ def scaled_camera(camera: Camera, factor: float) -> Camera:
     """Camera with the focal length times a factor."""
     fx, fy = camera.focal_px
     return dataclasses.replace(camera, focal_px=(fx * factor, fy * factor))
-
-
-def _checked(
-    xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Own, contiguous copies of the input, or a one-line error."""
-    xy = np.array(xy_px, dtype=np.float64, order="C")
-    brightness = np.array(flux, dtype=np.float64, order="C")
-    if xy.size == 0:
-        xy = xy.reshape(-1, 2)
-    n = xy.shape[0]
-    if xy.ndim != 2 or xy.shape[1] != 2 or brightness.shape != (n,):
-        raise StaridError(
-            f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
-        )
-    sigmas = np.ones((n, 2))
-    if xy_sigma_px is not None:
-        given = np.asarray(xy_sigma_px, dtype=np.float64)
-        if given.shape not in {(n,), (n, 2)}:
-            raise StaridError(
-                f"detections: errors {given.shape} given for {n} positions, (n,) or (n, 2) needed"
-            )
-        sigmas[:] = given if given.ndim == 2 else given[:, None]
-        if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):
-            raise StaridError("detections: every position error must be finite and positive")
-    if not (np.isfinite(xy).all() and np.isfinite(brightness).all()):
-        raise StaridError("detections: positions and flux must be finite numbers")
-    return xy, brightness, sigmas

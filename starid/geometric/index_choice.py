@@ -45,7 +45,7 @@ DEEP_SIDES: Final = (0.12, 0.95)
 MIDDLE_SIDE: Final = 0.5
 """Rather fewer deep pattern stars than triangles that must be smaller than this share."""
 
-SIDE_BINS: Final = 68
+SIDE_BINS: Final = 128
 _STARS_PER_QUOTA: Final = 30.0
 """Pattern stars of the whole sky, times the field's solid angle, over the quota; found by building."""
 

@@ -53,6 +53,9 @@ OFFSET_V: Final = 14
 """Position from the camera's centre, pixels."""
 COLUMNS: Final = 15
 
+NOWHERE: Final = 1e-9
+"""Length of the direction of a detection that sees none."""
+
 FAINTEST: Final = 99.0
 """Instrumental magnitude of a detection without positive flux."""
 
@@ -137,14 +140,14 @@ def observe(raw: Raw) -> Table:
 def observe_again(raw: Raw, given: Table, scale: float, seen: Table) -> None:
     """Fill `seen` with the same detections under a focal length divided by `scale`.
 
-    A detection that sees no direction then gets none: it lies near no star.
+    A detection that sees no direction then gets one of no length to speak of: it lies near no star.
     """
     for i in range(given.shape[0]):
         for column in range(COLUMNS):
             seen[i, column] = given[i, column]
         row = int(np.int64(given[i, SOURCE]))
         if not look(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], seen, i):
-            seen[i, X], seen[i, Y], seen[i, Z] = 0.0, 0.0, 0.0
+            seen[i, X], seen[i, Y], seen[i, Z] = 0.0, 0.0, NOWHERE
 
 
 @inner

@@ -8,7 +8,8 @@ little else. With a large quota come the *deep* ones: triangles of middling size
 stars. A narrow field has more sky to cover, and gets by with smaller triangles.
 
 Sides are chords of the unit sphere (2·sin(angle/2)), sorted longest first; corner k lies opposite side k.
-Triangles are binned by handedness and all three sides, so that a query reads a few short runs.
+Triangles stand in rows of like handedness, longest and middle side, each row sorted by the shortest, so that
+a query reads a few short runs.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from starid.geometric.jit_kernels import entry, inner
 from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.geometric.sky_grid import FACES, build_sky_grid, cell_of
 
-INDEX_VERSION: Final = 4
+INDEX_VERSION: Final = 5
 """Raised whenever the same catalogue and settings would give another index."""
 
 SIDE_STEPS: Final = 65535
@@ -54,11 +55,12 @@ class IndexArrays(NamedTuple):
     counts : ndarray (cells + 1, bins) int32
         Stars down to a magnitude bin in a cap with the area of the field around each coarse cell; the last
         row counts the whole sky.
-    bin_start : ndarray int32
-        Triangles of bin ``((hand · b + longest) · b + middle) · b + shortest`` stand in
-        ``[start[bin], start[bin + 1])``.
-    patterns : ndarray (p, 6) uint16
-        Longest, middle and shortest chord in steps, and the pattern star opposite each.
+    row_start : ndarray int32
+        Triangles of row r (`pattern_row`) stand in ``[start[r], start[r + 1])``, the shortest side rising.
+    sides : ndarray (p, 3) uint16
+        Longest, middle and shortest chord in steps.
+    corners : ndarray (p, 3) uint16
+        The pattern star opposite each.
     pattern_stars : ndarray int32
         Row of `stars` for each pattern star.
     numbers : ndarray (7,) float64
@@ -70,8 +72,9 @@ class IndexArrays(NamedTuple):
     grid_start: NDArray[np.int32]
     grid_stars: NDArray[np.int32]
     counts: NDArray[np.int32]
-    bin_start: NDArray[np.int32]
-    patterns: NDArray[np.uint16]
+    row_start: NDArray[np.int32]
+    sides: NDArray[np.uint16]
+    corners: NDArray[np.uint16]
     pattern_stars: NDArray[np.int32]
     numbers: NDArray[np.float64]
 
@@ -110,7 +113,7 @@ class IndexSettings:
     cells_per_edge : int
         Fineness of the sky grid.
     side_bins : int
-        Bins for each side.
+        Bins for the longest and the middle side.
     """
 
     limiting_magnitude: float
@@ -193,6 +196,12 @@ def handedness(vectors: NDArray[np.float64], i: int, j: int, k: int) -> int:
     return 1 if product > 0.0 else 0
 
 
+@inner
+def pattern_row(hand: int, longest: int, middle: int, bins: int) -> int:
+    """Row of the triangles of a handedness and two bins, middle ≤ longest; rows of one longest bin adjoin."""
+    return (hand * bins * (bins + 1) + longest * (longest + 1)) // 2 + middle
+
+
 @entry
 def _triangles(
     vectors: NDArray[np.float64],
@@ -203,7 +212,7 @@ def _triangles(
     deep_sides: tuple[float, float],
     bins: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
-    """All triangles i < j < k with sides within their limits: patterns and bins (see `IndexArrays`)."""
+    """All triangles i < j < k with sides within their limits: sides and corners (p, 6), and rows."""
     longest = bright_sides[1]
     step = longest / SIDE_STEPS
     count = 0
@@ -241,8 +250,7 @@ def _triangles(
                         hand = handedness(vectors, a, b, c)
                         bin0 = min(int(s0 / longest * bins), bins - 1)
                         bin1 = min(int(s1 / longest * bins), bins - 1)
-                        bin2 = min(int(s2 / longest * bins), bins - 1)
-                        binned[count] = ((hand * bins + bin0) * bins + bin1) * bins + bin2
+                        binned[count] = pattern_row(hand, bin0, bin1, bins)
                     count += 1
     return patterns, binned
 
@@ -309,9 +317,10 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
             f"index: no triangle of stars to V {settings.limiting_magnitude:g} fits the field; "
             "raise the limiting magnitude"
         )
-    order = np.argsort(binned, kind="stable")
-    bin_start = np.zeros(2 * bins**3 + 1, dtype=np.int32)
-    np.cumsum(np.bincount(binned, minlength=2 * bins**3), out=bin_start[1:])
+    order = np.lexsort((patterns[:, 2], binned))
+    rows = bins * (bins + 1)
+    row_start = np.zeros(rows + 1, dtype=np.int32)
+    np.cumsum(np.bincount(binned, minlength=rows), out=row_start[1:])
     magnitude_bins = max(int((settings.limiting_magnitude - BRIGHTEST_BIN) * BINS_PER_MAGNITUDE) + 1, 1)
     cap_cosine = 1.0 - settings.field_area_sr / (2.0 * math.pi)
     counts = _count_field_stars(vectors, magnitudes, cap_cosine, magnitude_bins)
@@ -331,8 +340,9 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
         grid_start=grid_start,
         grid_stars=grid_stars,
         counts=counts,
-        bin_start=bin_start,
-        patterns=np.ascontiguousarray(patterns[order]),
+        row_start=row_start,
+        sides=np.ascontiguousarray(patterns[order, :3]),
+        corners=np.ascontiguousarray(patterns[order, 3:]),
         pattern_stars=pattern_stars.astype(np.int32),
         numbers=numbers,
     )

@@ -2,7 +2,8 @@
 
 Detections are taken by falling flux; triangle (i, j, k) is tried after all triangles of brighter stars, so
 that few false stars among the brightest delay the answer and many do not prevent it: when the brightest are
-exhausted, triangles drawn from a wider choice follow.
+exhausted, triangles drawn from a wider choice follow. At last, where clutter fills much of the field, its
+parts are searched one by one.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from starid.geometric.answer import (
     new_candidate,
 )
 from starid.geometric.jit_kernels import entry, inner
-from starid.geometric.observation import MAGNITUDE, Raw, Table, X, Y, Z, observe, scaled
+from starid.geometric.look_up import look_up
+from starid.geometric.observation import MAGNITUDE, OFFSET_U, OFFSET_V, Raw, Table, X, Y, Z, observe, scaled
 from starid.geometric.pattern_index import (
     DEEP_LONGEST,
     DEEP_SHORTEST,
     SHORTEST_SIDE,
-    SIDE_BINS,
     SIDE_STEP,
     SIDE_STEPS,
     STAR_MAGNITUDE,
@@ -43,22 +44,29 @@ from starid.geometric.settings import (
     MAGNITUDE_GATE,
     MAX_TRIANGLES,
     NOTHING,
+    PART_STARS,
     SCALE_TOLERANCE,
     SEARCH_TOLERANCE,
     TEST_WINDOW,
     TOO_FEW,
 )
 from starid.geometric.verification import ROTATIONS, hit_odds, test_order
-from starid.projection import MODEL
+from starid.projection import HEIGHT, MODEL, WIDTH
 
 SYSTEMATIC: Final = 14
 """Brightest detections of which every triangle is tried first."""
 
-DRAWN_FROM: Final = 120
+DRAWN_FROM: Final = 200
 """Brightest detections from which further triangles are drawn."""
 
-DRAWN_TOLERANCE: Final = 0.5
+STRICT_TOLERANCE: Final = 0.5
 """Tolerance of their sides as a share of that of the first: they are many, and each must be cheap."""
+
+STRICT_GATE: Final = 0.6
+"""Deviation of their magnitudes as a share of that of the first."""
+
+PARTS: Final = 5
+"""Parts of the field: four quadrants and the middle."""
 
 MOST_FOUND: Final = 4096
 """Triangles of the index tried for one of detections."""
@@ -99,86 +107,41 @@ def make_frame(frame: Table) -> None:
 
 
 @inner
-def set_rotation(
+def set_sensor_frame(
     given: Table,
     detections: tuple[int, int, int],
     model: float,
     scale: float,
-    star_table: NDArray[np.float64],
-    stars: tuple[int, int, int],
     frames: NDArray[np.float64],
 ) -> None:
-    """Fill ``frames[2]`` with the ICRS→sensor matrix that carries three stars into three detections.
-
-    The second and the third should be far apart: they give the roll.
+    """Fill ``frames[0]`` with the frame of three detections.
 
     Parameters
     ----------
     model, scale : float
         Model of the camera, and by what its focal length is to be divided.
-    frames : ndarray (3, 3, 3)
-        The other two are workspace: the frame of the detections, and that of the stars.
+    """
+    for row in range(3):
+        copy_corner(given, detections[row], model, scale, frames[0], row)
+    make_frame(frames[0])
+
+
+@inner
+def set_rotation(
+    star_table: NDArray[np.float64], stars: tuple[int, int, int], frames: NDArray[np.float64]
+) -> None:
+    """Fill ``frames[2]`` with the ICRS→sensor matrix that carries three stars into the detections of ``frames[0]``.
+
+    The second and the third should be far apart: they give the roll. ``frames[1]`` is workspace.
     """
     sensor, sky = frames[0], frames[1]
     for row in range(3):
-        copy_corner(given, detections[row], model, scale, sensor, row)
-        copy_corner(star_table, stars[row], model, 1.0, sky, row)
-    make_frame(sensor)
+        for axis in range(3):
+            sky[row, axis] = star_table[stars[row], axis]
     make_frame(sky)
     for i in range(3):
         for j in range(3):
             frames[2, i, j] = sensor[0, i] * sky[0, j] + sensor[1, i] * sky[1, j] + sensor[2, i] * sky[2, j]
-
-
-@inner
-def _look_up(
-    patterns: NDArray[np.uint16],
-    bin_start: NDArray[np.int32],
-    numbers: NDArray[np.float64],
-    triangle: tuple[float, float, float],
-    hand: int,
-    tolerance: float,
-    spread: float,
-    found: NDArray[np.int64],
-) -> int:
-    """Fill in the index's triangles with the given sides, longest first; return how many.
-
-    With a `spread` the sides may all be longer or shorter by one factor within 1 ± spread.
-    """
-    s0, s1, s2 = triangle
-    bins, step = int(numbers[SIDE_BINS]), numbers[SIDE_STEP]
-    longest = step * SIDE_STEPS
-    per_side = bins / longest
-    low0, high0 = s0 * (1.0 - spread) - tolerance, min(s0 * (1.0 + spread) + tolerance, longest)
-    first_bin = max(int(low0 * per_side), 0)
-    last_bin = min(int(high0 * per_side), bins - 1)
-    ratio_low, ratio_high, scale = 1.0, 1.0, 1.0
-    count = 0
-    for bin0 in range(first_bin, last_bin + 1):
-        if spread > 0.0:
-            ratio_low = max(bin0 / per_side - tolerance, low0) / s0
-            ratio_high = min((bin0 + 1) / per_side + tolerance, high0) / s0
-        low1 = max(int((s1 * ratio_low - tolerance) * per_side), 0)
-        high1 = min(int((s1 * ratio_high + tolerance) * per_side), bins - 1)
-        low2 = max(int((s2 * ratio_low - tolerance) * per_side), 0)
-        high2 = min(int((s2 * ratio_high + tolerance) * per_side), bins - 1)
-        for bin1 in range(low1, high1 + 1):
-            row = ((hand * bins + bin0) * bins + bin1) * bins
-            for pattern in range(bin_start[row + low2], bin_start[row + high2 + 1]):
-                p0 = patterns[pattern, 0] * step
-                if p0 < low0 or p0 > high0:
-                    continue
-                if spread > 0.0:
-                    scale = p0 / s0
-                if abs(patterns[pattern, 1] * step - s1 * scale) > tolerance:
-                    continue
-                if abs(patterns[pattern, 2] * step - s2 * scale) > tolerance:
-                    continue
-                found[count] = pattern
-                count += 1
-                if count == found.shape[0]:
-                    return count
-    return count
 
 
 @inner
@@ -193,21 +156,24 @@ def _try_patterns(
     longest_side: float,
     found: NDArray[np.int64],
     count: int,
+    gate: float,
 ) -> float:
     """Try the index's triangles found for one of detections.
 
     Returns the bound of the first that stands, left in `candidate`, or 0.
     """
-    stars, patterns, pattern_stars = index.stars, index.patterns, index.pattern_stars
+    stars, sides, corner_stars = index.stars, index.sides, index.corners
     frames, numbers = candidate.frames, candidate.numbers
     i, j, k = corners
-    spread, gate = settings[SCALE_TOLERANCE], settings[MAGNITUDE_GATE]
+    spread = settings[SCALE_TOLERANCE]
     mi, mj, mk = given[i, MAGNITUDE], given[j, MAGNITUDE], given[k, MAGNITUDE]
+    numbers[SCALE] = 1.0
+    framed = False
     for n in range(count):
         pattern = found[n]
-        a = int(np.int64(pattern_stars[patterns[pattern, 3]]))
-        b = int(np.int64(pattern_stars[patterns[pattern, 4]]))
-        c = int(np.int64(pattern_stars[patterns[pattern, 5]]))
+        a = int(np.int64(index.pattern_stars[corner_stars[pattern, 0]]))
+        b = int(np.int64(index.pattern_stars[corner_stars[pattern, 1]]))
+        c = int(np.int64(index.pattern_stars[corner_stars[pattern, 2]]))
         da, db, dc = (
             stars[a, STAR_MAGNITUDE] - mi,
             stars[b, STAR_MAGNITUDE] - mj,
@@ -216,35 +182,17 @@ def _try_patterns(
         zero_point = (da + db + dc) / 3.0
         if abs(da - zero_point) > gate or abs(db - zero_point) > gate or abs(dc - zero_point) > gate:
             continue
-        numbers[ZERO_POINT], numbers[SCALE] = zero_point, 1.0
+        numbers[ZERO_POINT] = zero_point
         if spread > 0.0:
-            numbers[SCALE] = patterns[pattern, 0] * index.numbers[SIDE_STEP] / longest_side
-        set_rotation(given, corners, raw.params[MODEL], numbers[SCALE], stars, (a, b, c), frames)
+            numbers[SCALE] = sides[pattern, 0] * index.numbers[SIDE_STEP] / longest_side
+        if spread > 0.0 or not framed:
+            set_sensor_frame(given, corners, raw.params[MODEL], numbers[SCALE], frames)
+            framed = True
+        set_rotation(stars, (a, b, c), frames)
         _, bound = judged(index, raw, given, settings, candidate, tests, corners, ROTATIONS)
         if bound < settings[LOG_CHANCE]:
             return bound
     return 0.0
-
-
-@inner
-def chord_table(given: Table, count: int) -> NDArray[np.float64]:
-    """Chords (count, count) between the first detections."""
-    table = np.zeros((count, count))
-    for i in range(count):
-        for j in range(i):
-            table[i, j] = chord(given, i, j)
-            table[j, i] = table[i, j]
-    return table
-
-
-@inner
-def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
-    """Next of the triangles i < j < k in the order (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4)."""
-    if i + 1 < j:
-        return i + 1, j, k
-    if j + 1 < k:
-        return 0, j + 1, k
-    return 0, 1, k + 1
 
 
 @inner
@@ -262,6 +210,42 @@ def _drawn(state: np.uint64, choice: int) -> tuple[np.uint64, int, int, int]:
     )
 
 
+@inner
+def _worth_looking_up(given: Table, i: int, j: int, k: int, bounds: tuple[float, float, float]) -> bool:
+    """Whether a triangle of detections has sides within the bounds, and is none too flat."""
+    c0, c1, c2 = chord(given, j, k), chord(given, i, k), chord(given, i, j)
+    shortest, longest = min(c0, c1, c2), max(c0, c1, c2)
+    return shortest >= bounds[0] and longest <= bounds[1] and c0 + c1 + c2 - 2.0 * longest >= bounds[2]
+
+
+@inner
+def _members(raw: Raw, given: Table, part: int) -> NDArray[np.int64]:
+    """Detections in one of the `PARTS` of the field, four quadrants and the middle, brightest first."""
+    half_width, half_height = 0.25 * raw.params[WIDTH], 0.25 * raw.params[HEIGHT]
+    members = np.empty(given.shape[0], dtype=np.int64)
+    count = 0
+    for i in range(given.shape[0]):
+        u, v = given[i, OFFSET_U], given[i, OFFSET_V]
+        if part == PARTS - 1:
+            inside = abs(u) < half_width and abs(v) < half_height
+        else:
+            inside = (u < 0.0) == (part % 2 == 0) and (v < 0.0) == (part < 2)
+        if inside:
+            members[count] = i
+            count += 1
+    return members[:count]
+
+
+@inner
+def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
+    """Next of the triangles i < j < k in the order (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4)."""
+    if i + 1 < j:
+        return i + 1, j, k
+    if j + 1 < k:
+        return 0, j + 1, k
+    return 0, 1, k + 1
+
+
 @entry
 def identify_kernel(
     index: IndexArrays,
@@ -271,55 +255,68 @@ def identify_kernel(
     sigmas: NDArray[np.float64],
     settings: NDArray[np.float64],
 ) -> Answer:
-    """Find the attitude of a set of detections without knowing anything of it."""
+    """Find the attitude of a set of detections without knowing anything of it.
+
+    In stage 0 come the triangles of the brightest detections, in stage 1 those drawn from more of them, in
+    each further stage those of the brightest of one part of the field. The detections of a part also give its
+    sequential test, so that clutter elsewhere outvotes nothing; what it finds is refined and judged on the
+    whole field all the same.
+    """
     raw = Raw(params, xy, flux, sigmas)
     given = observe(raw)
     n = given.shape[0]
     candidate = new_candidate(n)
-    tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
-    found = np.empty(MOST_FOUND, dtype=np.int64)
-    spread, tolerance = settings[SCALE_TOLERANCE], settings[SEARCH_TOLERANCE]
-    shortest = index.numbers[SHORTEST_SIDE] / (1.0 + spread)
-    longest = index.numbers[SIDE_STEP] * SIDE_STEPS / (1.0 - spread)
-    limit = int(settings[MAX_TRIANGLES])
-    systematic, choice = min(n, SYSTEMATIC), min(n, DRAWN_FROM)
-    chords = chord_table(given, systematic)
-    i, j, k = 0, 0, 1
-    drawing = False
-    state = np.uint64(_SEED)
-    triangles, candidates = 0, 0
-    status, bound = NOTHING, 0.0
     if n < LEAST_MATCHED:
-        status, limit = TOO_FEW, 0
-    for _ in range(4 * limit):
-        if not drawing:
+        return finish(TOO_FEW, given, candidate, settings, 0.0, 0, 0)
+    odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
+    found = np.empty(MOST_FOUND, dtype=np.int64)
+    spread, limit, numbers = settings[SCALE_TOLERANCE], int(settings[MAX_TRIANGLES]), index.numbers
+    tolerance, gate = settings[SEARCH_TOLERANCE], settings[MAGNITUDE_GATE]
+    widest = numbers[SIDE_STEP] * SIDE_STEPS / (1.0 - spread)
+    bounds = (numbers[SHORTEST_SIDE] / (1.0 + spread), widest, tolerance)
+    members, draws, state = np.arange(min(n, SYSTEMATIC)), 0, np.uint64(_SEED)
+    stage, i, j, k = 0, 0, 0, 1
+    triangles, candidates, bound = 0, 0, 0.0
+    while True:
+        if stage == 1:
+            draws += 1
+            state, a, b, c = _drawn(state, min(n, DRAWN_FROM))
+            over = triangles >= limit or draws > 4 * limit
+        else:
             i, j, k = _next_triangle(i, j, k)
-            if k == systematic:
-                if choice <= systematic:
-                    break
-                drawing = True
-                tolerance *= DRAWN_TOLERANCE
-                shortest = index.numbers[DEEP_SHORTEST] / (1.0 + spread)
-                longest = index.numbers[DEEP_LONGEST] / (1.0 - spread)
-                chords = chord_table(given, choice)
-        if drawing:
-            state, i, j, k = _drawn(state, choice)
-            if i in (j, k) or j == k:
-                continue
-        s0, s1, s2, a, b, c = sorted_triangle(chords[j, k], chords[i, k], chords[i, j], i, j, k)
-        if s2 < shortest or s0 > longest or s1 + s2 - s0 < tolerance:
-            continue
-        triangles += 1
-        hand = handedness(given, a, b, c)
-        count = _look_up(
-            index.patterns, index.bin_start, index.numbers, (s0, s1, s2), hand, tolerance, spread, found
-        )
-        if count > 0:
-            candidates += count
-            bound = _try_patterns(index, raw, given, settings, candidate, tests, (a, b, c), s0, found, count)
-            if bound < 0.0:
-                status = ACCEPTED
+            over = k >= members.shape[0] or (stage == 0 and triangles >= limit)
+            if not over:
+                a, b, c = members[i], members[j], members[k]
+        if over:
+            stage, i, j, k = stage + 1, 0, 0, 1
+            if stage == 1:
+                bounds = (
+                    numbers[DEEP_SHORTEST] / (1.0 + spread),
+                    numbers[DEEP_LONGEST] / (1.0 - spread),
+                    tolerance * STRICT_TOLERANCE,
+                )
+                gate *= STRICT_GATE
+            if n <= SYSTEMATIC or stage > 1 + PARTS or (stage > 1 and settings[PART_STARS] < 3.0):
                 break
-        if triangles >= limit:
-            break
+            if stage > 1:
+                members = _members(raw, given, stage - 2)
+                order = members[test_order(members.shape[0])]
+                members = members[: int(settings[PART_STARS])]
+            continue
+        if a in (b, c) or b == c or not _worth_looking_up(given, a, b, c, bounds):
+            continue
+        s0, s1, s2, a, b, c = sorted_triangle(
+            chord(given, b, c), chord(given, a, c), chord(given, a, b), a, b, c
+        )
+        hand = handedness(given, a, b, c)
+        count = look_up(index, (s0, s1, s2), hand, bounds[2], spread, found)
+        triangles += 1
+        candidates += count
+        if count > 0:
+            bound = _try_patterns(
+                index, raw, given, settings, candidate, (odds, order), (a, b, c), s0, found, count, gate
+            )
+            if bound < 0.0:
+                break
+    status = ACCEPTED if bound < 0.0 else NOTHING
     return finish(status, given, candidate, settings, bound, triangles, candidates)

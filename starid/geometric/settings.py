@@ -28,7 +28,9 @@ SIGMAS_KNOWN: Final = 10
 """Not 0 where the errors of the positions are given."""
 FIELD_PX: Final = 11
 """Pixels in the field."""
-SETTING_COUNT: Final = 12
+PART_STARS: Final = 12
+"""Brightest detections of each part of the field that triangles are made of, 0 for none."""
+SETTING_COUNT: Final = 13
 
 NOTHING: Final = 0
 ACCEPTED: Final = 1

@@ -8,7 +8,6 @@ window, roll included, is followed; anything else is refused.
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
@@ -34,20 +33,18 @@ from starid.geometric.pattern_index import (
     chord,
 )
 from starid.geometric.refinement import SCALE, ZERO_POINT
-from starid.geometric.search import set_rotation
+from starid.geometric.search import set_rotation, set_sensor_frame
 from starid.geometric.settings import (
     ACCEPTED,
-    FIELD_PX,
     LOG_CHANCE_TRACKING,
     MAGNITUDE_GATE,
     NOTHING,
-    PX_PER_RAD,
     SEARCH_TOLERANCE,
     TEST_WINDOW,
     TOO_FEW,
 )
 from starid.geometric.sky_grid import cell_of
-from starid.geometric.verification import ROTATIONS, hit_odds, test_order
+from starid.geometric.verification import hit_odds, test_order
 from starid.projection import MODEL
 
 PAIRED: Final = 16
@@ -103,7 +100,8 @@ def _try_pair(
     if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
         return 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
-    set_rotation(given, (i, i, j), raw.params[MODEL], 1.0, index.stars, (a, a, b), candidate.frames)
+    set_sensor_frame(given, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
+    set_rotation(index.stars, (a, a, b), candidate.frames)
     _, bound = judged(index, raw, given, settings, candidate, tests, (i, j, j), prior_volume)
     return bound
 
@@ -153,6 +151,7 @@ def track_kernel(
     settings: NDArray[np.float64],
     predicted: NDArray[np.float64],
     window_rad: float,
+    prior_volume: float,
 ) -> Answer:
     """Find the attitude near a predicted one.
 
@@ -162,15 +161,14 @@ def track_kernel(
         ICRS→sensor.
     window_rad : float
         Largest angle of a star from where the prediction puts it.
+    prior_volume : float
+        Volume of the rotations that were possible beforehand, rad³.
     """
     raw = Raw(params, xy, flux, sigmas)
     given = observe(raw)
     n = given.shape[0]
     candidate = new_candidate(n)
     tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
-    # a star at the border of the field still lies within the window after a turn of window/(field's radius)
-    roll = min(window_rad * settings[PX_PER_RAD] / math.sqrt(settings[FIELD_PX] / math.pi), math.pi)
-    prior_volume = min(2.0 * math.pi * window_rad**2 * roll, ROTATIONS)
     near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
     counts = np.zeros(PAIRED, dtype=np.int64)
     status, bound, work = TOO_FEW if n < LEAST_MATCHED else NOTHING, 0.0, np.zeros(2, dtype=np.int64)

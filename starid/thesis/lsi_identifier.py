@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ from starid.cache import cache_dir
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
+from starid.geometric.given import checked_detections
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
 from starid.solution import Reason, Solution
@@ -99,15 +100,12 @@ class LsiReport:
     zero_point: float
 
 
-class LsiIdentifier:
-    """Star identification by the LSI algorithm, for one camera against one catalogue.
+@dataclass(frozen=True)
+class LsiOptions:
+    """What an LSI identifier can be told.
 
-    Parameters
+    Attributes
     ----------
-    camera
-        What the detections were taken with.
-    catalog
-        Default: the whole of Hipparcos at its default epoch.
     feature_limit
         Faintest V whose stars make features; by default what gives some 60 stars a field. The sensor must see deeper.
     overlap
@@ -122,6 +120,34 @@ class LsiIdentifier:
         Feature database to use instead of the cached one.
     cache
         Keep database and index in the cache folder.
+    """
+
+    feature_limit: float | None = None
+    overlap: float = 0.99
+    neighbours: int = 30_000
+    zero_point: float | None = None
+    limiting_magnitude: float | None = None
+    database: str | Path | None = None
+    cache: bool = True
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 1:
+            raise StaridError(f"lsi neighbours: {self.neighbours} given, at least 1 needed")
+
+
+class LsiIdentifier:
+    """Star identification by the LSI algorithm, for one camera against one catalogue.
+
+    Parameters
+    ----------
+    camera
+        What the detections were taken with.
+    catalog
+        Default: the whole of Hipparcos at its default epoch.
+    options
+        Default: those of `LsiOptions`.
+    **changes
+        Fields of `LsiOptions` that are to differ from it.
 
     Raises
     ------
@@ -133,31 +159,26 @@ class LsiIdentifier:
         self,
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
-        *,
-        feature_limit: float | None = None,
-        overlap: float = 0.99,
-        neighbours: int = 30_000,
-        zero_point: float | None = None,
-        limiting_magnitude: float | None = None,
-        database: str | Path | None = None,
-        cache: bool = True,
+        options: LsiOptions | None = None,
+        **changes: Any,
     ) -> None:
-        if neighbours < 1:
-            raise StaridError(f"lsi neighbours: {neighbours} given, at least 1 needed")
+        options = dataclasses.replace(options or LsiOptions(), **changes)
         self._catalog = load_catalog() if catalog is None else catalog
         self._camera = camera
-        probe = DatabaseParameters.for_camera(camera, overlap=overlap, kappa=0.0)
+        probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
-        limit = self._limit_for(share) if feature_limit is None else feature_limit
+        limit = self._limit_for(share) if options.feature_limit is None else options.feature_limit
         parameters = dataclasses.replace(probe, kappa=limit)
         seen = seen_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
-        self.database = self._load(seen, parameters, database, cache=cache)
+        self.database = self._load(seen, parameters, options.database, cache=options.cache)
         self.lost_in_space = LostInSpace(self.database)
         self._offset_px = _OFFSET_SHARE * self.database.parameters.half_width_px
-        self._neighbours = neighbours
-        self._zero_point = zero_point
+        self._neighbours = options.neighbours
+        self._zero_point = options.zero_point
         self._star_magnitude = self._magnitude_of_rank(share)
-        self.verifier = Identifier(camera, self._catalog, limiting_magnitude=limiting_magnitude, cache=cache)
+        self.verifier = Identifier(
+            camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
+        )
         self.last_report = LsiReport(None, 0, 0, math.nan)
 
     @property
@@ -243,7 +264,7 @@ class LsiIdentifier:
             The arrays do not fit each other, or hold values that are not finite.
         """
         begin = time.perf_counter()
-        xy, brightness = checked_detections(xy_px, flux)
+        xy, brightness, _ = checked_detections(xy_px, flux)
         tried = verified = 0
         coarse: Attitude | None = None
         enough = False
@@ -260,7 +281,7 @@ class LsiIdentifier:
                 if attitude is None:
                     continue
                 verified += 1
-                solution = self.verifier.track(xy, brightness, attitude, xy_sigma_px, window_px=_WINDOW_PX)
+                solution = self.verifier.verify(xy, brightness, attitude, xy_sigma_px, window_px=_WINDOW_PX)
                 if solution.valid:
                     self.learn(solution, brightness)
                     self.last_report = LsiReport(coarse, tried, verified, zero_point)
@@ -397,18 +418,3 @@ class LsiIdentifier:
             body = np.column_stack([seen, np.full(count, self.database.parameters.focal_px)])
             yield solve_wahba(body, sky.stars[matched[:count, 1], UX : UZ + 1]), place + 1 - start
             start = place + 1
-
-
-def checked_detections(xy_px: ArrayLike, flux: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Own, contiguous copies of the detections, or a one-line error."""
-    xy = np.array(xy_px, dtype=np.float64, order="C")
-    brightness = np.array(flux, dtype=np.float64, order="C")
-    if xy.size == 0:
-        xy = xy.reshape(-1, 2)
-    if xy.ndim != 2 or xy.shape[1] != 2 or brightness.shape != (xy.shape[0],):
-        raise StaridError(
-            f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
-        )
-    if not (np.isfinite(xy).all() and np.isfinite(brightness).all()):
-        raise StaridError("detections: positions and flux must be finite numbers")
-    return xy, brightness

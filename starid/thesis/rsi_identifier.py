@@ -10,8 +10,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.geometric.given import checked_detections
 from starid.solution import Reason, Solution
 from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import FilterError, ObservedFrame
-from starid.thesis.lsi_identifier import FieldStars, LsiIdentifier, checked_detections
+from starid.thesis.lsi_identifier import FieldStars, LsiIdentifier, LsiOptions
 from starid.thesis.rsi import RsiSettings, region_side
 from starid.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings
 
@@ -56,13 +56,12 @@ class RsiStatistics:
     region_sum_deg: float = 0.0
 
 
-class RsiIdentifier:
-    """Star identification by the recursive algorithm, for one camera against one catalogue.
+@dataclass(frozen=True)
+class RsiOptions(LsiOptions):
+    """What an RSI identifier can be told: all that the LSI one can, and this.
 
-    Parameters
+    Attributes
     ----------
-    camera, catalog, feature_limit, overlap, neighbours, zero_point, limiting_magnitude, database, cache
-        As in `LsiIdentifier`.
     gamma_min_deg
         Least side of the region of search, degrees.
     gamma_scale
@@ -73,47 +72,47 @@ class RsiIdentifier:
         One-sigma error of a position per axis that the filter assumes, pixels.
     """
 
+    gamma_min_deg: float = 2.0
+    gamma_scale: float = 1.0
+    filter_false_stars: bool = True
+    position_sigma_px: float = 0.5
+
+
+class RsiIdentifier:
+    """Star identification by the recursive algorithm, for one camera against one catalogue.
+
+    Parameters
+    ----------
+    camera, catalog
+        As in `LsiIdentifier`.
+    options
+        Default: those of `RsiOptions`.
+    **changes
+        Fields of `RsiOptions` that are to differ from it.
+    """
+
     def __init__(
         self,
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
-        *,
-        feature_limit: float | None = None,
-        overlap: float = 0.99,
-        neighbours: int = 30_000,
-        zero_point: float | None = None,
-        limiting_magnitude: float | None = None,
-        database: str | Path | None = None,
-        cache: bool = True,
-        gamma_min_deg: float = 2.0,
-        gamma_scale: float = 1.0,
-        filter_false_stars: bool = True,
-        position_sigma_px: float = 0.5,
+        options: RsiOptions | None = None,
+        **changes: Any,
     ) -> None:
-        self.lsi = LsiIdentifier(
-            camera,
-            catalog,
-            feature_limit=feature_limit,
-            overlap=overlap,
-            neighbours=neighbours,
-            zero_point=zero_point,
-            limiting_magnitude=limiting_magnitude,
-            database=database,
-            cache=cache,
-        )
-        self._settings = RsiSettings(gamma_min_deg=gamma_min_deg, gamma_scale=gamma_scale)
+        options = dataclasses.replace(options or RsiOptions(), **changes)
+        self.lsi = LsiIdentifier(camera, catalog, options)
+        self._settings = RsiSettings(gamma_min_deg=options.gamma_min_deg, gamma_scale=options.gamma_scale)
         scale = math.degrees(1.0 / camera.focal_px[0])
         half_field = 0.5 * self.lsi.database.parameters.fov_deg
         self._filter = (
             TrackFilter(
                 TrackFilterSettings(
-                    position_sigma_deg=position_sigma_px * scale,
+                    position_sigma_deg=options.position_sigma_px * scale,
                     brightness_sigma=0.3,
                     max_rotation_deg=15.0,
                     max_shift_deg=0.5 * half_field,
                 )
             )
-            if filter_false_stars
+            if options.filter_false_stars
             else None
         )
         self._before: ObservedFrame | None = None
@@ -152,7 +151,7 @@ class RsiIdentifier:
         xy_px, flux, xy_sigma_px
             As in `LsiIdentifier.identify`.
         """
-        xy, brightness = checked_detections(xy_px, flux)
+        xy, brightness, _ = checked_detections(xy_px, flux)
         self._follow(xy, brightness)
         return self.lsi.identify(xy, brightness, xy_sigma_px)
 
@@ -179,7 +178,7 @@ class RsiIdentifier:
             Where it is wider than the region, the region is widened to it.
         """
         begin = time.perf_counter()
-        xy, brightness = checked_detections(xy_px, flux)
+        xy, brightness, _ = checked_detections(xy_px, flux)
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         true_stars, side = self._follow(xy, brightness)
         if window_px is not None:
@@ -257,7 +256,7 @@ class RsiIdentifier:
         for attitude, _ in lsi.attitudes(chosen, places):
             if attitude is None:
                 continue
-            solution = lsi.verifier.track(xy, flux, attitude, xy_sigma_px, window_px=_WINDOW_PX)
+            solution = lsi.verifier.verify(xy, flux, attitude, xy_sigma_px, window_px=_WINDOW_PX)
             if solution.valid:
                 lsi.learn(solution, flux)
                 return dataclasses.replace(solution, mode="tracking")

@@ -1,0 +1,63 @@
+"""What a caller gives for detections, checked once and brought into the form of the kernels."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.errors import StaridError
+
+Array = NDArray[np.float64]
+
+
+def _numbers(values: ArrayLike, name: str) -> Array:
+    """Own, contiguous copy of an array of numbers."""
+    try:
+        return np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise StaridError(f"detections: {name} must be an array of numbers ({error})") from error
+
+
+def _all_finite(array: Array) -> bool:
+    """Whether no value is infinite or NaN; fast where the sum of the squares does not overflow."""
+    flat = array.ravel()
+    return math.isfinite(float(flat @ flat)) or bool(np.isfinite(flat).all())
+
+
+def checked_detections(
+    xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None
+) -> tuple[Array, Array, Array]:
+    """Positions (n, 2), flux (n,) and errors (n, 2), ones where none are given: own, contiguous copies.
+
+    Parameters
+    ----------
+    xy_px, flux, xy_sigma_px
+        As in `starid.interface.StarIdentifier.identify`.
+
+    Raises
+    ------
+    StaridError
+        The arrays do not fit each other, or hold what is not a finite number.
+    """
+    xy, brightness = _numbers(xy_px, "positions"), _numbers(flux, "flux")
+    if xy.shape == (0,):
+        xy = xy.reshape(0, 2)
+    if xy.ndim != 2 or xy.shape[1] != 2 or brightness.shape != (len(xy),):
+        raise StaridError(
+            f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
+        )
+    if not (_all_finite(xy) and _all_finite(brightness)):
+        raise StaridError("detections: positions and flux must be finite numbers")
+    sigmas = np.ones(xy.shape)
+    if xy_sigma_px is not None:
+        given = _numbers(xy_sigma_px, "position errors")
+        if given.shape not in {(len(xy),), xy.shape}:
+            raise StaridError(
+                f"detections: errors {given.shape} given for {len(xy)} positions, (n,) or (n, 2) needed"
+            )
+        sigmas[:] = given if given.ndim == 2 else given[:, None]
+        if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):
+            raise StaridError("detections: every position error must be finite and positive")
+    return xy, brightness, sigmas
