@@ -1,0 +1,59 @@
+"""The profile with a real lens has the errors of a real unit, and the calibration alone makes them."""
+
+import numpy as np
+import pytest
+
+from emulator.device.cycle import as_quaternion
+from emulator.device.device import profile_defaults
+from emulator.device.parameters import Parameters
+from emulator.emulation import camera_constants, pipeline_setup
+from emulator.imaging.frames import FrameRequest, SolverSettings, Warm
+from emulator.imaging.picture import Picture
+from emulator.profile import load_profile
+from protocol.icd import load_icd
+from starid.attitude import Attitude, random_attitude
+
+DATA_SHEET_ARCSEC = 55.44
+IDEAL_ARCSEC = 2.0
+FIELDS = 4
+
+
+def errors_arcsec(picture, parameters) -> list[float]:
+    """Errors across the boresight in a few random fields."""
+    settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
+    rng = np.random.default_rng(7)
+    errors = []
+    for index in range(FIELDS):
+        truth = random_attitude(rng)
+        request = FrameRequest(index, as_quaternion(truth), (0.0, 0.0, 0.0), 0.1, 1.0, settings=settings)
+        result = picture.handle(request)
+        assert result.valid, result
+        measured = Attitude(np.array(result.quaternion_xyzw))
+        errors.append(measured.error_to(truth).cross_boresight_arcsec)
+    return errors
+
+
+def test_a_calibration_that_is_a_little_wrong_costs_what_a_data_sheet_allows():
+    profile, icd = load_profile("real_lens", ["run.clock=stepped"]), load_icd()
+    picture = Picture(pipeline_setup(profile))
+    constants = camera_constants(Warm(picture.camera.to_dict(), len(picture.catalog), 0.0))
+    parameters = Parameters(icd, profile_defaults(profile, icd))
+    assert constants.keys() <= profile.parameters.keys()
+    wrong = errors_arcsec(picture, parameters)
+    assert 5.0 < np.median(wrong) < DATA_SHEET_ARCSEC
+    assert max(wrong) < DATA_SHEET_ARCSEC
+    parameters.set(constants)
+    assert max(errors_arcsec(picture, parameters)) < IDEAL_ARCSEC
+
+
+@pytest.mark.parametrize("name", ["cubestar", "demo"])
+def test_the_other_profiles_know_their_lens(name):
+    assert not load_profile(name).parameters.keys() & {
+        "focal_length",
+        "centroid_x",
+        "centroid_y",
+        "k1",
+        "k2",
+        "p1",
+        "p2",
+    }
