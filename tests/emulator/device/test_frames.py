@@ -1,0 +1,95 @@
+"""Stars, timing and the rate of frames."""
+
+import pytest
+
+from emulator.profile import Profile
+from emulator.truth.source import FixedTruth
+from starid.attitude import Attitude
+
+ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+CENTIMAG = 0.001
+
+
+def test_three_brightest_stars_are_reported(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(1.5)
+    first, second = bench.read("star_1_raw"), bench.read("star_2_raw")
+    assert first == {
+        "star_1_catalogue": 32349,
+        "star_1_x": pytest.approx(-382.0),
+        "star_1_y": pytest.approx(356.6),
+    }
+    assert second["star_2_catalogue"] == 101772 % 65536
+    magnitudes = bench.read("star_magnitudes")
+    assert magnitudes["magnitude_1"] == pytest.approx(-1.44, abs=CENTIMAG)
+    assert magnitudes["magnitude_3"] == pytest.approx(0.45, abs=CENTIMAG)
+    stars = bench.read("identified_stars")
+    assert stars["count"] == 4
+    assert [stars[f"hip_{n}"] for n in range(1, 6)] == [32349, 101772, 27989, 21421, 0]
+
+
+def test_performance_and_timing_come_from_the_frame(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(1.5)
+    one, two, timing = (bench.read(n) for n in ("star_performance_1", "star_performance_2", "star_timing"))
+    assert one == {
+        "stars_detected": 40, "image_noise": pytest.approx(0.6), "invalid_stars": 3, "stars_identified": 35,
+        "identification_mode": "lost_in_space", "image_dark": 8,
+    }  # fmt: skip
+    assert two["sample_period"] == 1000
+    assert two["confidence_1"] == 100
+    assert all(two[f"{step}_ok"] for step in ("capture", "detection", "identification", "attitude"))
+    model = Profile().timing
+    assert timing["capture_duration"] == round(100 + model.readout_s * 1e3)
+    assert timing["detection_duration"] == round((model.detect_s + 40 * model.detect_per_star_s) * 1e3)
+    assert timing["identification_duration"] == round(model.identify_lost_s * 1e3)
+
+
+def test_a_result_is_known_only_after_its_modelled_latency(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    model = Profile().timing
+    after = 0.1 + model.readout_s + model.detect_s + 40 * model.detect_per_star_s + model.identify_lost_s
+    bench.step(after - 0.001)
+    assert bench.read("precise_attitude")["reason"] == "no_frame"
+    bench.step(0.002)
+    attitude = bench.read("precise_attitude")
+    assert attitude["valid"]
+    assert attitude["latency"] == pytest.approx((after - 0.05) * 1e3, abs=0.1)
+
+
+@pytest.mark.parametrize("rate", [0.5, 1.0, 5.0, 10.0])
+def test_frames_come_at_the_update_rate(bench, rate):
+    bench.command("set_update_rate", rate=rate)
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(20.0)
+    counter = bench.read("precise_attitude")["frame_counter"]
+    assert abs(counter - 20.0 * rate) <= 2
+    assert bench.read("star_performance_2")["sample_period"] == round(1000.0 / rate)
+
+
+def test_a_new_update_rate_holds_at_once(bench):
+    bench.command("set_update_rate", rate=0.1)
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(1.0)
+    bench.command("set_update_rate", rate=10.0)
+    bench.step(2.0)
+    assert bench.read("precise_attitude")["frame_counter"] >= 18
+
+
+def test_exposure_bounds_the_update_rate(bench):
+    bench.command("set_parameter", parameter=1, value=500.0)
+    bench.command("set_update_rate", rate=10.0)
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(10.2)
+    assert 18 <= bench.read("precise_attitude")["frame_counter"] <= 20
+    assert bench.read("star_performance_2")["sample_period"] == 500
+
+
+def test_delay_time_moves_the_exposure(make_bench):
+    bench = make_bench(truth=FixedTruth(ORION)).start()
+    bench.command("set_parameter", parameter=12, value=300.0)
+    begin = bench.clock.now_ns() / 1e9
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(0.9)
+    mid_s = bench.read("precise_attitude")["time_of_exposure"] - Profile().run.start_unix_s
+    assert mid_s == pytest.approx(begin + 0.35)

@@ -1,0 +1,104 @@
+"""What the device answers to: every row has a handler, errors as published, counters, unsolicited telemetry."""
+
+import pytest
+
+from emulator.device.device import missing_handlers
+from emulator.device.telecommands import TELECOMMANDS
+from emulator.device.telemetry import TELEMETRY
+from emulator.profile import Profile
+from protocol.icd import load_icd
+from protocol.messages import ErrorCode, ReplyKind, Request
+
+
+def test_every_row_of_the_definition_is_served():
+    icd = load_icd()
+    assert missing_handlers(icd) == []
+    assert set(TELEMETRY) == set(icd.telemetry)
+    assert set(TELECOMMANDS) == set(icd.telecommands)
+
+
+@pytest.mark.parametrize("mode", ["standby", "lost_in_space"])
+@pytest.mark.parametrize("name", load_icd().telemetry)
+def test_every_telemetry_row_answers_in_every_state(make_bench, name, mode):
+    bench = make_bench().start()
+    bench.command("set_mode", mode=mode)
+    bench.step(3.0)
+    values = bench.read(name)
+    assert set(values) == set(bench.icd.telemetry[name].named_fields)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "code"),
+    [
+        (31, b"", ErrorCode.INVALID_ID),
+        (0, b"\x01", ErrorCode.INVALID_ID),
+        (200, b"", ErrorCode.INVALID_ID),
+        (1, b"", ErrorCode.INVALID_LENGTH),
+        (1, b"\x5a\x00", ErrorCode.INVALID_LENGTH),
+        (1, b"\x5b", ErrorCode.INVALID_PARAMETER),
+        (96, b"\x04", ErrorCode.INVALID_PARAMETER),
+        (2, b"\x00\x00\x00\x00\xe8\x03", ErrorCode.INVALID_PARAMETER),
+        (37, bytes(52), ErrorCode.INVALID_LENGTH),
+        (128, b"\x00", ErrorCode.INVALID_LENGTH),
+    ],
+)
+def test_bad_requests_get_the_published_code_and_change_nothing(bench, identifier, data, code):
+    (reply,) = bench.device.handle(Request.of(identifier, data))
+    assert (reply.kind, reply.id, reply.code) == (ReplyKind.NACK, identifier, code)
+    assert bench.mode == "standby"
+
+
+def test_acknowledge_tells_what_became_of_the_last_telecommand(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    assert bench.read("acknowledge") == {
+        "last_telecommand": 96, "processed": True, "error": "ok", "parameter_index": 0,
+    }  # fmt: skip
+    bench.send("set_unix_time", b"\x00\x00\x00\x00\xff\xff")
+    assert bench.read("acknowledge") == {
+        "last_telecommand": 2, "processed": True, "error": "invalid_parameter", "parameter_index": 1,
+    }  # fmt: skip
+    bench.send("set_mode", b"")
+    assert bench.read("acknowledge")["error"] == "invalid_length"
+
+
+def test_counters_count_and_clear(bench):
+    for _ in range(3):
+        bench.command("set_mode", mode="standby")
+    bench.device.handle(Request.of(31))
+    status = bench.read("communication_status")
+    assert (status["telecommand_count"], status["telemetry_count"]) == (4, 1)
+    assert bench.command("clear_counters") is ErrorCode.OK
+    status = bench.read("communication_status")
+    assert (status["telecommand_count"], status["telemetry_count"]) == (0, 1)
+
+
+def test_counters_wrap_at_16_bits(bench):
+    bench.device.counters.telecommands = 65535
+    bench.command("set_mode", mode="standby")
+    assert bench.read("communication_status")["telecommand_count"] == 0
+
+
+def test_unsolicited_telemetry_goes_out_at_its_rate(bench):
+    sent = []
+    bench.device.outlets.append(sent.append)
+    assert bench.command("set_unsolicited", telemetry=160, rate=4.0) is ErrorCode.OK
+    bench.step(9.99)
+    assert len(sent) == 40
+    assert {(reply.kind, reply.id, reply.destination) for reply in sent} == {(ReplyKind.UNSOLICITED, 160, 1)}
+    assert bench.icd.telemetry["precise_attitude"].decode(sent[0].data)["reason"] == "not_running"
+    bench.command("set_unsolicited", telemetry=160, rate=0.0)
+    bench.step(5.0)
+    assert len(sent) == 40
+
+
+def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
+    bench = make_bench(Profile(parameters={"unsolicited_rate": 2.0, "unsolicited_selection": 128}))
+    sent = []
+    bench.device.outlets.append(sent.append)
+    bench.start()
+    assert len(sent) == 3
+    assert sent[0].id == 128
+
+
+def test_unsolicited_telemetry_needs_a_row(bench):
+    assert bench.command("set_unsolicited", telemetry=200, rate=1.0) is ErrorCode.INVALID_PARAMETER
