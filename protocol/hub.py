@@ -17,6 +17,7 @@ from typing import Final, TextIO, cast
 from protocol.can_framing import CanFrame
 from protocol.candump import format_candump
 from protocol.errors import ProtocolError
+from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
 DEFAULT_HOST: Final = "127.0.0.1"
@@ -69,6 +70,7 @@ class _Client(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
+        notice_a_lost_peer(transport)
         self._transport.write(b"< hi >")
         self._hub.join(self)
 

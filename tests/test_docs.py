@@ -193,6 +193,7 @@ def test_walkthrough_pytest(unit, tmp_path):
 class Exchange:
     """A frame that the walk-through sends with cansend, and the frames that it shows as the answer."""
 
+    typed: str
     sent: CanFrame
     answers: list[CanFrame]
 
@@ -204,20 +205,20 @@ def exchanges(headings: set[str]) -> list[Exchange]:
             continue
         for part in block.text.split("$ cansend vcan0 ")[1:]:
             typed, *dump = part.splitlines()
-            seen = [_dumped(line) for line in dump]
+            seen = [dumped(line) for line in dump]
             assert format_frame(seen[0]) == typed, "candump shows another frame than cansend sent"
-            found.append(Exchange(seen[0], seen[1:]))
+            found.append(Exchange(f"cansend vcan0 {typed}", seen[0], seen[1:]))
     return found
 
 
-def _dumped(line: str) -> CanFrame:
+def dumped(line: str) -> CanFrame:
     channel, identifier, size, *data = line.split()
     frame = CanFrame(int(identifier, 16), bytes.fromhex("".join(data)), extended=len(identifier) == 8)
     assert (channel, size) == ("vcan0", f"[{len(frame.data)}]")
     return frame
 
 
-def _fixed(frame: CanFrame) -> bytes:
+def fixed(frame: CanFrame) -> bytes:
     """Return the part of a frame that does not depend on time and noise."""
     if frame.extended:
         kind = MessageType(frame.id >> 24)
@@ -243,7 +244,7 @@ def check_exchanges(found: list[Exchange], ready: dict[str, str], ours: Callable
                 assert got is not None, f"no answer to {format_frame(sent)}"
                 frame = CanFrame(got.arbitration_id, bytes(got.data), extended=got.is_extended_id)
                 assert (hex(frame.id), len(frame.data)) == (hex(answer.id), len(answer.data))
-                assert _fixed(frame) == _fixed(answer)
+                assert fixed(frame) == fixed(answer)
 
 
 @pytest.mark.process

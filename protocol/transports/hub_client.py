@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final, cast
 
 from protocol.can_framing import CanFrame
+from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from protocol.transports.base import ReturningTransport, TransportError
 
@@ -43,6 +44,7 @@ class _Connection(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)
+        notice_a_lost_peer(transport, must_read=True)
         self.transport.set_write_buffer_limits(high=0)
 
     def connection_lost(self, exc: Exception | None) -> None:

@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 
 import serial
 
+from protocol.keepalive import notice_a_lost_peer
 from protocol.serial_framing import PacingSchedule
 from protocol.transports.base import ReturningTransport, Transport, TransportError
 from protocol.transports.paced_writer import PacedWriter
@@ -329,6 +330,7 @@ class _StreamProtocol(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         if isinstance(transport, asyncio.Transport):
+            notice_a_lost_peer(transport)
             self._owner.attach(self, transport)
 
     def data_received(self, data: bytes) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+from pathlib import Path
 
 import can
 import pytest
@@ -135,5 +137,36 @@ def test_a_server_that_is_no_socketcand_is_told(greeting: bytes) -> None:
             port = server.sockets[0].getsockname()[1]
             with pytest.raises(TransportError, match="is this a socketcand server"):
                 await open_can(f"socketcand:127.0.0.1:{port}/vcan0").start(lambda _: None)
+
+    asyncio.run(main())
+
+
+IN_GUEST = "User Mode Linux" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
+
+
+@pytest.mark.socketcan
+@pytest.mark.skipif(not IN_GUEST, reason="takes the loopback interface down: in the guest only")
+def test_a_hub_that_is_gone_without_a_word_is_noticed_and_found_again() -> None:
+    """The connection is half open: no FIN, no RST, packets simply vanish."""
+
+    async def main() -> None:
+        hub = CanHub(port=0)
+        await hub.start()
+        pair = CanPair(*(open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0") for _ in range(2)))
+        await pair.start()
+        subprocess.run(["ip", "link", "set", "lo", "down"], check=True)
+        try:
+            pair.one.send(FRAMES[0])
+            async with asyncio.timeout(60):  # the one by its unanswered frame, the other by the silence
+                while len(pair.errors) < 2:
+                    await asyncio.sleep(0.1)
+        finally:
+            subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+        await until(lambda: pair.one.statistics.reconnects == pair.two.statistics.reconnects == 1)
+        pair.one.send(FRAMES[1])
+        await until(lambda: pair.got_two == [FRAMES[1]])
+        await pair.one.close()
+        await pair.two.close()
+        await hub.close()
 
     asyncio.run(main())
