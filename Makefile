@@ -40,7 +40,7 @@ reproduce: $(VENV)/.product
 	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
-	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py
+	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -9,6 +10,7 @@ import signal
 import time
 import tty
 
+import canopen
 import pytest
 
 from hil_tests.client import ObcClient
@@ -82,6 +84,45 @@ def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp
     for path in files:
         if path.suffix == ".json":
             json.loads(path.read_text())
+
+
+NODE = 44
+HEARTBEAT, STORE = 0x1017, 0x1010
+SAVE = int.from_bytes(b"save", "little")
+
+
+@contextlib.contextmanager
+def canopen_master(channel: str):
+    """A master of the `canopen` library, and its view of the node without a data sheet."""
+    host, _, port = channel.removeprefix("socketcand:").partition("/")[0].rpartition(":")
+    network = canopen.Network()
+    network.connect(interface="socketcand", host=host, port=int(port), channel="vcan0")
+    try:
+        node = network.add_node(NODE, canopen.ObjectDictionary())
+        node.sdo.RESPONSE_TIMEOUT = 5.0
+        yield network, node.sdo
+    finally:
+        network.disconnect()
+
+
+def test_power_cuts_while_canopen_settings_are_being_stored_lose_none_of_them(own):
+    rng = random.Random(6)
+    with OwnHub() as hub:
+        emulator = own(serial="off", can=hub.channel, extra=["--canopen", str(NODE)])
+        allowed = {1000}
+        for turn in range(4):
+            with canopen_master(hub.channel) as (network, sdo):
+                assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed, f"after cut {turn}"
+                kept, last = 2000 + turn, 3000 + turn
+                sdo.download(HEARTBEAT, 0, kept.to_bytes(2, "little"))
+                sdo.download(STORE, 1, SAVE.to_bytes(4, "little"))  # answered when it is on the disk
+                sdo.download(HEARTBEAT, 0, last.to_bytes(2, "little"))
+                network.send_message(0x600 + NODE, bytes((0x23, 0x10, 0x10, 1)) + b"save")
+                time.sleep(rng.random() * 0.01)  # the cut comes before, while or after this one is stored
+            allowed = {kept, last}
+            emulator.restart(signal.SIGKILL)
+        with canopen_master(hub.channel) as (_, sdo):
+            assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed
 
 
 def test_a_serial_peer_that_never_reads_does_not_stop_the_device(emulator, can_obc):
