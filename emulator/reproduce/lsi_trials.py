@@ -27,6 +27,9 @@ FRAMES: Final = COLUMNS * ROWS
 HALF_FRAME_DEG: Final = 20.0
 """From the corner of a frame to its centre, degrees: the frames behind the published numbers are 40° wide."""
 
+_COMPARED_NEIGHBOURS: Final = 256
+"""Neighbours tried where the stars themselves decide."""
+
 ON, OFF = "on", "off"
 """The frames as they are, and moved off the grid."""
 
@@ -69,6 +72,7 @@ def solve_frames(
     noise: Callable[[np.random.Generator], NoiseModel] | None = None,
     roll_deg: float = 0.0,
     every: int = 1,
+    compares: bool = False,
 ) -> Results:
     """Run LSI, and the sub-cell search after it, on the test frames.
 
@@ -88,20 +92,24 @@ def solve_frames(
         The camera's roll.
     every
         Use only every so-many-th frame.
+    compares
+        Run the sub-cell search that compares the stars, too.
 
     Returns
     -------
     Results
-        `frames` (n, 2) degrees; `f_mse`, `f_1se`, `f_fine` (n,): ε_f in degrees of the two LSI estimates and of the
-        sub-cell search; `theta_mse`, `theta_1se`, `theta_fine`: ε_θ in degrees; `psi_mse`, `residual`: ε_ψ of LSI and
-        of the sub-cell search.
+        `frames` (n, 2) degrees; `f_mse`, `f_1se`, `f_fine`, and `f_stars` if asked for, (n,): ε_f in degrees of the two LSI estimates, of
+        the sub-cell search, and of the one that compares the stars; `theta_…` likewise: ε_θ in degrees; `psi_mse`,
+        `residual`: ε_ψ of LSI and of the sub-cell search.
     """
     lsi = context.lost_in_space(overlap)
     fine = SubcellSearch(lsi)
+    compared = SubcellSearch(lsi, neighbours=_COMPARED_NEIGHBOURS)
     sky = context.sky()
     frames = frames_under_test(rng, grid, lsi.database.grid.step_deg, every)
-    answers = np.empty((3, len(frames), 2))
-    angles = np.empty((3, len(frames)))
+    names = ("mse", "1se", "fine", *(("stars",) if compares else ()))
+    answers = np.empty((len(names), len(frames), 2))
+    angles = np.empty((len(names), len(frames)))
     psi = np.empty((2, len(frames)))
     roll = math.radians(roll_deg)
     for i, (ra, dec) in enumerate(frames):
@@ -113,13 +121,14 @@ def solve_frames(
         features = extract_features(brightness, places)
         solution = lsi.solve(features)
         better = fine.solve(features)
-        estimates: tuple[LsiEstimate | FineEstimate, ...] = (solution.mse, solution.one_se, better)
+        estimates: list[LsiEstimate | FineEstimate] = [solution.mse, solution.one_se, better]
+        if compares:
+            estimates.append(compared.solve(features, places))
         for j, estimate in enumerate(estimates):
             answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
             angles[j, i] = angle_error(features.theta_rad - estimate.theta_rad, roll)
         psi[:, i] = solution.mse.error_psi, better.residual
     errors = boresight_error(answers, frames)
-    names = ("mse", "1se", "fine")
     return {
         "frames": frames,
         **{f"f_{name}": errors[j] for j, name in enumerate(names)},

@@ -85,5 +85,6 @@ EXPERIMENTS: Final = (
         full={"percent": [99.5, 99.75]},
         quick=None,
         alone=True,
+        revision=2,
     ),
 )

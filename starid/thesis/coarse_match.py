@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.jit import compiled
-from starid.thesis.frame_sky import BRIGHTNESS, FOCAL, HALF_WIDTH, bins_near, gnomonic, stars_of_bins, turn_to
+from starid.thesis.frame_sky import stars_near
 
 MAX_STARS: Final = 256
 """Most catalogue stars of a cell that are considered."""
@@ -24,40 +24,6 @@ ROLL_BINS: Final = 180
 
 _REFITS: Final = 4
 _INNERMOST: Final = 4.0
-
-
-@compiled
-def stars_near(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    ra_deg: float,
-    dec_deg: float,
-    margin: float,
-    found: NDArray[np.float64],
-    rows: NDArray[np.int64],
-) -> int:
-    """List the stars of a frame on the sphere with north up and a margin around it; return how many.
-
-    `found` (n, 3) receives x, y in pixels and the magnitude, `rows` (n,) the stars' rows in the table.
-    """
-    limit = (frame[HALF_WIDTH] + margin) ** 2
-    reach = math.degrees(math.atan((frame[HALF_WIDTH] + margin) / frame[FOCAL]))
-    turn = turn_to(ra_deg, dec_deg)
-    low, high, first, bins = bins_near(ra_deg, dec_deg, reach, spherical=True)
-    count = 0
-    for band in range(low, high + 1):
-        for part in range(2):
-            begin, end = stars_of_bins(bin_start, band, first, bins, part)
-            for i in range(begin, end):
-                x, y = gnomonic(stars, i, turn, frame[FOCAL])
-                if x * x + y * y <= limit and count < found.shape[0]:
-                    found[count, 0] = x
-                    found[count, 1] = y
-                    found[count, 2] = stars[i, BRIGHTNESS]
-                    rows[count] = i
-                    count += 1
-    return count
 
 
 @compiled

@@ -73,16 +73,27 @@ def turn_to(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
 
 @compiled
 def gnomonic(
-    stars: NDArray[np.float64], i: int, turn: tuple[float, float, float, float], focal: float
+    ux: float, uy: float, uz: float, turn: tuple[float, float, float, float], focal: float
 ) -> tuple[float, float]:
     """Offset of a star in the frame at a place (`turn_to`), north up, +x right, +y down; infinite behind the camera."""
     cos_a, sin_a, cos_d, sin_d = turn
-    level = cos_a * stars[i, UX] + sin_a * stars[i, UY]
-    depth = cos_d * level + sin_d * stars[i, UZ]
+    level = cos_a * ux + sin_a * uy
+    depth = cos_d * level + sin_d * uz
     if depth <= 0.0:
         return math.inf, math.inf
-    east = cos_a * stars[i, UY] - sin_a * stars[i, UX]
-    return -focal * east / depth, -focal * (cos_d * stars[i, UZ] - sin_d * level) / depth
+    east = cos_a * uy - sin_a * ux
+    return -focal * east / depth, -focal * (cos_d * uz - sin_d * level) / depth
+
+
+@compiled
+def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) -> tuple[float, float]:
+    """Offset of a star in the flat plane, degrees; right ascension wraps."""
+    x = star_ra - ra_deg
+    if x > 180.0:
+        x -= 360.0
+    elif x < -180.0:
+        x += 360.0
+    return x, star_dec - dec_deg
 
 
 @compiled
@@ -94,7 +105,7 @@ def cell_sums(
     dec_deg: float,
     sums: NDArray[np.float64],
 ) -> None:
-    """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360; flat or gnomonic offsets."""
+    """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
     clear_sums(sums)
     half = frame[HALF_WIDTH]
     half2 = half * half
@@ -107,18 +118,51 @@ def cell_sums(
             begin, end = stars_of_bins(bin_start, band, first, count, part)
             for i in range(begin, end):
                 if spherical:
-                    x, y = gnomonic(stars, i, turn, frame[FOCAL])
+                    x, y = gnomonic(stars[i, UX], stars[i, UY], stars[i, UZ], turn, frame[FOCAL])
                 else:
-                    y = stars[i, DECLINATION] - dec_deg
-                    x = stars[i, RIGHT_ASCENSION] - ra_deg
-                    if x > 180.0:
-                        x -= 360.0
-                    elif x < -180.0:
-                        x += 360.0
-                if (full and abs(x) <= half and abs(y) <= half) or (
-                    not full and x * x + y * y <= half * half
-                ):
+                    x, y = flat_offset(stars[i, RIGHT_ASCENSION], stars[i, DECLINATION], ra_deg, dec_deg)
+                if (full and abs(x) <= half and abs(y) <= half) or (not full and x * x + y * y <= half2):
                     add_star(sums, stars[i, BRIGHTNESS], x, y, frame[PIVOT])
+
+
+@compiled
+def stars_near(
+    stars: NDArray[np.float64],
+    bin_start: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    ra_deg: float,
+    dec_deg: float,
+    margin: float,
+    found: NDArray[np.float64],
+    rows: NDArray[np.int64],
+) -> int:
+    """List the stars of a circular frame with north up and a margin around it; return how many.
+
+    `found` (n, 3) receives x, y in the frame's unit and the magnitude, `rows` (n,) the stars' rows in the table.
+    """
+    spherical = frame[SPHERICAL] > 0.5
+    limit = (frame[HALF_WIDTH] + margin) ** 2
+    reach = frame[HALF_WIDTH] + margin
+    if spherical:
+        reach = math.degrees(math.atan(reach / frame[FOCAL]))
+    turn = turn_to(ra_deg, dec_deg)
+    low, high, first, bins = bins_near(ra_deg, dec_deg, reach, spherical)
+    count = 0
+    for band in range(low, high + 1):
+        for part in range(2):
+            begin, end = stars_of_bins(bin_start, band, first, bins, part)
+            for i in range(begin, end):
+                if spherical:
+                    x, y = gnomonic(stars[i, UX], stars[i, UY], stars[i, UZ], turn, frame[FOCAL])
+                else:
+                    x, y = flat_offset(stars[i, RIGHT_ASCENSION], stars[i, DECLINATION], ra_deg, dec_deg)
+                if x * x + y * y <= limit and count < found.shape[0]:
+                    found[count, 0] = x
+                    found[count, 1] = y
+                    found[count, 2] = stars[i, BRIGHTNESS]
+                    rows[count] = i
+                    count += 1
+    return count
 
 
 @compiled

@@ -20,13 +20,17 @@ from starid.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stor
 from starid.thesis.database import DatabaseError
 from starid.thesis.features import FeatureVector
 from starid.thesis.frame_grid import cell_row
-from starid.thesis.frame_sky import cell_features
+from starid.thesis.frame_sky import HALF_WIDTH, cell_features, stars_near
 from starid.thesis.lsi import LostInSpace
 
 _DIFFERENCE_DEG = 1e-4
 _MAX_STEPS = 8
 _CONVERGED_DEG = 1e-7
 _AGREED = 1e-12
+_MOST_STARS = 2048
+_NEAR = 0.0075
+_SEEN = 0.9
+_NO_STARS = np.empty((0, 2))
 
 
 @compiled
@@ -126,10 +130,50 @@ def newton_from(
 
 
 @compiled
+def share_seen(
+    arrays: CellArrays,
+    positions: NDArray[np.float64],
+    theta: float,
+    ra: float,
+    dec: float,
+    found: NDArray[np.float64],
+    rows: NDArray[np.int64],
+) -> float:
+    """Share of the observed stars that the catalogue has within 0.75 % of the frame's half width, from a place.
+
+    Parameters
+    ----------
+    positions, theta
+        Observed stars (n, 2) in the frame's unit, and the polar angle of their frame object, radians.
+    ra, dec
+        Place, degrees; the roll is what the polar angle there differs by.
+    found, rows
+        Work space for `stars_near`.
+    """
+    count = stars_near(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, 0.0, found, rows)
+    sums = np.empty(8)
+    vector = np.empty(5)
+    turn = theta - cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, sums, vector)
+    c, s = math.cos(turn), math.sin(turn)
+    limit = (_NEAR * arrays.frame[HALF_WIDTH]) ** 2
+    seen = 0
+    for i in range(positions.shape[0]):
+        x = c * positions[i, 0] + s * positions[i, 1]
+        y = c * positions[i, 1] - s * positions[i, 0]
+        for j in range(count):
+            if (found[j, 0] - x) ** 2 + (found[j, 1] - y) ** 2 <= limit:
+                seen += 1
+                break
+    return float(seen / positions.shape[0])
+
+
+@compiled
 def subcell_kernel(
     index: CellIndex,
     arrays: CellArrays,
     observation: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    theta: float,
     reach_deg: float,
     distances: NDArray[np.float64],
     cells: NDArray[np.int64],
@@ -137,10 +181,16 @@ def subcell_kernel(
 ) -> int:
     """Try the neighbours from the nearest outwards; return how many starts were made.
 
-    The nearest cell in full precision goes first, and the first start that agrees in all features ends the search. A
-    start near an earlier one is left out. `answer` (4,) receives right
-    ascension, declination (degrees), polar angle (radians) and the length of the residual.
+    The nearest cell in full precision goes first. A start near an earlier one is left out. Without positions the first
+    place that agrees in all features ends the search, and the least residual wins; with the stars' positions (n, 2) and
+    their polar angle, the first from which nine stars in ten are seen, and the greatest share of them wins. `answer`
+    (5,) receives right ascension, declination (degrees), polar angle (radians), the length of the residual and the share
+    of stars seen.
     """
+    compares = positions.shape[0] > 0
+    found = np.empty((_MOST_STARS if compares else 0, 3))
+    rows = np.empty(found.shape[0], dtype=np.int64)
+    most = -1.0
     stored_neighbours(index, observation * 2.55, distances, cells)
     order = np.argsort(distances)
     first = exact_nearest(index, arrays, observation, answer)
@@ -149,7 +199,7 @@ def subcell_kernel(
     starts = 0
     best = math.inf
     for turn in range(-1, order.size):
-        if best < _AGREED:
+        if (not compares and best < _AGREED) or most >= _SEEN:
             break
         cell = first if turn < 0 else cells[order[turn]]
         if cell < 0:
@@ -170,7 +220,9 @@ def subcell_kernel(
         places[starts, 0] = ra
         places[starts, 1] = dec
         starts += 1
-        if cost < best:
+        seen = share_seen(arrays, positions, theta, place[0], place[1], found, rows) if compares else 0.0
+        if seen > most or (seen == most and cost < best):
+            most = seen
             best = cost
             answer[0] = place[0] % 360.0
             answer[1] = place[1]
@@ -181,6 +233,7 @@ def subcell_kernel(
             arrays.stars, arrays.bin_start, arrays.frame, answer[0], answer[1], sums, vector
         )
         answer[3] = math.sqrt(best)
+        answer[4] = most
     return starts
 
 
@@ -199,6 +252,8 @@ class FineEstimate:
         stars of the answer.
     starts
         Cells that were tried.
+    seen
+        Share of the frame's stars that the catalogue has where the answer wants them; 0 if they were not compared.
     """
 
     right_ascension_deg: float
@@ -206,6 +261,7 @@ class FineEstimate:
     theta_rad: float
     residual: float
     starts: int
+    seen: float
 
 
 class SubcellSearch:
@@ -228,8 +284,16 @@ class SubcellSearch:
         self._reach = reach_steps * lost_in_space.database.grid.step_deg
         self._neighbours = neighbours
 
-    def solve(self, features: FeatureVector) -> FineEstimate:
+    def solve(self, features: FeatureVector, positions: NDArray[np.float64] | None = None) -> FineEstimate:
         """Boresight from the features of one frame.
+
+        Parameters
+        ----------
+        features
+            Features of the frame.
+        positions
+            Offsets of the same stars from the centre in the frame's unit, (n, 2): with them the stars themselves are
+            compared with the catalogue's at every place tried, as five features agree at more places than one.
 
         Raises
         ------
@@ -239,11 +303,13 @@ class SubcellSearch:
         observation = self._lsi.database.normalise(features)
         if not np.isfinite(observation).all():
             raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
-        answer = np.empty(4)
+        answer = np.empty(5)
         starts = subcell_kernel(
             self._lsi.index,
             self._lsi.arrays,
             observation,
+            _NO_STARS if positions is None else np.ascontiguousarray(positions, dtype=np.float64),
+            features.theta_rad,
             self._reach,
             np.empty(self._neighbours),
             np.empty(self._neighbours, dtype=np.int64),
@@ -251,4 +317,5 @@ class SubcellSearch:
         )
         if starts == 0:
             raise DatabaseError("LSI: the database holds no frame with a star")
-        return FineEstimate(float(answer[0]), float(answer[1]), float(answer[2]), float(answer[3]), starts)
+        ra, dec, theta, residual, seen = (float(value) for value in answer)
+        return FineEstimate(ra, dec, theta, residual, starts, seen)

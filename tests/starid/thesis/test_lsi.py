@@ -11,10 +11,11 @@ from sklearn.linear_model import Lasso
 
 from starid.thesis.cell_search import exact_nearest, exact_vector, stored_neighbours
 from starid.thesis.database import DatabaseError
-from starid.thesis.features import FeatureVector
+from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.lasso import LAMBDAS, coordinate_descent, lasso_path, optimality_gap
 from starid.thesis.lsi import LostInSpace
 from starid.thesis.metrics import boresight_error
+from starid.thesis.simulation import turned
 from starid.thesis.subcell import SubcellSearch
 from tests.starid.thesis.thesis_sky import database, lost_in_space, thesis_frames
 
@@ -135,6 +136,25 @@ def test_accuracy_off_the_grid_and_between_the_cells():
         assert (plain <= limit).mean() >= least
         assert (fine <= limit).mean() > (plain <= limit).mean()
     assert (fine <= 0.001).mean() > 0.8
+
+
+def test_comparing_the_stars_tells_places_of_equal_features_apart():
+    lsi = lost_in_space(99.5)
+    search = SubcellSearch(lsi, neighbours=256)
+    errors = {False: [], True: []}
+    for ra, dec in zip(*thesis_frames(6), strict=True):
+        where = ra + 0.618 * GRID_STEP, dec + 0.618 * GRID_STEP
+        brightness, positions, _ = lsi.database.sky.stars_in_frame(where[0] % 360.0, where[1])
+        positions = turned(positions, 33.0)
+        features = extract_features(brightness, positions)
+        for compares, errors_of_kind in errors.items():
+            found = search.solve(features, positions if compares else None)
+            place = found.right_ascension_deg, found.declination_deg
+            errors_of_kind.append(float(boresight_error(*place, *where)))
+            assert compares or found.seen == 0.0
+    plain, compared = (np.array(errors[kind]) for kind in (False, True))
+    assert (compared <= 0.1).mean() >= 0.975
+    assert (compared <= 0.1).mean() > (plain <= 0.1).mean() + 0.02
 
 
 def test_right_ascension_wraps():
