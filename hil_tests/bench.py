@@ -8,7 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from hil_tests.client import DEFAULT_TIMEOUT_S, ObcClient
+from hil_tests.async_client import DEFAULT_TIMEOUT_S
+from hil_tests.client import ObcClient
 from hil_tests.emulator_process import EmulatorProcess
 from hil_tests.errors import BenchError
 from hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS

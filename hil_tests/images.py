@@ -7,9 +7,10 @@ import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from hil_tests.errors import BadReplyError, BenchError, NackError
+from hil_tests.readings import Reading
 from protocol.image_transfer import (
     FRAME_SIZE,
     MAP_PARTS,
@@ -23,8 +24,23 @@ from protocol.image_transfer import (
 from protocol.messages import ErrorCode
 from protocol.values import Value
 
-if TYPE_CHECKING:
-    from hil_tests.client import AsyncObcClient
+
+class Downloader(Protocol):
+    """The part of a client that a download needs."""
+
+    bursts: asyncio.Queue[bytes]
+
+    async def command(self, name: str, values: Mapping[str, Value] | None = None) -> object:
+        """Send a telecommand."""
+
+    async def read(self, name: str) -> Reading:
+        """Read telemetry with its latency."""
+        ...
+
+    async def telemetry(self, name: str) -> Mapping[str, Value]:
+        """Read telemetry as values by name."""
+        ...
+
 
 FRAME_ATTEMPTS: Final = 3
 """How often a frame with a wrong checksum is read before the download is given up."""
@@ -63,9 +79,9 @@ class Image:
     seconds: float
 
 
-async def save_image(client: AsyncObcClient, size: str, *, within_s: float) -> None:
+async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
     """Have an image taken and wait until it is stored."""
-    await client.command("save_image", camera="star", image_size=size)
+    await client.command("save_image", {"camera": "star", "image_size": size})
     deadline = time.monotonic() + within_s
     while True:
         state = await client.telemetry("image_status")
@@ -80,7 +96,7 @@ async def save_image(client: AsyncObcClient, size: str, *, within_s: float) -> N
         await asyncio.sleep(POLL_S)
 
 
-async def download_by_frames(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
+async def download_by_frames(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image and download it in frames of 128 bytes (init, read, advance), each with its checksum.
 
     Raises
@@ -104,7 +120,7 @@ async def download_by_frames(client: AsyncObcClient, size: str, *, within_s: flo
     return Image(bytes(pixels), edge, edge, received, repeats, time.monotonic() - begin)
 
 
-async def _read_frame(client: AsyncObcClient, number: int) -> tuple[bytes, int]:
+async def _read_frame(client: Downloader, number: int) -> tuple[bytes, int]:
     """Read the loaded frame and its checksum; return it and how often it was read."""
     problem = ""
     for attempt in range(1, FRAME_ATTEMPTS + 1):
@@ -121,9 +137,7 @@ async def _read_frame(client: AsyncObcClient, number: int) -> tuple[bytes, int]:
     raise BadReplyError(f"image frame {number}: {problem}")
 
 
-async def _when_not_busy(
-    client: AsyncObcClient, name: str, within_s: float, values: Mapping[str, Value]
-) -> None:
+async def _when_not_busy(client: Downloader, name: str, within_s: float, values: Mapping[str, Value]) -> None:
     """Send a telecommand, again while the device says busy."""
     deadline = time.monotonic() + within_s
     while True:
@@ -140,7 +154,7 @@ async def _when_not_busy(
 # --- bursts ---
 
 
-async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
+async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image and download its file by bursts: blocks of up to 1024 numbered packets, holes asked for again.
 
     The file's own header, loaded first, tells how long it is.
@@ -158,9 +172,7 @@ async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: flo
     return Image(pixels, width, height, len(data), repeats, time.monotonic() - begin)
 
 
-async def _download_block(
-    client: AsyncObcClient, offset: int, length: int, within_s: float
-) -> tuple[bytes, int]:
+async def _download_block(client: Downloader, offset: int, length: int, within_s: float) -> tuple[bytes, int]:
     """Load one block of the file and gather its packets; return it and how often packets were asked for again."""
     await _when_not_busy(
         client,
@@ -184,7 +196,7 @@ async def _download_block(
     for repeats in range(BURST_ROUNDS):
         while not client.bursts.empty():
             client.bursts.get_nowait()
-        await client.command("start_burst", ignore_hole_map=repeats == 0)
+        await client.command("start_burst", {"ignore_hole_map": repeats == 0})
         await _gather(client, packets, count)
         if len(packets) == count:
             block = b"".join(packets[number] for number in range(count))[:length]
@@ -198,7 +210,7 @@ async def _download_block(
     )
 
 
-async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int) -> None:
+async def _gather(client: Downloader, packets: dict[int, bytes], count: int) -> None:
     """Take burst packets until all are there or the line is silent."""
     while len(packets) < count:
         try:
@@ -211,11 +223,11 @@ async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int)
             packets[number] = data
 
 
-async def _send_hole_map(client: AsyncObcClient, packets: dict[int, bytes]) -> None:
+async def _send_hole_map(client: Downloader, packets: dict[int, bytes]) -> None:
     """Tell the device which packets have arrived."""
     holes = HoleMap(packets)
     for part in range(1, MAP_PARTS + 1):
-        await client.command(f"set_hole_map_{part}", map=holes.part(part))
+        await client.command(f"set_hole_map_{part}", {"map": holes.part(part)})
 
 
 def bmp_file_size(header: bytes) -> int:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Final
 
 from hil_tests.bench import Bench
-from hil_tests.client import ObcClient, Reading
+from hil_tests.client import ObcClient
 from hil_tests.errors import BenchError, NackError
 from hil_tests.expect import resolve, show
 from hil_tests.png import write_png
 from hil_tests.raw_exchange import matches, pattern, send_and_listen
+from hil_tests.readings import Reading
 from hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, percentile, summarize
 from hil_tests.script_model import (
     Command,

@@ -1,0 +1,275 @@
+"""An OBC that asks a star sensor by the names of the interface definition, as coroutines."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
+from hil_tests.images import Image, download_by_bursts, download_by_frames
+from hil_tests.links import (
+    HostLink,
+)
+from hil_tests.readings import Ack, Reading, Transaction
+from protocol.errors import ProtocolError
+from protocol.icd import InterfaceDefinition, load_icd
+from protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
+from protocol.values import Value
+
+DEFAULT_TIMEOUT_S: Final = 1.0
+"""Time-out of a transaction, that of current public flight software."""
+SETTLE_S: Final = 0.05
+"""Pause after a time-out, in which a late reply is thrown away so that no later request takes it for its own."""
+
+
+class AsyncObcClient:
+    """Asks one device over one link, one request at a time.
+
+    Parameters
+    ----------
+    link : HostLink
+        A serial line or a CAN bus.
+    icd : InterfaceDefinition, optional
+        Names and layouts; the one that travels with the package if not given.
+    timeout_s : float
+        How long a reply may take unless a call says otherwise.
+    retries : int
+        How often a request is sent again after a time-out unless a call says otherwise. Off by default: a bench
+        wants to see a lost reply.
+    """
+
+    def __init__(
+        self,
+        link: HostLink,
+        icd: InterfaceDefinition | None = None,
+        *,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+        retries: int = 0,
+    ) -> None:
+        self.link = link
+        self.icd = load_icd() if icd is None else icd
+        self.timeout_s = timeout_s
+        self.retries = retries
+        self.transactions: list[Transaction] = []
+        self.faults: list[LinkFault] = []
+        self.stray_replies: list[Reply] = []
+        self.unsolicited: asyncio.Queue[Reading] = asyncio.Queue()
+        self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
+        self._turn = asyncio.Lock()
+        self._pending: tuple[Request, asyncio.Future[tuple[Reply, float]]] | None = None
+        link.on_reply = self._on_reply
+        link.on_fault = self.faults.append
+
+    async def start(self) -> None:
+        """Open the link."""
+        await self.link.start()
+
+    async def close(self) -> None:
+        """Close the link."""
+        await self.link.close()
+
+    # --- by name ---
+
+    async def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
+        """Ask for a telemetry row.
+
+        Raises
+        ------
+        NackError, NoReplyError, BadReplyError, LinkLostError
+        """
+        row = self.icd.telemetry[name]
+        request = Request(RequestKind.TELEMETRY, row.id)
+        reply, latency = await self.transact(
+            request, row.name, row.size, timeout_s=timeout_s, retries=retries
+        )
+        return self._reading(reply, latency)
+
+    async def telemetry(
+        self, name: str, *, timeout_s: float | None = None, retries: int | None = None
+    ) -> dict[str, Value]:
+        """Ask for a telemetry row and return its physical values by field."""
+        return dict((await self.read(name, timeout_s=timeout_s, retries=retries)).values)
+
+    async def command(
+        self,
+        name: str,
+        values: Mapping[str, Value] | None = None,
+        *,
+        timeout_s: float | None = None,
+        retries: int | None = None,
+        **fields: Value,
+    ) -> Ack:
+        """Send a telecommand and wait for its acknowledge; fields as a mapping, by keyword, or both.
+
+        Raises
+        ------
+        NackError
+            The device refused it; carries the published code.
+        """
+        data = self.icd.telecommands[name].encode({**(values or {}), **fields})
+        return await self.command_raw(name, data, timeout_s=timeout_s, retries=retries)
+
+    async def command_raw(
+        self, name: str, data: bytes, *, timeout_s: float | None = None, retries: int | None = None
+    ) -> Ack:
+        """Send a telecommand with its parameters as bytes, well-formed or not."""
+        row = self.icd.telecommands[name]
+        request = Request(RequestKind.TELECOMMAND, row.id, data)
+        _reply, latency = await self.transact(request, row.name, 0, timeout_s=timeout_s, retries=retries)
+        return Ack(row.name, latency)
+
+    async def set_parameter(self, name: str, value: Value) -> Ack:
+        """Set a parameter by name, in its own unit."""
+        parameter = self.icd.parameters[name]
+        return await self.command("set_parameter", parameter=parameter.id, value=parameter.to_number(value))
+
+    async def read_parameter(self, name: str) -> Reading:
+        """Select a parameter by name and read its value, limits and default."""
+        parameter = self.icd.parameters[name]
+        await self.command("select_parameter", parameter=parameter.id)
+        reading = await self.read("parameter")
+        if reading["parameter"] != parameter.id:
+            raise BadReplyError(
+                f"parameter {name}: the device reports number {reading['parameter']!r}, not {parameter.id}"
+            )
+        return reading
+
+    async def get_parameter(self, name: str) -> Value:
+        """Return the value of a parameter in its own type."""
+        reading = await self.read_parameter(name)
+        try:
+            return self.icd.parameters[name].check(reading["value"])
+        except ProtocolError as error:
+            raise BadReplyError(f"parameter {name}: {error}") from None
+
+    async def wait_for(
+        self, name: str, condition: Callable[[Reading], bool], *, within_s: float, every_s: float = 0.1
+    ) -> Reading:
+        """Read a row until the condition holds.
+
+        Raises
+        ------
+        BenchError
+            It did not hold in time.
+        """
+        deadline = time.monotonic() + within_s
+        while True:
+            reading = await self.read(name)
+            if condition(reading):
+                return reading
+            if time.monotonic() >= deadline:
+                raise BenchError(
+                    f"{name}: what was waited for did not come within {within_s:g} s; last {dict(reading.values)}"
+                )
+            await asyncio.sleep(every_s)
+
+    async def wait_unsolicited(self, name: str, *, timeout_s: float | None = None) -> Reading:
+        """Return the next unsolicited telemetry of a row; that of other rows is dropped."""
+        wanted = self.icd.telemetry[name].name
+        limit = self.timeout_s if timeout_s is None else timeout_s
+        try:
+            async with asyncio.timeout(limit):
+                while True:
+                    reading = await self.unsolicited.get()
+                    if reading.name == wanted:
+                        return reading
+        except TimeoutError:
+            raise NoReplyError(f"unsolicited {wanted}", limit) from None
+
+    async def download_image(
+        self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
+    ) -> Image:
+        """Have an image taken and stored, and download it by `frames` or by `burst`."""
+        if method not in ("frames", "burst"):
+            raise BenchError(f"image download method '{method}': must be frames or burst")
+        download = download_by_frames if method == "frames" else download_by_bursts
+        return await download(self, size, within_s=within_s)
+
+    # --- by number ---
+
+    async def transact(
+        self,
+        request: Request,
+        name: str,
+        reply_size: int,
+        *,
+        timeout_s: float | None = None,
+        retries: int | None = None,
+    ) -> tuple[Reply, float]:
+        """Send a request and return its reply and latency; the numbers need not be in the definition."""
+        limit = self.timeout_s if timeout_s is None else timeout_s
+        attempts = 1 + (self.retries if retries is None else retries)
+        async with self._turn:
+            for _ in range(attempts):
+                answer = await self._attempt(request, reply_size, limit)
+                if answer is not None:
+                    return self._judge(name, *answer)
+                self.transactions.append(Transaction(name, "no_reply", float("inf")))
+        self.link.check()
+        raise NoReplyError(name, limit, attempts)
+
+    async def _attempt(self, request: Request, reply_size: int, limit: float) -> tuple[Reply, float] | None:
+        future: asyncio.Future[tuple[Reply, float]] = asyncio.get_running_loop().create_future()
+        self._pending = (request, future)
+        begin = time.perf_counter()
+        try:
+            self.link.request(request, reply_size)
+            async with asyncio.timeout(limit):
+                reply, end = await future
+            return reply, end - begin
+        except TimeoutError:
+            await asyncio.sleep(SETTLE_S)
+            self.link.forget()
+            return None
+        finally:
+            self._pending = None
+
+    def _judge(self, name: str, reply: Reply, latency: float) -> tuple[Reply, float]:
+        if reply.kind is not ReplyKind.NACK:
+            self.transactions.append(Transaction(name, "ok", latency))
+            return reply, latency
+        names = self.icd.enums["error_code"].names
+        code_name = names.get(int(reply.code), "unpublished code")
+        self.transactions.append(Transaction(name, code_name, latency))
+        raise NackError(name, int(reply.code), code_name)
+
+    def _on_reply(self, reply: Reply) -> None:
+        now = time.perf_counter()
+        if reply.kind is ReplyKind.BURST:
+            self.bursts.put_nowait(reply.data)
+            return
+        if reply.kind is ReplyKind.UNSOLICITED:
+            self._on_unsolicited(reply)
+            return
+        if self._pending is not None:
+            request, future = self._pending
+            fits = reply.id is None or reply.id == request.id
+            if fits and reply.kind in _ANSWERS[request.kind] and not future.done():
+                future.set_result((reply, now))
+                return
+        self.stray_replies.append(reply)
+
+    def _on_unsolicited(self, reply: Reply) -> None:
+        row = self.icd.row_by_id(reply.id) if reply.id is not None else None
+        if row is None or row.kind != "telemetry" or len(reply.data) != row.size:
+            self.stray_replies.append(reply)
+        else:
+            self.unsolicited.put_nowait(self._reading(reply, 0.0))
+
+    def _reading(self, reply: Reply, latency: float) -> Reading:
+        row = self.icd.telemetry_by_id[reply.id] if reply.id is not None else None
+        if row is None:
+            raise BadReplyError("a reply without an identifier")
+        try:
+            values = row.decode(reply.data)
+        except ProtocolError as error:
+            raise BadReplyError(str(error)) from None
+        return Reading(row.name, values, latency, time.time())
+
+
+_ANSWERS: Final = {
+    RequestKind.TELECOMMAND: (ReplyKind.ACK, ReplyKind.NACK),
+    RequestKind.TELEMETRY: (ReplyKind.TELEMETRY, ReplyKind.NACK),
+}
