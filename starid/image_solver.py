@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,22 +13,18 @@ from numpy.typing import NDArray
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.identifier import Effort, Identifier
+from starid.geometric.identifier import Identifier
+from starid.image_looks import Counts, Look, looks
 from starid.imaging.detection import Detections, DetectionSettings, detect
-from starid.self_calibration import IMAGE_MODELS, Stars, self_calibrate
-from starid.solution import Solution
+from starid.rough_search import ALL_ROUNDS, RoughSearch
+from starid.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
+from starid.solution import Reason, Solution
 
 _FEW: Final = 8
 """Fewer matched stars leave the lens as it was taken to be."""
 
-_PATIENT: Final = Effort(
-    tolerance_px=8.0,
-    window_px=20.0,
-    test_window_px=16.0,
-    magnitude_gate=2.5,
-    max_triangles=30000,
-)
-"""Second try on an image of an unknown camera: rough positions, odd colours, many false stars."""
+_ROUNDS: Final = ((ALL_ROUNDS[:1], None), (ALL_ROUNDS[1:2], 4), (ALL_ROUNDS[2:], 1))
+"""Rounds of the search, and how many of the looks at the image get them; None while they are still to be made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +41,24 @@ class ImageSolution:
         The camera: as given, or as estimated on this image.
     stars : StarCatalog
         Catalogue stars as the camera sees them.
+    mirrored : bool
+        The image shows the sky mirrored. Attitude, camera and detections then are those of the image flipped
+        left to right.
     """
 
     solution: Solution
     detections: Detections
     camera: Camera
     stars: StarCatalog
+    mirrored: bool = False
+
+    def on_image(self, xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions (n, 2) of the solution's frame, on the image as it was given."""
+        return flipped(xy_px, self.camera.width) if self.mirrored else xy_px
 
 
 def solve_image(
-    image: NDArray[np.uint8] | NDArray[np.uint16],
+    image: Counts,
     camera: Camera | None = None,
     catalog: StarCatalog | None = None,
     *,
@@ -71,8 +76,9 @@ def solve_image(
     catalog : StarCatalog, optional
         Default: the whole of Hipparcos at its default epoch.
     fov_tolerance : float
-        Relative uncertainty of the camera's field of view. If it is not 0, focal length and, with enough
-        stars, distortion are estimated on the image.
+        Relative uncertainty of the camera's field of view. If it is not 0, the image may come from any camera:
+        focal length and, with enough stars, distortion are estimated on it, and other ways to look at it are
+        tried where the plain one fails (`starid.image_looks`, `starid.rough_search`).
     settings : DetectionSettings, optional
         For the detection.
 
@@ -89,30 +95,72 @@ def solve_image(
             "give the profile of the camera that took it, or its field of view"
         )
     sky = load_catalog() if catalog is None else catalog
-    found = detect(image, settings or DetectionSettings())
-    identifier = Identifier(given, sky, fov_tolerance=fov_tolerance)
-    solution = identifier.identify(found.xy_px, found.flux, found.xy_sigma_px)
     if fov_tolerance > 0.0:
-        if not solution.valid:
-            identifier = Identifier(given, sky, fov_tolerance=fov_tolerance, effort=_PATIENT)
-            solution = identifier.identify(found.xy_px, found.flux)
-        if solution.valid:
-            solution = _polished(solution, found, identifier)
+        return _solve_roughly(image, given, sky, fov_tolerance, settings)
+    found = detect(image, settings or DetectionSettings())
+    identifier = Identifier(given, sky)
+    solution = identifier.identify(found.xy_px, found.flux, found.xy_sigma_px)
     return ImageSolution(solution, found, solution.camera or given, identifier.stars)
 
 
-def _polished(solution: Solution, found: Detections, identifier: Identifier) -> Solution:
-    """Solution with the lens estimated on the same stars, where they suffice."""
-    rough = solution.camera or identifier.camera
-    if solution.star_count < _FEW:
-        return solution
-    stars = Stars(found.xy_px, found.flux, found.xy_sigma_px)
-    camera = self_calibrate(
-        [stars], rough, identifier.catalog, fov_tolerance=0.01, models=IMAGE_MODELS
-    ).calibration.camera
-    again = identifier.with_camera(camera).track(
+def _solve_roughly(
+    image: Counts, camera: Camera, sky: StarCatalog, fov_tolerance: float, settings: DetectionSettings | None
+) -> ImageSolution:
+    """Look at the image in one way after the other until one of them shows a sky."""
+    begin = time.perf_counter()
+    search = RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
+    seen: list[Look] = []
+    answer = Solution.invalid(Reason.NO_MATCH)
+    for rounds, source in _ROUNDS:
+        for look in looks(image, settings) if source is None else seen[:source]:
+            if source is None:
+                seen.append(look)
+            found = look.detections
+            xy = flipped(found.xy_px, camera.width) if look.mirrored else found.xy_px
+            answer = search.identify(xy, found.flux, rounds=rounds)
+            if answer.valid:
+                return polished(answer, look, camera, search, begin)
+    answer = Solution.invalid(answer.reason, elapsed=time.perf_counter() - begin)
+    return ImageSolution(answer, seen[0].detections, camera, search.identifier.stars)
+
+
+def polished(
+    solution: Solution, look: Look, camera: Camera, search: RoughSearch, begin: float
+) -> ImageSolution:
+    """Solution with the lens estimated on the same stars, where they suffice.
+
+    Parameters
+    ----------
+    solution : Solution
+        Valid, in the rows of the look's detections.
+    look : Look
+        What was identified.
+    camera : Camera
+        As it was taken to be.
+    search : RoughSearch
+        What found the solution.
+    begin : float
+        Performance counter at the start.
+    """
+    identifier = search.identifier
+    found = look.detections
+    if look.mirrored:
+        found = dataclasses.replace(found, xy_px=flipped(found.xy_px, camera.width))
+    refined = solution.camera or camera
+    if solution.star_count >= _FEW:
+        stars = Stars(found.xy_px, found.flux, found.xy_sigma_px)
+        refined = calibrate_identified(
+            [stars], {0: solution}, camera, identifier.catalog, models=IMAGE_MODELS
+        ).calibration.camera
+    again = identifier.with_camera(refined).track(
         found.xy_px, found.flux, solution.attitude, found.xy_sigma_px
     )
-    if not again.valid:
-        return solution
-    return dataclasses.replace(again, mode="lost_in_space", camera=camera)
+    if again.valid:
+        solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
+    solution = dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+    return ImageSolution(solution, found, solution.camera or camera, identifier.stars, look.mirrored)
+
+
+def flipped(xy: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+    """Positions (n, 2) in the image flipped left to right."""
+    return np.stack([width - 1.0 - xy[:, 0], xy[:, 1]], axis=1)

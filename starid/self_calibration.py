@@ -1,6 +1,6 @@
 """Calibration without a laboratory: from the stars of several frames and a rough field of view.
 
-Each frame is identified with the start camera, whose focal length may be off by the tolerance; the matches
+Each frame is identified with the start camera, whose lens may be off by the tolerance; the matches
 calibrate the camera; with it all catalogue stars in the field are matched again, which brings in the corners
 that the start camera had missed; and so on until nothing changes.
 """
@@ -8,7 +8,7 @@ that the start camera had missed; and so on until nothing changes.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -28,7 +28,8 @@ from starid.calibration import (
 from starid.camera import Camera
 from starid.catalog import StarCatalog, blend, load_catalog
 from starid.errors import StaridError
-from starid.geometric.identifier import Identifier
+from starid.rough_search import RoughSearch
+from starid.solution import Solution
 
 Array = NDArray[np.float64]
 
@@ -121,28 +122,73 @@ def self_calibrate(
     if estimate is not None:
         check_estimate(estimate)
     sky = load_catalog() if catalog is None else catalog
-    identifier = Identifier(camera, sky, fov_tolerance=fov_tolerance)
-    matched: dict[int, CalibrationFrame] = {}
+    search = RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
+    solutions: dict[int, Solution] = {}
     refused: dict[int, str] = {}
-    faintest = -np.inf
     for index, stars in enumerate(frames):
-        sigma = _floored_sigma(stars)
-        solution = identifier.identify(stars.xy_px, stars.flux, None if sigma is None else _one_axis(sigma))
-        if not solution.valid:
+        solution = search.identify(stars.xy_px, stars.flux)
+        if solution.valid:
+            solutions[index] = solution
+        else:
             refused[index] = solution.reason.value
-            continue
-        rows, chosen = solution.catalog_index, solution.detection_index
-        faintest = max(faintest, float(sky.v[rows].max()))
-        matched[index] = _frame(stars, sigma, chosen, sky.vectors[rows], solution.attitude)
-    if not matched:
+    if not solutions:
         reasons = ", ".join(sorted(set(refused.values())))
         raise StaridError(
             f"calibration: none of {len(frames)} frames could be identified ({reasons}); "
             "check the field of view, or take frames with more stars"
         )
+    result = calibrate_identified(frames, solutions, camera, sky, estimate=estimate, models=models)
+    return dataclasses.replace(result, refused=refused)
+
+
+def calibrate_identified(
+    frames: Sequence[Stars],
+    solutions: Mapping[int, Solution],
+    camera: Camera,
+    sky: StarCatalog,
+    *,
+    estimate: Sequence[str] | None = None,
+    models: Sequence[tuple[str, ...]] = MODELS,
+) -> SelfCalibration:
+    """Estimate the camera that took frames of which some are identified.
+
+    Parameters
+    ----------
+    frames : sequence of Stars
+        Detections of each frame.
+    solutions : mapping of int to Solution
+        Valid solutions by frame, at least one; the first one's camera, if it has one, is where the
+        adjustment starts.
+    camera : Camera
+        The camera that the frames were identified with.
+    sky : StarCatalog
+        What the solutions' `catalog_index` counts in.
+    estimate, models
+        As in `self_calibrate`.
+
+    Raises
+    ------
+    StaridError
+        What `calibrate` refuses.
+    """
+    indices = tuple(solutions)
+    matched: list[CalibrationFrame] = []
+    faintest = -np.inf
+    for index, solution in solutions.items():
+        stars, rows = frames[index], solution.catalog_index
+        faintest = max(faintest, float(sky.v[rows].max()))
+        matched.append(
+            _frame(
+                stars,
+                _floored_sigma(stars),
+                solution.detection_index,
+                sky.vectors[rows],
+                solution.attitude,
+            )
+        )
+    start = solutions[indices[0]].camera or camera
     seen = blend(sky.brighter_than(faintest + _FAINTER), _BLEND_PX * camera.pixel_scale_rad)
-    indices = tuple(matched)
-    result = calibrate(list(matched.values()), camera, _enough(list(matched.values()), ("focal", "k1")))
+    result = calibrate(matched, start, _enough(matched, ("focal", "k1")))
     matches: tuple[NDArray[np.int64], ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
@@ -159,7 +205,7 @@ def self_calibrate(
         result = _best(again, start, models) if estimate is None else calibrate(again, start, estimate)
         if _same(before, result):
             break
-    return SelfCalibration(result, indices, matches, refused)
+    return SelfCalibration(result, indices, matches, {})
 
 
 def _floored_sigma(stars: Stars) -> Array | None:
@@ -168,12 +214,6 @@ def _floored_sigma(stars: Stars) -> Array | None:
         return None
     floored: Array = np.hypot(stars.xy_sigma_px, _SIGMA_FLOOR_PX)
     return floored
-
-
-def _one_axis(sigma: Array) -> Array:
-    """Error on one axis (n,) of errors (n,) or (n, 2)."""
-    mean: Array = sigma if sigma.ndim == 1 else np.sqrt(np.mean(sigma**2, axis=1))
-    return mean
 
 
 def _frame(

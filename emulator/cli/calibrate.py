@@ -35,8 +35,8 @@ def command(
     ] = None,
     epoch: Annotated[float | None, typer.Option(help="Julian year of the images; default 2026.")] = None,
     allow_colour: Annotated[
-        bool, typer.Option("--allow-colour", help="Turn colour images into grey.")
-    ] = False,
+        bool, typer.Option("--allow-colour/--refuse-colour", help="Turn colour images into grey.")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Estimate focal length, centre and distortion from stars in several images, and save the camera.

@@ -9,20 +9,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from starid.camera import Camera
+    from starid.camera import Camera, Model
+    from starid.catalog import StarCatalog
     from starid.image_solver import ImageSolution
 
 _NUMBERED_TO_MAGNITUDE = 3.0
 _SHOWN_STARS = 12
+_ANY_FIELD = "auto"
+_MODELS: dict[str, Model] = {"pinhole": "pinhole", "equidistant": "equidistant"}
 
 
 def command(
-    image: Annotated[Path, typer.Argument(help="PNG, TIFF or JPEG, grey, 8 or 16 bits.")],
+    image: Annotated[
+        Path, typer.Argument(help="PNG, TIFF or JPEG, 8 or 16 bits; grey, or with --fov colour.")
+    ],
     profile: Annotated[
         str | None, typer.Option(help="Take the camera from this profile (name or TOML file).")
     ] = None,
     fov: Annotated[
-        float | None, typer.Option(help="Rough horizontal field of view, degrees, of any other camera.")
+        str | None,
+        typer.Option(
+            metavar="DEGREES|auto",
+            help="Any other camera: rough width of what the image shows, edge to edge, degrees; or auto, to "
+            "try 5 to 46 degrees.",
+        ),
     ] = None,
     fov_tolerance: Annotated[
         float, typer.Option(min=0.0, max=0.3, help="Relative uncertainty of --fov.")
@@ -30,30 +40,30 @@ def command(
     model: Annotated[str, typer.Option(help="With --fov: pinhole or equidistant.")] = "pinhole",
     epoch: Annotated[float | None, typer.Option(help="Julian year of the image; default 2026.")] = None,
     allow_colour: Annotated[
-        bool, typer.Option("--allow-colour", help="Turn a colour image into grey.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--allow-colour/--refuse-colour",
+            help="Turn a colour image into grey, or refuse it; default: refuse it but with --fov.",
+        ),
+    ] = None,
     annotate: Annotated[
-        Path | None, typer.Option(help="Write the image with its identified stars marked.")
+        Path | None,
+        typer.Option("--annotate", "-o", help="Write the image with its identified stars marked."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Identify the stars on an image, lost in space; exit status 1 if they cannot be.
 
-    Without --profile or --fov the camera is the emulator's own, 937×937 pixels and 42° wide.
+    Without --profile or --fov the camera is the emulator's own, 937×937 pixels and 42° wide. With --fov the image
+    may come from any camera, be mirrored or a negative; field and distortion are measured on it.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
-    from starid.image_solver import solve_image
     from starid.imaging.image_io import read_image, write_image
 
-    pixels = read_image(image, allow_colour=allow_colour)
-    camera = _camera(profile, fov, model, pixels.shape)
-    result = solve_image(
-        pixels,
-        camera,
-        load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch),
-        fov_tolerance=0.0 if fov is None else fov_tolerance,
-    )
-    report = _report(image, result)
+    pixels = read_image(image, allow_colour=fov is not None if allow_colour is None else allow_colour)
+    catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)
+    result = _solved(pixels, catalog, profile, fov, fov_tolerance, model)
+    report = _report(image, result, _advice(result, fov, model))
     if annotate is not None:
         write_image(annotate, _marked(pixels, result))
     if as_json:
@@ -64,16 +74,41 @@ def command(
         raise typer.Exit(1)
 
 
-def _camera(profile: str | None, fov: float | None, model: str, shape: tuple[int, ...]) -> Camera:
-    """The camera that the options name."""
+def _solved(
+    pixels: Any,
+    catalog: StarCatalog,
+    profile: str | None,
+    fov: str | None,
+    fov_tolerance: float,
+    model: str,
+) -> ImageSolution:
+    """What is found on the image with the camera that the options name."""
     from emulator.errors import EmulatorError
+    from starid.camera import Camera
+    from starid.field_sweep import solve_any_field
+    from starid.image_solver import solve_image
+
+    if fov is None:
+        return solve_image(pixels, _camera(profile), catalog)
+    if profile is not None:
+        raise EmulatorError("identify: --profile and --fov both name a camera: give one of them")
+    if model not in _MODELS:
+        raise EmulatorError(f"identify --model: {model!r} given, {' or '.join(_MODELS)} needed")
+    if fov == _ANY_FIELD:
+        return solve_any_field(pixels, catalog, model=_MODELS[model])
+    try:
+        width_deg = float(fov)
+    except ValueError:
+        raise EmulatorError(f"identify --fov: {fov!r} given, degrees or {_ANY_FIELD} needed") from None
+    camera = Camera.from_fov(width_deg, pixels.shape[1], pixels.shape[0], _MODELS[model])
+    return solve_image(pixels, camera, catalog, fov_tolerance=fov_tolerance)
+
+
+def _camera(profile: str | None) -> Camera:
+    """The camera of a profile, or the emulator's own."""
     from starid.camera import Camera
     from starid.camera_file import load_camera
 
-    if fov is not None:
-        if profile is not None:
-            raise EmulatorError("identify: --profile and --fov both name a camera: give one of them")
-        return Camera.from_dict({"fov_deg": fov, "width": shape[1], "height": shape[0], "model": model})
     if profile is None:
         return Camera.from_fov()
     if Path(profile).suffix == ".toml":
@@ -83,13 +118,34 @@ def _camera(profile: str | None, fov: float | None, model: str, shape: tuple[int
     return Camera.from_dict(load_profile(profile).camera.values())
 
 
-def _report(image: Path, result: ImageSolution) -> dict[str, Any]:
+def _advice(result: ImageSolution, fov: str | None, model: str) -> str:
+    """What to try where the image was not identified; empty where it was."""
+    solution, found = result.solution, result.detections
+    if solution.valid:
+        return ""
+    if solution.reason == "too_few_stars":
+        seen = found.reason or f"{len(found)} stars stand out"
+        return f"{seen}; expose longer, or give a part of the image that shows sky"
+    if fov is None:
+        return "give the profile of the camera that took it, or with --fov the rough width of the image in degrees"
+    if fov == _ANY_FIELD:
+        return "give the width of the image in degrees with --fov, if it is not within 5 to 46 degrees, or --model equidistant"
+    other = next(name for name in _MODELS if name != model)
+    return (
+        f"check that the whole image is {fov}° wide within the tolerance, or try --fov {_ANY_FIELD}, --model {other}, "
+        "or a part of the image without foreground"
+    )
+
+
+def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
     """The answer as plain values; angles and quaternion are None where it is not valid."""
     solution, found = result.solution, result.detections
     report: dict[str, Any] = {
         "image": str(image),
         "valid": solution.valid,
         "reason": solution.reason.value,
+        "advice": advice,
+        "mirrored": result.mirrored,
         "ra_deg": None,
         "dec_deg": None,
         "roll_deg": None,
@@ -114,7 +170,7 @@ def _report(image: Path, result: ImageSolution) -> dict[str, Any]:
         {"hip": int(hip), "x_px": float(x), "y_px": float(y), "flux": float(flux)}
         for hip, (x, y), flux in zip(
             solution.hip,
-            found.xy_px[solution.detection_index],
+            result.on_image(found.xy_px[solution.detection_index]),
             found.flux[solution.detection_index],
             strict=True,
         )
@@ -131,7 +187,9 @@ def _report(image: Path, result: ImageSolution) -> dict[str, Any]:
         "probability_false": solution.probability_false,
         "missing_stars": [
             {"hip": int(hip), "x_px": float(x), "y_px": float(y), "v": float(v)}
-            for hip, (x, y), v in zip(missing.hip, missing.xy_px, missing.magnitude, strict=True)
+            for hip, (x, y), v in zip(
+                missing.hip, result.on_image(missing.xy_px), missing.magnitude, strict=True
+            )
         ],
     }
 
@@ -149,8 +207,9 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
         star_label(int(hip), float(magnitude), _NUMBERED_TO_MAGNITUDE)
         for hip, magnitude in zip(solution.hip, v, strict=True)
     ]
-    others = np.delete(found.xy_px, solution.detection_index, axis=0)
-    return annotate(pixels, found.xy_px[solution.detection_index], labels, missed_xy_px=others)
+    xy = result.on_image(found.xy_px)
+    others = np.delete(xy, solution.detection_index, axis=0)
+    return annotate(pixels, xy[solution.detection_index], labels, missed_xy_px=others)
 
 
 def _show(report: dict[str, Any]) -> None:
@@ -162,7 +221,8 @@ def _show(report: dict[str, Any]) -> None:
     console = Console(soft_wrap=True)
     if not report["valid"]:
         console.print(
-            f"{report['image']}: not identified ({report['reason']}); {report['stars_detected']} stars found"
+            f"{report['image']}: not identified ({report['reason']}); {report['stars_detected']} stars found; "
+            f"{report['advice']}"
         )
         return
     console.print(
@@ -174,6 +234,8 @@ def _show(report: dict[str, Any]) -> None:
         f"1σ {report['sigma_cross_arcsec']:.2f}″ across and {report['sigma_roll_arcsec']:.1f}″ about the boresight, "
         f"false with probability < {max(report['probability_false'], 1e-300):.1g}"
     )
+    if report["mirrored"]:
+        console.print("the image is mirrored: roll and attitude are those of the image flipped left to right")
     if report["missing_stars"]:
         brightest = min(report["missing_stars"], key=lambda star: star["v"])
         console.print(
