@@ -1,0 +1,135 @@
+"""What the identifier does with input that is bad, too little or odd."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.errors import StaridError
+from starid.geometric.identifier import Effort, Identifier
+from starid.solution import Reason, Solution
+from tests.starid.geometric.sky_points import identifier, sky
+
+AT = Attitude.from_radec_roll(80.0, 10.0, 30.0)
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("xy", "flux", "sigma", "words"),
+    [
+        ([[NAN, 1.0]], [1.0], None, "finite"),
+        ([[1.0, INF]], [1.0], None, "finite"),
+        ([[1.0, 1.0]], [NAN], None, "finite"),
+        ([[1.0, 1.0]], [INF], None, "finite"),
+        ([[1.0, 1.0]], [1.0, 2.0], None, r"\(1, 2\) and flux \(2,\)"),
+        ([1.0, 2.0, 3.0], [1.0], None, r"positions \(3,\)"),
+        ([[1.0, 2.0, 3.0]], [1.0], None, r"positions \(1, 3\)"),
+        (5.0, [1.0], None, r"positions \(\)"),
+        ([[1.0, 1.0], [2.0]], [1.0, 1.0], None, "positions must be an array of numbers"),
+        ([[1.0, 1.0]], ["bright"], None, "flux must be an array of numbers"),
+        ([[1.0, 1.0]], [1.0], [0.0], "positive"),
+        ([[1.0, 1.0]], [1.0], [NAN], "positive"),
+        ([[1.0, 1.0]], [1.0], [1.0, 1.0], r"errors \(2,\)"),
+        ([[1.0, 1.0]], [1.0], [[1.0, 1.0, 1.0]], r"errors \(1, 3\)"),
+    ],
+)
+def test_bad_arrays_are_refused_in_one_line(xy: object, flux: object, sigma: object, words: str) -> None:
+    for ask in (identifier().identify, lambda a, b, c: identifier().track(a, b, AT, c)):
+        with pytest.raises(StaridError, match=words) as caught:
+            ask(xy, flux, sigma)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_too_few_detections_are_named(count: int) -> None:
+    xy, flux, _ = sky(AT)
+    for solution in (
+        identifier().identify(xy[:count], flux[:count]),
+        identifier().track(xy[:count], flux[:count], AT),
+    ):
+        assert (solution.valid, solution.reason, solution.star_count) == (False, Reason.TOO_FEW_STARS, 0)
+        with pytest.raises(StaridError, match="too_few_stars"):
+            _ = solution.attitude
+
+
+def test_no_detections_may_come_as_an_empty_list() -> None:
+    assert identifier().identify([], []).reason is Reason.TOO_FEW_STARS
+
+
+@pytest.mark.parametrize("count", [4, 30, 200])
+def test_all_detections_in_one_place_are_no_star_field(count: int) -> None:
+    solution = identifier().identify(np.full((count, 2), 300.0), np.ones(count))
+    assert (solution.valid, solution.reason) == (False, Reason.NO_MATCH)
+
+
+def test_a_star_detected_twice_is_matched_once() -> None:
+    xy, flux, _ = sky(AT)
+    solution = identifier().identify(np.concatenate([xy, xy]), np.concatenate([flux, flux]))
+    assert solution.valid
+    assert len(set(solution.hip.tolist())) == solution.star_count
+    assert solution.attitude.error_to(AT).total_arcsec < 100.0
+
+
+def test_detections_without_flux_count_as_faintest() -> None:
+    xy, flux, _ = sky(AT)
+    dark = flux.copy()
+    dark[::3], dark[3::6] = 0.0, -5.0
+    solution = identifier().identify(xy, dark)
+    assert solution.valid
+    assert not set(solution.detection_index.tolist()) & set(np.flatnonzero(dark <= 0.0).tolist())
+
+
+def test_input_is_left_as_it_was() -> None:
+    xy, flux, _ = sky(AT)
+    before = xy.copy(), flux.copy()
+    identifier().identify(xy, flux)
+    assert (xy == before[0]).all()
+    assert (flux == before[1]).all()
+
+
+def test_single_precision_lists_and_strided_arrays_are_taken() -> None:
+    xy, flux, _ = sky(AT)
+    expected = identifier().identify(xy, flux).quaternion_xyzw
+    strided = np.zeros((len(xy), 6))
+    strided[:, 1:4:2] = xy
+    for positions in (xy.tolist(), np.asfortranarray(xy), strided[:, 1:4:2]):
+        assert identifier().identify(positions, flux.tolist()).quaternion_xyzw == pytest.approx(expected)
+    single = identifier().identify(xy.astype(np.float32), flux.astype(np.float32))
+    assert single.attitude.error_to(AT).total_arcsec < 100.0
+
+
+@pytest.mark.parametrize("window", [0.0, -1.0, NAN, INF])
+def test_a_tracking_window_must_be_positive(window: float) -> None:
+    xy, flux, _ = sky(AT)
+    with pytest.raises(StaridError, match="window_px"):
+        identifier().track(xy, flux, AT, window_px=window)
+
+
+@pytest.mark.parametrize("tolerance", [-0.01, 0.31, NAN])
+def test_a_tolerance_of_the_field_must_be_in_range(tolerance: float) -> None:
+    with pytest.raises(StaridError, match="fov_tolerance"):
+        Identifier(fov_tolerance=tolerance)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"tolerance_px": 0.0}, {"max_triangles": -1}, {"window_px": NAN}, {"max_false_probability": INF},
+     {"part_stars": -1}, {"part_stars": 31}],
+)  # fmt: skip
+def test_an_effort_out_of_range_is_named(change: dict[str, float]) -> None:
+    with pytest.raises(StaridError, match=next(iter(change))):
+        Effort(**change)
+
+
+def test_a_camera_of_another_size_is_refused() -> None:
+    with pytest.raises(StaridError, match="937×937"):
+        identifier().with_camera(Camera.from_fov(42.0, 640, 480))
+
+
+def test_a_solution_cannot_be_valid_and_have_a_reason_against_it() -> None:
+    with pytest.raises(StaridError, match="no_match"):
+        Solution(valid=True, reason=Reason.NO_MATCH)

@@ -1,0 +1,101 @@
+"""The index on disk: mapped again, and built anew where it is damaged or another's."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.errors import StaridError
+from starid.geometric import index_file
+from starid.geometric.identifier import Identifier
+from tests.starid.geometric.sky_points import sky
+
+CAMERA = Camera.from_fov(60.0, 512, 512)
+MOST_BYTES = 10_000_000
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("index")
+    Identifier(CAMERA, limiting_magnitude=4.0, cache=folder)
+    (path,) = folder.iterdir()
+    return path
+
+
+def key_of(path: Path) -> str:
+    return path.stem.removeprefix("index-")
+
+
+def test_index_is_written_once_and_is_small(stored: Path) -> None:
+    before = stored.stat().st_mtime_ns
+    Identifier(CAMERA, limiting_magnitude=4.0, cache=stored.parent)
+    assert stored.stat().st_mtime_ns == before
+    assert stored.stat().st_size < MOST_BYTES
+
+
+def test_arrays_come_back_as_they_were_and_cannot_be_written(stored: Path) -> None:
+    mapped = index_file.load(stored, key_of(stored))
+    assert mapped is not None
+    again = index_file.unpack(index_file.pack(mapped, "k"), "k")
+    for first, second in zip(mapped, again, strict=True):
+        assert first.dtype == second.dtype
+        assert np.array_equal(first, second)
+        assert not first.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda b: b[:0], "empty file"),
+        (lambda b: b"GIF89a" + b[6:], "not an index file"),
+        (lambda b: b[:40], "header cut off"),
+        (lambda b: b[: len(b) // 2], "checksum"),
+        (lambda b: b[:-1], "checksum"),
+        (lambda b: b[: len(b) - 1000] + bytes([b[-1000] ^ 1]) + b[len(b) - 999 :], "checksum"),
+        (lambda b: b.replace(b'"key"', b'"kei"', 1), "key"),
+        (lambda b: b[:8] + (1 << 62).to_bytes(8, "little") + b[16:], "header cut off"),
+    ],
+    ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length"],
+)
+def test_damaged_file_is_named_and_built_anew(
+    stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage, words: str
+) -> None:
+    good = stored.read_bytes()
+    path = tmp_path / stored.name
+    path.write_bytes(damage(good))
+    with caplog.at_level(logging.WARNING):
+        identifier = Identifier(CAMERA, limiting_magnitude=4.0, cache=tmp_path)
+    assert str(path) in caplog.text
+    assert words in caplog.text
+    assert path.read_bytes() == good
+    attitude = Attitude.from_radec_roll(80.0, 10.0, 30.0)
+    xy, flux, _ = sky(attitude, camera=CAMERA, limit=4.0, identified=identifier)
+    assert identifier.identify(xy, flux).valid
+
+
+def test_an_index_of_another_camera_under_this_name_is_not_believed(
+    stored: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert index_file.load(stored, "another") is None
+    assert "made for another" in caplog.text
+
+
+def test_a_folder_that_cannot_be_written_costs_only_the_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    with caplog.at_level(logging.WARNING):
+        Identifier(CAMERA, limiting_magnitude=4.0, cache=blocked)
+    assert "cannot be written" in caplog.text
+
+
+def test_a_sky_without_triangles_is_refused() -> None:
+    with pytest.raises(StaridError, match="raise the limiting magnitude"):
+        Identifier(Camera.from_fov(5.0, 512, 512), limiting_magnitude=1.0, cache=False)
