@@ -210,7 +210,9 @@ class ControlServer:
 
     async def _set_truth(self, request: dict[str, Any]) -> Answer:
         _only(request, "truth")
-        config = _parse(_TRUTH, _Truth, request.get("truth"))
+        if not isinstance(request.get("truth"), dict):
+            raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
+        config = _parse(_TRUTH, _Truth, request["truth"], "truth")
         device = self._emulation.device
         device.cycle.truth = await self._emulation.open_truth(config)
         return {"kind": config.kind, "address": self._emulation.ready_words.get("truth", "")}
@@ -248,12 +250,12 @@ _TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 _FAULT: Final[TypeAdapter[FaultRequest]] = TypeAdapter(FaultRequest)
 
 
-def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object) -> Any:
+def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object, *under: str) -> Any:
     """Validate a part of a request, or say in one line what is wrong with it."""
     try:
         return adapter.validate_json(json.dumps(value))
     except ValidationError as error:
-        raise EmulatorError(explain(error, model)) from None
+        raise EmulatorError(explain(error, model, under=under)) from None
 
 
 def _only(request: dict[str, Any], *known: str) -> None:

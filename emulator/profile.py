@@ -226,7 +226,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        why = explain(error, Profile, "extends")
+        why = explain(error, Profile, also=("extends",))
         raise EmulatorError(f"{_culprit(path, overrides, why)}: {why}") from None
     for name in profile.parameters:
         if name in LINK_PARAMETERS:

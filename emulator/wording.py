@@ -9,19 +9,24 @@ from typing import Any, Final
 from pydantic import BaseModel, ValidationError
 
 
-def explain(error: ValidationError, model: type[BaseModel], *also: str) -> str:
+def explain(
+    error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
+) -> str:
     """Say in one line where the first fault of a validation is, what it is and what to do.
 
     Parameters
     ----------
     error, model
         What was refused, and by which model.
+    under
+        Keys of the model under which what was refused stands.
     also
         Keys that may stand at the top beside those of the model.
     """
     first = error.errors(include_url=False)[0]
-    loc = first["loc"]
-    where = ".".join(str(part) for part in loc if part not in _TAGS) or "as a whole"
+    loc = (*under, *first["loc"])
+    path = [str(part) for part in loc if part not in _TAGS]
+    where = ".".join(path) or "as a whole"
     if first["type"] == "extra_forbidden":
         known = sorted([*_keys_at(model, loc[:-1]), *(also if len(loc) == 1 else ())])
         near = difflib.get_close_matches(str(loc[-1]), known, n=1)
@@ -36,7 +41,7 @@ def explain(error: ValidationError, model: type[BaseModel], *also: str) -> str:
         expected = context.get("expected_tags") or ", ".join(
             repr(tag) for tag in sorted(_tags_at(model, loc))
         )
-        return f"{where}.{key}: must be one of {expected}{given}"
+        return f"{'.'.join([*path, key])}: must be one of {expected}{given}"
     shown = "" if isinstance(first["input"], (dict, list)) else f" (given: {first['input']!r})"
     return f"{where}: {plain(first['msg'])}{shown}"
 

@@ -137,8 +137,19 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             assert later["roll_deg"] == pytest.approx(6.0)  # three seconds after the swap
             by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
             assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
+            for wrong, said in (
+                ({}, "truth: an object is needed, with the keys of [truth] in a profile"),
+                ({"truth": 3}, "truth: an object is needed, with the keys of [truth] in a profile"),
+                ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind"),
+                ({"truth": {}}, "truth.kind: must be one of 'file', 'fixed', 'live', 'rate', 'slew'"),
+                (
+                    {"truth": {"kind": "fixed", "attitude": {"ra_deg": "x"}}},
+                    "truth.attitude.ra_deg: must be a valid number (given: 'x')",
+                ),
+            ):
+                assert await control.do("set_truth", **wrong) == {"ok": False, "error": said}
             bad = await control.do("set_truth", truth={"kind": "rate"})
-            assert bad == {"ok": False, "error": "rate_deg_s: missing; give it"}
+            assert bad == {"ok": False, "error": "truth.rate_deg_s: missing; give it"}
             assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
             assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
 
