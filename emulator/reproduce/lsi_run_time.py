@@ -116,6 +116,12 @@ def _work(context: Context, part: Part) -> Results:
     return dict(times)
 
 
+def _compared(published: float, ours: float) -> str:
+    if ours > published:
+        return f"{ours / published:.1f} times slower"
+    return f"{published / ours:.{0 if published > 10.0 * ours else 1}f} times faster"
+
+
 def _rows(results: Mapping[str, Results], percents: list[float], *, checked: bool) -> list[Row]:
     rows = []
     for percent in percents:
@@ -135,9 +141,7 @@ def _rows(results: Mapping[str, Results], percents: list[float], *, checked: boo
                         unit="ms",
                         digits=3,
                         at_most=limit if checked else None,
-                        remark=f"{published / ours:.0f} times faster"
-                        if ours < published
-                        else f"{ours / published:.1f} times slower",
+                        remark=_compared(published, ours),
                     )
                 )
             if percent == _BEST:

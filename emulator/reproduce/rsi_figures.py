@@ -13,6 +13,7 @@ from emulator.reproduce.rsi_parts import BY_TABLE, FIELDS, LSI_ONLY, SETTLING, m
 
 _SHOWN: Final = 40
 _LEAST: Final = 1e-4
+_MOST_MS: Final = 1.0
 
 
 def rsi_figures(context: Context, results: Mapping[str, Results]) -> list[str]:
@@ -84,10 +85,9 @@ def _by_method(context: Context, results: Mapping[str, Results], overlap: float,
             )
         axis.set(title=name, xlabel="threshold of ε_f / °")
         axis.legend(loc="lower right")
-    number = "6_39_to_6_41" if overlap == context.parameters["overlaps"][-1] else "f_3_to_f_5"
-    fig.suptitle(
-        f"Figures {number.replace('_to_', ' to ').replace('_', '.').upper()}, p = {100 * overlap:g} %, noise × {scale:g}"
-    )
+    last = overlap == context.parameters["overlaps"][-1]
+    number, words = ("6_39_to_6_41", "6.39 to 6.41") if last else ("f_3_to_f_5", "F.3 to F.5")
+    fig.suptitle(f"Figures {words}: p = {100 * overlap:g} %, noise × {scale:g}")
     return save(fig, context.folder / f"figures_{number}_x{scale:g}.png")
 
 
@@ -132,7 +132,7 @@ def _sequences(context: Context, results: Mapping[str, Results]) -> str:
             axis.set(title=f"μ = f = {factor}, τ = {tau:g}")
     for axis in axes[-1]:
         axis.set_xlabel("frame")
-    axes[0, 0].legend(loc="lower right", ncols=2)
+    fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     fig.suptitle(f"Figures 6.33 to 6.36 and E: p = {100 * context.parameters['overlaps'][-1]:g} %")
     return save(fig, context.folder / "figures_6_33_to_6_36_and_e.png")
 
@@ -154,9 +154,9 @@ def _run_times(context: Context, results: Mapping[str, Results]) -> str:
             lines += right.plot(frames, numbers["lasso_ms"], "k:", label="LASSO / ms (right)")
             axis.set(title=f"μ = f = {factor}, τ = {tau:g}", ylim=(0.0, 4.0))
             right.grid(visible=False)
-            right.set_ylim(bottom=0.0)
+            right.set_ylim(0.0, _MOST_MS)
             if (i, j) == (0, 0):
-                axis.legend(handles=lines, loc="upper right", ncols=2)
+                fig.legend(handles=lines, loc="outside lower center", ncols=4)
     for axis in axes[-1]:
         axis.set_xlabel("frame")
     fig.suptitle(f"Figures 6.42, 6.43 and G: p = {100 * context.parameters['overlaps'][-1]:g} %")

@@ -99,6 +99,8 @@ def statistics(result: Results) -> dict[str, float]:
         "side_sigma": float(side.std()) if side.size else math.nan,
         "search_ms": float(np.nanmean(settled["search_ms"])),
         "search_ms_sigma": float(np.nanstd(settled["search_ms"])),
+        "search_ms_median": float(np.nanmedian(settled["search_ms"])),
+        "lasso_ms_median": float(np.nanmedian(settled["lasso_ms"])),
         "lasso_ms": float(np.nanmean(settled["lasso_ms"])),
         "lasso_ms_sigma": float(np.nanstd(settled["lasso_ms"])),
         "mean_distance_deg": float(np.nanmean(settled["mean_distance"])),
