@@ -1,0 +1,73 @@
+"""Photographs of the sky by a camera that is no star sensor: more stars than the catalogue has, and other defects."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.attitude import Attitude, random_attitude
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+
+WIDTH, HEIGHT, FOV_DEG = 800, 600, 11.0
+LIMIT = 9.0
+UNLISTED = 150
+FULL = 255.0
+
+
+def photograph(
+    catalog: StarCatalog,
+    seed: int,
+    *,
+    distortion: float = 0.0,
+    spot_px: float = 1.3,
+    foreground: float = 0.0,
+    fov_deg: float = FOV_DEG,
+) -> tuple[NDArray[np.uint8], Attitude, Camera]:
+    """Grey image of 8 bits, the attitude and the camera that took it.
+
+    Parameters
+    ----------
+    catalog : StarCatalog
+        The listed stars; half as many again, faint ones, are not in it.
+    seed : int
+        Of attitude, unlisted stars, colours and noise.
+    distortion : float
+        Displacement at the image's corner as a share of its distance from the centre.
+    spot_px : float
+        Standard deviation of a star's spot.
+    foreground : float
+        Share of the image's height that a hill covers, sharp and grainy.
+    fov_deg : float
+        Width of the field.
+    """
+    rng = np.random.default_rng(seed)
+    attitude = random_attitude(rng)
+    half = math.tan(math.radians(fov_deg) / 2.0)
+    k1 = distortion / (half * math.hypot(1.0, HEIGHT / WIDTH)) ** 2
+    camera = Camera.from_fov(fov_deg, WIDTH, HEIGHT, distortion=(k1,))
+    near = catalog.in_cone(attitude.boresight, camera.field_radius_rad * 1.1)
+    near = near[catalog.v[near] < LIMIT]
+    xy, inside = camera.project(attitude.to_sensor(catalog.vectors[near]))
+    magnitude = catalog.v[near][inside] + rng.normal(0.0, 0.25, int(inside.sum()))
+    unlisted = rng.uniform(-0.5, [WIDTH - 0.5, HEIGHT - 0.5], (UNLISTED, 2))
+    magnitude = np.concatenate([magnitude, LIMIT - rng.exponential(0.7, UNLISTED)])
+    light = 5.0 * math.sqrt(4.0 * math.pi) * spot_px * 10.0 ** (0.4 * (LIMIT - magnitude))
+    image = np.full((HEIGHT, WIDTH), 30.0)
+    rows, columns = np.arange(HEIGHT), np.arange(WIDTH)
+    for (x, y), flux in zip(np.concatenate([xy[inside], unlisted]), light, strict=True):
+        bell_x = np.exp(-0.5 * ((columns - x) / spot_px) ** 2)
+        bell_y = np.exp(-0.5 * ((rows - y) / spot_px) ** 2)
+        reach = max(round(6.0 * spot_px), 8)
+        window = np.s_[max(int(y) - reach, 0) : int(y) + reach, max(int(x) - reach, 0) : int(x) + reach]
+        spot = np.outer(bell_y[window[0]], bell_x[window[1]])
+        image[window] += flux / (2.0 * math.pi * spot_px**2) * spot
+    image += rng.normal(0.0, 1.0, image.shape)
+    if foreground:
+        crest = HEIGHT * (1.0 - foreground) + 20.0 * np.sin(columns / 60.0)
+        grain = cv2.GaussianBlur(rng.normal(0.0, 20.0, image.shape), (0, 0), 1.0)
+        image = np.where(rows[:, None] > crest, 14.0 + grain, image)
+    return np.clip(np.rint(image), 0.0, FULL).astype(np.uint8), attitude, camera
