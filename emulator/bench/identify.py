@@ -66,11 +66,13 @@ class Tally:
     floor_roll: list[float] = field(default_factory=list)
     squared: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
 
     def add(self, scene: Scene, floor: Attitude | None, reply: Reply) -> None:
         """Count one frame; `floor` is None where there is no true attitude."""
         self.frames += 1
         self.seconds.append(reply.seconds)
+        self.cpu_seconds.append(reply.cpu_seconds)
         if reply.matrix is None:
             return
         self.valid += 1
@@ -89,7 +91,7 @@ class Tally:
 
     def report(self) -> dict[str, Any]:
         """Figures as plain values; None where a row has none."""
-        milliseconds = 1e3 * np.array(self.seconds)
+        milliseconds, cpu = 1e3 * np.array(self.seconds), 1e3 * np.array(self.cpu_seconds)
         boresight, roll = _median(self.boresight), _median(self.roll)
         return {
             "row": self.row,
@@ -101,6 +103,8 @@ class Tally:
             "floor_ratio": _ratio(boresight, _median(self.floor_boresight)),
             "median_ms": float(np.median(milliseconds)) if self.frames else None,
             "p99_ms": float(np.percentile(milliseconds, 99.0)) if self.frames else None,
+            "cpu_median_ms": float(np.median(cpu)) if self.frames else None,
+            "cpu_p99_ms": float(np.percentile(cpu, 99.0)) if self.frames else None,
             "roll_median_arcsec": roll,
             "roll_floor_ratio": _ratio(roll, _median(self.floor_roll)),
             "floor_arcsec": _median(self.floor_boresight),

@@ -38,15 +38,27 @@ class Reply:
     ----------
     matrix : ndarray (3, 3) or None
         ICRS→sensor, None where it gave no attitude.
-    seconds : float
-        Wall time of the call.
+    seconds, cpu_seconds : float
+        Wall time of the call, and the processor time of it.
     covariance : ndarray (3, 3) or None
         Of the rotation vector, rad², where the solver states one.
     """
 
     matrix: Array | None
     seconds: float
+    cpu_seconds: float
     covariance: Array | None = None
+
+
+class Stopwatch:
+    """Wall and processor time since it was made."""
+
+    def __init__(self) -> None:
+        self._cpu, self._wall = time.process_time(), time.perf_counter()
+
+    def read(self) -> tuple[float, float]:
+        """Return both, seconds."""
+        return time.perf_counter() - self._wall, time.process_time() - self._cpu
 
 
 Solver = Callable[[Scene], Reply]
@@ -89,12 +101,12 @@ def _own(name: str, camera: Camera) -> Solver:
     identifier = make_identifier(name, camera)
 
     def solve(scene: Scene) -> Reply:
-        begin = time.perf_counter()
+        watch = Stopwatch()
         solution = identifier.identify(scene.xy_px, scene.flux)
-        seconds = time.perf_counter() - begin
+        seconds = watch.read()
         if not solution.valid:
-            return Reply(None, seconds)
-        return Reply(solution.attitude.matrix, seconds, solution.covariance)
+            return Reply(None, *seconds)
+        return Reply(solution.attitude.matrix, *seconds, solution.covariance)
 
     return solve
 
@@ -116,12 +128,12 @@ def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
 
     def solve(scene: Scene) -> Reply:
         table = np.column_stack([scene.xy_px - centre, scene.flux])
-        begin = time.perf_counter()
+        watch = Stopwatch()
         result: Any = database.solve_from_centroids(
             table, camera_model=model, image_width=camera.width, image_height=camera.height
         )
-        seconds = time.perf_counter() - begin
-        return Reply(np.array(result.rotation_matrix_icrs_to_camera) if result else None, seconds)
+        seconds = watch.read()
+        return Reply(np.array(result.rotation_matrix_icrs_to_camera) if result else None, *seconds)
 
     return solve
 
@@ -156,13 +168,13 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
 
     def solve(scene: Scene) -> Reply:
         xy = np.ascontiguousarray(scene.xy_px[np.argsort(-scene.flux)], dtype=np.float32)
-        begin = time.perf_counter()
+        watch = Stopwatch()
         try:
             result = tracker.process_image_coordiantes(xy)
         except ruststartracker.StarTrackerError:
-            return Reply(None, time.perf_counter() - begin)
-        seconds = time.perf_counter() - begin
+            return Reply(None, *watch.read())
+        seconds = watch.read()
         # its quaternion turns the sensor into the sky
-        return Reply(Rotation.from_quat(result.quat).inv().as_matrix(), seconds)
+        return Reply(Rotation.from_quat(result.quat).inv().as_matrix(), *seconds)
 
     return solve

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-_TABLE_WIDTH = 118
+_TABLE_WIDTH = 134
 
 group = typer.Typer(help="Measure speed, latency and accuracy.", no_args_is_help=True)
 
@@ -243,6 +243,8 @@ def identify(
         "roll ÷",
         "ms",
         "p99 ms",
+        "CPU ms",
+        "p99",
     )
     for entry in answer["rows"]:
         figures = (
@@ -251,6 +253,8 @@ def identify(
             _shown(entry["roll_floor_ratio"], 3),
             _shown(entry["median_ms"], 3),
             _shown(entry["p99_ms"], 2),
+            _shown(entry["cpu_median_ms"], 3),
+            _shown(entry["cpu_p99_ms"], 2),
         )
         table.add_row(
             entry["row"],
