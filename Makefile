@@ -2,6 +2,7 @@
 # make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
 # make lint        ruff and mypy --strict
 # make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
+# make cosmos      the COSMOS export, read by OpenC3's own reader (installed apart, 220 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
 PYTHON ?= python3
 VENV := .venv
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint reproduce fuzz clean
+.PHONY: help demo test lint reproduce fuzz cosmos clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -41,6 +42,12 @@ reproduce: $(VENV)/.product
 
 fuzz: $(VENV)/.developer
 	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
+
+cosmos: $(VENV)/.developer
+	$(PYTHON) -m venv out/cosmos
+	out/cosmos/bin/pip install --quiet openc3
+	PYTHONPATH=$$(out/cosmos/bin/python -c 'import site; print(site.getsitepackages()[0])') \
+		$(BIN)/python -m pytest tests/protocol/test_export.py -k cosmos
 
 clean:
 	rm -rf $(VENV) out build dist

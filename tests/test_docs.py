@@ -19,6 +19,7 @@ from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.own_hub import OwnBus
 from hil_tests.raw_exchange import format_frame
 from protocol.can_framing import CanFrame, MessageType
+from protocol.canopen import build_dictionary
 from protocol.export import export
 from protocol.icd import load_icd
 
@@ -73,6 +74,36 @@ def numbers(text: str) -> list[float]:
 def test_icd_is_the_present_export():
     remedy = "docs/icd.md is out of date; run: starhil icd export markdown -o docs/icd.md"
     assert (DOCS / "icd.md").read_text(encoding="utf-8") == export(load_icd(), "markdown"), remedy
+
+
+def table_after(name: str, heading: str) -> list[list[str]]:
+    """Rows of the first table under a heading, without its head."""
+    text = (DOCS / name).read_text(encoding="utf-8").split(f"## {heading}\n")[1]
+    rows = [
+        line.strip("|").split("|") for line in text.split("\n## ")[0].splitlines() if line.startswith("|")
+    ]
+    return [[cell.strip() for cell in row] for row in rows[2:]]
+
+
+def test_canopen_names_every_object_of_the_device():
+    named: set[int] = set()
+    for places, _ in table_after("canopen.md", "Where things are"):
+        for place in places.split(", "):
+            first, _, last = place.replace("h", "").partition("–")
+            named |= set(range(int(first, 16), int(last or first, 16) + 1))
+    assert named == {index for index in build_dictionary().od.indices if index >= 0x2000}
+
+
+def test_canopen_shows_the_pdos_as_they_are():
+    od = build_dictionary().od
+    for title, identifier, content in table_after("canopen.md", "Attitude by PDO")[:4]:
+        number = int(title.split()[0]) - 1
+        mapping = od[0x1A00 + number]
+        sizes = [(mapping[slot].default & 0xFF) // 8 for slot in range(1, mapping[0].default + 1)]
+        shown = [int(size or 1) for size in re.findall(r"(?:^|, )[^,(]*(?:\((\d)\))?", content)]
+        assert sizes == shown, title
+        base = int(identifier.removesuffix("h + node"), 16)
+        assert base == (od[0x1800 + number][1].default & 0x7FF & ~0x7F), title
 
 
 def test_library(tmp_path, monkeypatch):
