@@ -7,11 +7,11 @@ process works on it, and a campaign that was interrupted continues where it stop
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 WRONG_DEG: Final = 0.1
 """A valid answer is wrong when boresight or roll is further than this from the truth, in degrees."""
 
+_EDGE_STEP: Final = 5
+"""Every so manieth row and column tells where the edge of a dark body must lie to hide a share of the image."""
+
 RECORD: Final = np.dtype(
     [
         ("frame", np.int64),
@@ -37,6 +40,7 @@ RECORD: Final = np.dtype(
         ("roll_deg", np.float64),
         ("valid", np.bool_),
         ("reason", "U24"),
+        ("rate_deg_s", np.float64),
         ("cross_arcsec", np.float64),
         ("roll_arcsec", np.float64),
         ("normalised_squared_error", np.float64),
@@ -61,6 +65,8 @@ class CampaignPlan:
     fov_deg : full width of the field of view in degrees.
     rate_deg_s : body rate during the exposure, degrees per second about a random axis of each frame.
     blocked : share of the image (0 … 0.9) hidden by a dark body at a random side of each frame.
+    sky : "clear", or "hard": 100 false stars among some 50 true ones, planets, hot pixels, particles, the Moon in the
+        field or glare of the Sun, and body rates of up to 2°/s instead of `rate_deg_s` (`emulator.imaging.hard_sky`).
     algorithm : the identifier, as in a device profile.
     chunk : frames a chunk, the unit of work and of resumption.
     """
@@ -72,12 +78,15 @@ class CampaignPlan:
     blocked: float = 0.0
     algorithm: str = "geometric"
     chunk: int = 50
+    sky: str = "clear"
 
     def __post_init__(self) -> None:
         if self.frames < 1:
             raise EmulatorError(f"campaign: frames is {self.frames}: give at least 1")
         if not 0 <= self.blocked <= 0.9:
             raise EmulatorError(f"campaign: blocked is {self.blocked}: give a share from 0 to 0.9")
+        if self.sky not in ("clear", "hard"):
+            raise EmulatorError(f"campaign: sky is {self.sky!r}: give clear or hard")
 
     @property
     def chunks(self) -> int:
@@ -131,16 +140,17 @@ class CampaignStore:
 
 
 class FrameMaker:
-    """What one process needs to make and solve the frames of a plan; made once a process."""
+    """What one thread needs to make and solve the frames of a plan."""
 
     def __init__(self, plan: CampaignPlan) -> None:
+        from emulator.imaging.hard_sky import HARD_SENSOR
         from emulator.imaging.sensor import Renderer, SensorModel
         from starid.camera import Camera
         from starid.catalog import load_catalog
         from starid.interface import make_identifier
 
         self.plan = plan
-        sensor = SensorModel()
+        sensor = SensorModel() if plan.sky == "clear" else HARD_SENSOR
         self.camera = Camera.from_fov(plan.fov_deg)
         self.renderer: Renderer = Renderer(self.camera, load_catalog(), sensor, seed=plan.seed)
         self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera)
@@ -148,21 +158,24 @@ class FrameMaker:
 
     def solve(self, frame: int) -> tuple[Any, ...]:
         """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
+        from emulator.imaging.hard_sky import FASTEST_DEG_S, hard_sky
         from starid.imaging.detection import detect
 
         rng = np.random.default_rng((self.plan.seed, frame))
         truth = random_attitude(rng)
         axis = rng.normal(size=3)
-        rate = np.deg2rad(self.plan.rate_deg_s) * axis / np.linalg.norm(axis)
+        rate_deg_s, objects = self.plan.rate_deg_s, None
+        if self.plan.sky == "hard":
+            rate_deg_s = rng.uniform(0.0, FASTEST_DEG_S)
+            objects = hard_sky(truth, rng)
+        rate = np.deg2rad(rate_deg_s) * axis / np.linalg.norm(axis)
         start = time.perf_counter()
-        picture = self.renderer.render(truth, rate, frame)
+        picture = self.renderer.render(truth, rate, frame, objects=objects)
         image = block_side(picture.image, self.plan.blocked, rng)
         rendered = time.perf_counter()
         found = detect(image, self.settings)
         detected = time.perf_counter()
-        answer = self.identifier.identify(
-            found.xy_px, found.flux, np.sqrt((found.xy_sigma_px**2).mean(axis=1))
-        )
+        answer = self.identifier.identify(found.xy_px, found.flux, found.sigma_px)
         identified = time.perf_counter()
         cross, roll, squared = error_of(answer, truth)
         return (
@@ -172,6 +185,7 @@ class FrameMaker:
             truth.roll_deg,
             answer.valid,
             str(answer.reason),
+            rate_deg_s,
             cross,
             roll,
             squared,
@@ -202,19 +216,27 @@ def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) 
         return image
     height, width = image.shape
     angle = rng.uniform(0, 2 * np.pi)
-    rows, columns = np.indices(image.shape)
-    depth = (columns - (width - 1) / 2) * np.cos(angle) + (rows - (height - 1) / 2) * np.sin(angle)
+    across = (np.arange(width, dtype=np.float32) - (width - 1) / 2) * np.float32(np.cos(angle))
+    down = (np.arange(height, dtype=np.float32) - (height - 1) / 2) * np.float32(np.sin(angle))
+    some = slice(_EDGE_STEP // 2, None, _EDGE_STEP)
+    edge = np.quantile(down[some, None] + across[some], 1 - share)
     blocked = image.copy()
-    blocked[depth > np.quantile(depth, 1 - share)] = 0
+    blocked[down[:, None] + across > edge] = 0
     return blocked
 
 
-@lru_cache(maxsize=1)
+_of_thread = threading.local()
+
+
 def _maker(plan: CampaignPlan) -> FrameMaker:
+    """The maker of this thread (a Dask worker may have several), made anew for another plan."""
     import cv2
 
-    cv2.setNumThreads(1)
-    return FrameMaker(plan)
+    made: FrameMaker | None = getattr(_of_thread, "maker", None)
+    if made is None or made.plan != plan:
+        cv2.setNumThreads(1)
+        made = _of_thread.maker = FrameMaker(plan)
+    return made
 
 
 def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
@@ -264,13 +286,17 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     """Figures of a campaign from its rows (RECORD): counts, errors in arcseconds, times in milliseconds.
 
     `wrong` counts valid answers with boresight or roll more than 0.1° from the truth; `pole_frames` and
-    `ra_wrap_frames` count the frames with a celestial pole, or the hour circle RA 0°, inside the field.
+    `ra_wrap_frames` count the frames with a celestial pole, or the hour circle RA 0°, inside the field, `_valid` those of
+    them that are valid. `normalised_squared_error` is the mean over that many valid frames of the squared error over its
+    covariance. Where the body rate differs, `valid_pct_by_rate` has it up to 0.5, 1, 1.5 … °/s.
     """
     valid = rows[rows["valid"]]
     limit = 3600 * WRONG_DEG
     wrong = valid[(valid["cross_arcsec"] > limit) | (valid["roll_arcsec"] > limit)]
     half = fov_deg / 2
     away = np.abs((rows["ra_deg"] + 180) % 360 - 180) * np.cos(np.deg2rad(rows["dec_deg"]))
+    pole = np.abs(rows["dec_deg"]) > 90 - half
+    wrap = away < half
     total = rows["render_ms"] + rows["detect_ms"] + rows["identify_ms"]
 
     def of_valid(name: str, percent: float) -> float | None:
@@ -279,26 +305,37 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     def median(values: npt.NDArray[np.float64]) -> float:
         return float(np.median(values))
 
-    return {
+    figures = {
         "frames": len(rows),
         "valid": len(valid),
         "valid_pct": 100 * len(valid) / len(rows),
         "wrong": len(wrong),
         "wrong_frames": [int(frame) for frame in np.sort(wrong["frame"])],
         "invalid_reasons": dict(Counter(str(reason) for reason in rows["reason"][~rows["valid"]])),
-        "pole_frames": int(np.sum(np.abs(rows["dec_deg"]) > 90 - half)),
-        "ra_wrap_frames": int(np.sum(away < half)),
+        "pole_frames": int(np.sum(pole)),
+        "pole_frames_valid": int(np.sum(pole & rows["valid"])),
+        "ra_wrap_frames": int(np.sum(wrap)),
+        "ra_wrap_frames_valid": int(np.sum(wrap & rows["valid"])),
         "median_arcsec": of_valid("cross_arcsec", 50),
         "p99_arcsec": of_valid("cross_arcsec", 99),
         "max_arcsec": of_valid("cross_arcsec", 100),
         "roll_median_arcsec": of_valid("roll_arcsec", 50),
         "roll_p99_arcsec": of_valid("roll_arcsec", 99),
         "normalised_squared_error": float(np.mean(valid["normalised_squared_error"])) if len(valid) else None,
+        "normalised_squared_error_frames": len(valid),
         "stars_median": median(rows["detected"]),
         "matched_median": of_valid("matched", 50),
         "median_ms_render": median(rows["render_ms"]),
         "median_ms_detect": median(rows["detect_ms"]),
         "median_ms_identify": median(rows["identify_ms"]),
+        "p99_ms_render": float(np.percentile(rows["render_ms"], 99)),
+        "p99_ms_detect": float(np.percentile(rows["detect_ms"], 99)),
         "p99_ms_identify": float(np.percentile(rows["identify_ms"], 99)),
         "median_ms_frame": median(total),
     }
+    bins = np.ceil(2.0 * rows["rate_deg_s"]) / 2.0
+    if len(np.unique(bins)) > 1:
+        figures["valid_pct_by_rate"] = {
+            f"{rate:g}": 100 * float(np.mean(rows["valid"][bins == rate])) for rate in np.unique(bins)
+        }
+    return figures

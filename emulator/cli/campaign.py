@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,10 +31,16 @@ def lost_in_space(
     require_valid: Annotated[
         float, typer.Option(help="Exit 1 when fewer per cent of the frames are valid.")
     ] = 99.5,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes, also of a local Dask cluster.")] = 1,
     dask: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler, or `local` for one of our own.")
     ] = None,
+    sky: Annotated[
+        str,
+        typer.Option(
+            help="clear, or hard: 100 false stars among some 50 true ones, planets, hot pixels, the Moon or glare, to 2 deg/s."
+        ),
+    ] = "clear",
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Folder that keeps finished chunks; a second run goes on there."),
@@ -48,8 +55,8 @@ def lost_in_space(
 
     from emulator.campaign import CampaignPlan, run_campaign, summarise
 
-    plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm)
-    with _backend(dask):
+    plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm, sky=sky)
+    with _backend(dask, jobs):
         chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
     rows = np.concatenate(chunks)
     figures: dict[str, Any] = {"seed": seed, **summarise(rows, fov)}
@@ -61,25 +68,38 @@ def lost_in_space(
         raise typer.Exit(1)
 
 
-def _backend(dask: str | None) -> Any:
-    """The joblib backend that `--dask` asks for; without it the caller's processes."""
+@contextmanager
+def _backend(dask: str | None, jobs: int) -> Iterator[None]:
+    """Work in the joblib backend that `--dask` asks for; without it in the caller's processes."""
     if dask is None:
-        return nullcontext()
+        yield
+        return
     from emulator.errors import EmulatorError
 
     try:
-        from distributed import Client
+        from distributed import Client, LocalCluster
     except ImportError as error:
         raise EmulatorError(
             "campaign: --dask needs the `cluster` extra: pip install 'starhil[cluster]'"
         ) from error
     from joblib import parallel_config
 
-    try:
-        client = Client() if dask == "local" else Client(dask, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise EmulatorError(f"campaign: no Dask scheduler at {dask!r}: {error}") from error
-    return parallel_config(backend="dask", client=client)
+    with ExitStack() as stack:
+        try:
+            address = dask
+            if dask == "local":
+                address = stack.enter_context(
+                    LocalCluster(
+                        n_workers=jobs, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+                    )
+                )
+            client = stack.enter_context(Client(address, timeout="10s"))
+        except (OSError, ValueError) as error:
+            raise EmulatorError(f"campaign: no Dask scheduler at {dask!r}: {error}") from error
+        if not client.ncores():
+            raise EmulatorError(f"campaign: the Dask scheduler at {dask!r} has no workers: start some")
+        stack.enter_context(parallel_config(backend="dask", client=client))
+        yield
 
 
 def _with_progress(chunks: Any, total: int) -> Any:

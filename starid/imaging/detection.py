@@ -27,13 +27,20 @@ from starid.imaging.measurement import (
     BAD_FIT,
     FIT_PARAMETERS,
     FRESH,
+    NOT_A_STAR,
     SATURATED,
     TWICE,
     find_neighbours,
     measure,
 )
 from starid.imaging.pairs import doubt_close_pairs, split_pairs
-from starid.imaging.spot_shape import MOMENT_COLUMNS, SpotShape, moments_of, shape_from_moments
+from starid.imaging.spot_shape import (
+    MOMENT_COLUMNS,
+    SpotShape,
+    moments_of,
+    shape_from_moments,
+    trails_among_round,
+)
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
@@ -47,6 +54,9 @@ _MOST_PEAKS: Final = 8192
 _HIGHER: Final = 1.5
 _STARS_FOR_A_GLANCE: Final = 12
 _STARS_FOR_SHAPE: Final = 30
+_PEAKS_FOR_TRAILS: Final = 300
+_MISFITS_FOR_TRAILS: Final = 8
+_MISFIT_SHARE: Final = 0.1
 _SHAPE_WINDOW_PX: Final = 40
 _STARS_FOR_WIDTH: Final = 15
 _LEAST_FOR_WIDTH: Final = 3
@@ -208,7 +218,14 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
         return _nothing(
             background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
         )
-    return _measured(counts, background, peaks[: 2 * chosen.max_stars], heights, shape, chosen, saturation)
+    found, misfits = _measured(counts, background, peaks, heights, shape, chosen, saturation)
+    suspicious = misfits >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(found))
+    if suspicious and chosen.follow_trails and shape.trail_px == 0.0:
+        shape = _trails_among_round(counts, background, peaks, shape, saturation)
+        if shape.trail_px > 0.0:
+            peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
+            found, _ = _measured(counts, background, peaks, heights, shape, chosen, saturation)
+    return found
 
 
 def _checked(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
@@ -331,6 +348,21 @@ def _shape(
     return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
 
 
+def _trails_among_round(
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    background: Background,
+    peaks: npt.NDArray[np.int32],
+    shape: SpotShape,
+    saturation: int,
+) -> SpotShape:
+    """Look whether stars leave trails though the brightest objects are round."""
+    tries = peaks[:_PEAKS_FOR_TRAILS]
+    table = np.empty((len(tries), MOMENT_COLUMNS))
+    limits = (shape.sigma_px, _SHAPE_WINDOW_PX, float(saturation))
+    count = moments_of(counts, tries, background.level, float(background.block_px), *limits, table)
+    return trails_among_round(table[:count], counts.shape[1], counts.shape[0], shape)
+
+
 def _fitted(
     windows: Table,
     pixels: Grid,
@@ -373,8 +405,9 @@ def _measured(
     shape: SpotShape,
     settings: DetectionSettings,
     saturation: int,
-) -> Detections:
-    """Fit the candidates and keep the stars."""
+) -> tuple[Detections, int]:
+    """Fit the candidates and keep the stars; tell beside them how many fits the shape of a star does not explain."""
+    peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
     gain = settings.gain_e_per_dn
     per_dn = 0.0 if gain is None else 1.0 / gain
     typical = background.median_noise
@@ -392,19 +425,18 @@ def _measured(
     windows, stars, flags = _fitted(windows, pixels, sensor, lit, size, settings.blend_px)
     good = np.flatnonzero(stars[:, STATE] == GOOD)
     if good.size == 0:
-        return _nothing(background, "nothing on the image has the shape of a star", count)
+        return _nothing(background, "nothing on the image has the shape of a star", count), count
     again = (stars[:, STATE] == TWICE) | (windows[:, COLUMNS] == SEEN_BEFORE)
     refused = len(stars) - good.size - int(np.count_nonzero(again))
     good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
     fits, marks = stars[good], flags[good]
     freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
     misfit = fits[:, CHI2] / freedom
-    fits[:, [VAR_X, VAR_Y, VAR_FLUX]] *= np.where(
-        misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom), misfit, 1.0
-    )[:, None]
+    is_bad = misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
+    fits[:, [VAR_X, VAR_Y, VAR_FLUX]] *= np.where(is_bad, misfit, 1.0)[:, None]
     doubt_close_pairs(fits, np.argsort(-fits[:, Y], kind="stable"), settings.blend_px)
     unit = 1.0 if gain is None else gain
-    return Detections(
+    found = Detections(
         fits[:, [X, Y]],
         fits[:, FLUX] * unit,
         np.sqrt(fits[:, VAR_FLUX]) * unit,
@@ -418,3 +450,5 @@ def _measured(
         refused,
         "",
     )
+    misfits = int(np.count_nonzero(is_bad) + np.count_nonzero(stars[:, STATE] == NOT_A_STAR))
+    return found, misfits

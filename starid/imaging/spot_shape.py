@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from starid.imaging.background import interpolate_at, median
 from starid.imaging.jit_loops import compiled_loops
-from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, typical_trail
+from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, mismatch, typical_trail
 
 Array = npt.NDArray[np.float64]
 
@@ -29,6 +29,10 @@ _LEAST_FOR_SPOT: Final = 3
 _ROUND_BELOW_PX: Final = 1.0
 _LEAST_SIGMA_PX: Final = 0.3
 _UNEXPLAINED: Final = 0.4
+_LONG_PX: Final = 2.5
+_LEAST_LONG: Final = 6
+_AGREES: Final = 0.3
+_MOST_AGREE: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -200,6 +204,39 @@ def shape_from_moments(
         if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * median(length):
             return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
     return SpotShape(_sigma(median(mean), known_sigma_px), still, 0.0, len(table))
+
+
+def long_trails(table: Array, sigma_px: float) -> npt.NDArray[np.bool_]:
+    """Which stars (n,) of a table of moments are so long that noise or a close neighbour hardly explains it."""
+    split = np.hypot(0.5 * (table[:, 2] - table[:, 4]), table[:, 3])
+    along = 0.5 * (table[:, 2] + table[:, 4]) + split
+    return np.asarray(trail_length(along, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
+
+
+def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) -> SpotShape:
+    """Trails of a frame on which most objects are round, as particles, hot pixels and reflections are: they are no stars.
+
+    Parameters
+    ----------
+    table : ndarray (n, 5)
+        Moments, as in `shape_from_moments`.
+    width, height : int
+        Size of the image.
+    shape : SpotShape
+        What the round ones say; returned as it is, unless enough of the long ones agree on a flow.
+    """
+    longest = table[long_trails(table, shape.sigma_px)]
+    if len(longest) < _LEAST_LONG:
+        return shape
+    found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
+    seen = np.hypot(0.5 * (longest[:, 2] - longest[:, 4]), longest[:, 3])
+    length = trail_length(0.5 * (longest[:, 2] + longest[:, 4]) + seen, shape.sigma_px**2 + _PIXEL_VARIANCE)
+    angle = 0.5 * np.arctan2(2.0 * longest[:, 3], longest[:, 2] - longest[:, 4])
+    trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    places = (longest[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / (0.5 * max(width, height))
+    off = np.array([mismatch(found.flow, places, trails, k)[0] for k in range(len(places))])
+    agree = np.count_nonzero(off < _AGREES * length)
+    return found if found.trail_px > 0.0 and agree >= max(_LEAST_LONG, _MOST_AGREE * len(longest)) else shape
 
 
 def _sigma(variance: float, known: float | None) -> float:

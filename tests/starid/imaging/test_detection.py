@@ -254,6 +254,36 @@ def test_trails_of_a_turning_sensor_are_followed(dx: float, dy: float) -> None:
     assert np.mean(error**2) == pytest.approx(1.0, abs=0.5)
 
 
+def test_trails_are_followed_among_more_and_brighter_round_points() -> None:
+    """Particles and reflections are round while the sensor turns; stars are what agrees on a motion."""
+    shape = (400, 500)
+    places = scattered(60, shape, 9, gap=30.0)
+    places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
+    stars, points = places[::3], np.concatenate([places[1::3], places[2::3]])
+    light = sum(trail(shape, *place, 3000.0, 6.0, -2.0) for place in stars)
+    light = light + sum(spot(shape, *place, 9000.0) for place in points)
+    found = detect(photograph(light), KNOWN)
+    assert len(points) > 1.8 * len(stars) > 18
+    assert found.trail_px == pytest.approx(math.hypot(6.0, 2.0), rel=0.1)
+    number, _ = matched(found, stars)
+    assert np.all(number >= 0)
+    error = (found.xy_px[number] - stars) / found.xy_sigma_px[number]
+    assert np.mean(error**2) == pytest.approx(1.0, abs=0.6)
+
+
+def test_a_few_streaks_among_still_stars_make_no_trails() -> None:
+    shape = (400, 500)
+    places = scattered(60, shape, 9, gap=30.0)
+    light = sum(spot(shape, *place, 3000.0) for place in places[:40])
+    angles = np.linspace(0.0, math.pi, 12, endpoint=False)
+    for place, angle in zip(places[40:52], angles, strict=True):
+        light = light + trail(shape, *place, 9000.0, 12.0 * math.cos(angle), 12.0 * math.sin(angle))
+    found = detect(photograph(light), KNOWN)
+    assert found.trail_px == 0.0
+    number, _ = matched(found, places[:40])
+    assert np.count_nonzero(number >= 0) >= 39
+
+
 def test_trails_of_a_roll_are_followed() -> None:
     shape = (400, 400)
     places = scattered(60, shape, 10, gap=30.0)
