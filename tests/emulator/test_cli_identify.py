@@ -107,3 +107,33 @@ def test_an_image_of_another_size_is_refused(tmp_path):
     assert isinstance(result.exception, StaridError)
     assert "640×480" in str(result.exception)
     assert "937×937" in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--fov", "wide"], "'wide'"),
+        (["--fov", "11", "--profile", "cubestar"], "give one of them"),
+        (["--fov", "11", "--model", "fisheye"], "pinhole or equidistant"),
+    ],
+)
+def test_options_that_name_no_camera_are_refused(tmp_path, options, named):
+    image = tmp_path / "dark.png"
+    cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (64, 64)).astype(np.uint8))
+    result = starhil("identify", str(image), *options)
+    assert result.exit_code != 0
+    assert named in str(result.exception)
+
+
+def test_colour_is_refused_but_where_the_image_may_come_from_any_camera(tmp_path):
+    image = tmp_path / "colour.png"
+    noise = np.random.default_rng(2).normal(60, 4, (100, 120, 3)).astype(np.uint8)
+    cv2.imwrite(str(image), noise)
+    refused = starhil("identify", str(image))
+    assert "3 channels" in str(refused.exception)
+    looked_at = starhil("identify", str(image), "--fov", "11", "--json")
+    assert looked_at.exit_code == 1
+    found = json.loads(looked_at.stdout)
+    assert found["reason"] == "too_few_stars"
+    assert "expose longer" in found["advice"]
+    assert "channels" in str(starhil("identify", str(image), "--fov", "11", "--refuse-colour").exception)
