@@ -54,8 +54,9 @@ def command(
 ) -> None:
     """Identify the stars on an image, lost in space; exit status 1 if they cannot be.
 
-    Without --profile or --fov the camera is the emulator's own, 937×937 pixels and 42° wide. With --fov the image
-    may come from any camera, be mirrored or a negative; field and distortion are measured on it.
+    Without --profile or --fov the camera is the emulator's own, 937×937 pixels
+    and 42° wide. With --fov the image may come from any camera, be mirrored or
+    a negative; field and distortion are measured on it.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
     from starid.imaging.image_io import read_image, write_image
