@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from protocol.messages import FaultKind, LinkFault, Request
-from protocol.serial_framing import DeviceReceiver
+from protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
+from protocol.serial_framing import DeviceReceiver, Dialect
 from tests.conformance.mutant_seams import (
     enter,
     events,
@@ -113,6 +113,14 @@ def not_taken_out(unit: SimulatedUnit) -> None:
             else [event]
         )
     )(unit)
+
+
+@mutant("unsolicited telemetry comes in a dialect that has none", "serial", "unsolicited.rate")
+def talkative(unit: SimulatedUnit) -> None:
+    def say(reply: Reply) -> None:
+        unit.link._send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY), Dialect.B)
+
+    unit.device.outlets[:] = [say]
 
 
 @mutant("replies leave faster than the line", "serial", "timing.pace")
