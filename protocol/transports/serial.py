@@ -35,7 +35,6 @@ class SerialTransport(Transport[bytes]):
         """Go on at another bit rate as soon as all that was queued has left."""
 
 
-
 def open_serial(
     spec: str = "auto", baud: int = DEFAULT_BAUD, *, symlink: Path | None = None, paced: bool | None = None
 ) -> SerialTransport:
