@@ -275,7 +275,7 @@ def test_a_tty_takes_another_bit_rate_and_keeps_it_when_it_comes_back(tmp_path: 
             pair.two.send(b"before")
             pair.two.set_baud(115200)
             await until(lambda: pair.two._port.baudrate == 115200)  # type: ignore[attr-defined]
-            assert bytes(pair.got_one) == b"before"
+            await until(lambda: bytes(pair.got_one) == b"before")
             pair.two._lost("pulled")  # type: ignore[attr-defined]
             await until(lambda: pair.two.statistics.reconnects == 1)
             assert pair.two._port.baudrate == 115200  # type: ignore[attr-defined]
