@@ -25,6 +25,10 @@ def photograph(
     distortion: float = 0.0,
     spot_px: float = 1.3,
     foreground: float = 0.0,
+    trail_px: float = 0.0,
+    hot: float = 0.0,
+    glow: float = 0.0,
+    quality: int = 0,
     fov_deg: float = FOV_DEG,
 ) -> tuple[NDArray[np.uint8], Attitude, Camera]:
     """Grey image of 8 bits, the attitude and the camera that took it.
@@ -41,6 +45,14 @@ def photograph(
         Standard deviation of a star's spot.
     foreground : float
         Share of the image's height that a hill covers, sharp and grainy.
+    trail_px : float
+        Length of the stars' trails, in one direction.
+    hot : float
+        Share of the pixels that are hot, with any brightness.
+    glow : float
+        Peak of the light about a bright body in the field, counts; the body itself saturates.
+    quality : int
+        Of the compression as JPEG, 0 for none.
     fov_deg : float
         Width of the field.
     """
@@ -65,9 +77,28 @@ def photograph(
         window = np.s_[max(int(y) - reach, 0) : int(y) + reach, max(int(x) - reach, 0) : int(x) + reach]
         spot = np.outer(bell_y[window[0]], bell_x[window[1]])
         image[window] += flux / (2.0 * math.pi * spot_px**2) * spot
+    if trail_px:
+        steps = np.linspace(-0.5, 0.5, 8 * math.ceil(trail_px)) * trail_px
+        middle = math.ceil(trail_px)
+        along = np.zeros((2 * middle + 1, 2 * middle + 1))
+        np.add.at(
+            along, (np.rint(middle + 0.6 * steps).astype(int), np.rint(middle + 0.8 * steps).astype(int)), 1.0
+        )
+        image = cv2.filter2D(image, -1, along / along.sum(), borderType=cv2.BORDER_REPLICATE)
+    if glow:
+        x, y = rng.uniform(0.0, [WIDTH, HEIGHT])
+        away = np.hypot(columns - x, rows[:, None] - y)
+        image += glow * np.exp(-away / (0.15 * WIDTH)) + FULL * (away < 0.25 / fov_deg * WIDTH)
     image += rng.normal(0.0, 1.0, image.shape)
     if foreground:
         crest = HEIGHT * (1.0 - foreground) + 20.0 * np.sin(columns / 60.0)
         grain = cv2.GaussianBlur(rng.normal(0.0, 20.0, image.shape), (0, 0), 1.0)
         image = np.where(rows[:, None] > crest, 14.0 + grain, image)
-    return np.clip(np.rint(image), 0.0, FULL).astype(np.uint8), attitude, camera
+    if hot:
+        count = int(hot * image.size)
+        image[rng.integers(0, HEIGHT, count), rng.integers(0, WIDTH, count)] += rng.uniform(0.0, FULL, count)
+    counts = np.clip(np.rint(image), 0.0, FULL).astype(np.uint8)
+    if quality:
+        packed = cv2.imencode(".jpg", counts, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        counts = np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+    return counts, attitude, camera
