@@ -11,8 +11,8 @@ import inspect
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Final, get_args, get_type_hints
 
 from emulator.errors import EmulatorError
 from starid.camera import Camera
@@ -70,12 +70,7 @@ class IdentifierChoice:
     def _check(self, options: dict[str, Any]) -> None:
         """Refuse an option that the algorithm does not have, or of another type."""
         module, name = ALGORITHMS[self.algorithm]
-        parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
-        known = {
-            name: str(parameter.annotation)
-            for name, parameter in parameters.items()
-            if any(kind in str(parameter.annotation) for kind in _KINDS)
-        }
+        known = _known_options(getattr(importlib.import_module(module), name))
         for option, value in options.items():
             if option not in known:
                 raise EmulatorError(
@@ -86,6 +81,15 @@ class IdentifierChoice:
                 raise EmulatorError(
                     f"identifier.{option}: {value!r} given, {known[option].removesuffix(' | None')} needed"
                 )
+
+
+def _known_options(algorithm: type) -> dict[str, str]:
+    """Options of an algorithm's class and their types: its keywords, and the fields of its options."""
+    types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
+    for held in get_args(get_type_hints(vars(algorithm)["__init__"]).get("options")):
+        if is_dataclass(held):
+            types |= {field.name: str(field.type) for field in fields(held)}
+    return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ class Emulator:
     """A running emulator with its control channel and serial line."""
 
     def __init__(self, *arguments: str) -> None:
-        command = [sys.executable, "-c", "from emulator.cli.app import main; main()", "run"]
+        default = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)"  # nohup has it ignored
+        command = [sys.executable, "-c", f"{default}; from emulator.cli.app import main; main()", "run"]
         self.process = subprocess.Popen(
             [*command, "--can", "off", "--control", "auto", *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -17,7 +17,7 @@ pytestmark = [
 ]
 
 
-SPEED = 0.7
+SPEED = 0.5
 """Run time in a second: the guest has one slow processor, and time-outs are rules that stay."""
 
 

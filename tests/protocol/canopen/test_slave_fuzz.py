@@ -36,6 +36,8 @@ LSS_COMMANDS = (
 NMT_COMMANDS = (1, 2, 128, 129, 130)
 MOST_ANSWERS = 200
 """Frames that one frame may be answered by: a block of 127 segments and what goes with it."""
+LONGEST_SILENCE_S = 2 * 65.535
+"""LSS activate bit timing keeps a slave silent for two switch delays of 16 bits of milliseconds (CiA 305)."""
 
 
 def frames(source: random.Random, entries: list[tuple[int, int]]):
@@ -96,11 +98,12 @@ def all_entries(bench: Bench):
 
 def alive(bench: Bench) -> Bench:
     """After a reset of the node it boots up and answers; a slave whose node-ID was changed is made anew."""
+    bench.now += LONGEST_SILENCE_S
+    bench.frame(0x000, bytes((0x81, NODE)))  # also puts a node-ID of LSS into force
+    bench.advance(0.1)
     if bench.slave.node_id != NODE:
         bench = Bench().power_on()
         bench.show(bytes(3000))
         return bench
-    bench.frame(0x000, b"\x81\x2c")
-    bench.advance(0.1)
     assert bench.sdo("40 00 10 00").startswith("43001000")
     return bench
