@@ -277,27 +277,10 @@ def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: 
     separation_rad : float
         Angle within which a star is near, radians.
     """
-    chord = 2.0 * math.sin(0.5 * min(separation_rad, math.pi))
-    bright = catalog.vectors[catalog.v <= limiting_magnitude]
+    bright = np.flatnonzero(catalog.v <= limiting_magnitude)
     faint = np.flatnonzero(catalog.v > limiting_magnitude)
-    faint = faint[np.argsort(catalog.vectors[faint, 2], kind="stable")]
-    vectors = catalog.vectors[faint]
-    x, z = np.ascontiguousarray(vectors[:, 0]), np.ascontiguousarray(vectors[:, 2])
-    first = np.searchsorted(z, bright[:, 2] - chord, side="left")
-    count = np.searchsorted(z, bright[:, 2] + chord, side="right") - first
-    is_near = np.zeros(len(faint), dtype=np.bool_)
-    # so many bright stars at a time that the candidates for their companions fill no more than some megabytes
-    portion = np.cumsum(count) // _CANDIDATES
-    for start, end in itertools.pairwise(
-        [*np.flatnonzero(np.diff(portion, prepend=-1)).tolist(), len(bright)]
-    ):
-        one = np.repeat(np.arange(start, end), count[start:end])
-        before = np.cumsum(count[start:end]) - count[start:end]
-        other = np.arange(len(one)) + np.repeat(first[start:end] - before, count[start:end])
-        close = np.flatnonzero(np.abs(x[other] - bright[one, 0]) <= chord)
-        gap = vectors[other[close]] - bright[one[close]]
-        is_near[other[close[np.einsum("ij,ij->i", gap, gap) <= chord * chord]]] = True
-    return np.sort(faint[is_near])
+    pairs = _close_pairs(catalog.vectors[bright], catalog.vectors[faint], separation_rad)
+    return faint[np.unique(pairs[:, 1])]
 
 
 def blend(
@@ -328,8 +311,8 @@ def blend(
     if not separation_rad >= 0.0:
         raise StaridError(f"star catalogue: separation {separation_rad} given, radians ≥ 0 needed")
     leader = np.arange(len(catalog))
-    chord = 2.0 * math.sin(0.5 * min(separation_rad, math.pi))
-    pairs = _close_pairs(catalog.vectors, chord)
+    pairs = _close_pairs(catalog.vectors, catalog.vectors, separation_rad)
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     if len(pairs) == 0:
         return catalog
     rank = np.empty(len(catalog), dtype=np.intp)
@@ -343,7 +326,7 @@ def blend(
     places = catalog.vectors
     if as_fitted:
         gap = places - places[leader]
-        distance = np.linalg.norm(gap, axis=1) / max(chord, 1e-12)
+        distance = np.linalg.norm(gap, axis=1) / max(_chord(separation_rad), 1e-12)
         places = places[leader] + fitted_share(distance, flux / flux[leader])[:, None] * gap
     sums = np.zeros((len(catalog), 3))
     np.add.at(sums, leader, places * flux[:, None])
@@ -364,22 +347,35 @@ def blend(
     return merged.subset(np.argsort(merged.v, kind="stable"))
 
 
-def _close_pairs(vectors: NDArray[np.float64], chord: float) -> NDArray[np.intp]:
-    """Pairs of indices (m, 2) of unit vectors not farther apart than a chord.
+def _chord(angle_rad: float) -> float:
+    """Distance between the ends of two unit vectors at an angle."""
+    return 2.0 * math.sin(0.5 * min(angle_rad, math.pi))
 
-    The vectors are ordered by z; partners stand within the chord of z, so the order is compared with itself
-    shifted by one, two, … until none is near enough. (A tree would do, but importing one costs half a second.)
+
+def _close_pairs(
+    ones: NDArray[np.float64], others: NDArray[np.float64], separation_rad: float
+) -> NDArray[np.intp]:
+    """Pairs (m, 2) of rows of `ones` and rows of `others`, unit vectors, that are not farther apart than an angle.
+
+    The others are ordered by z, in which partners stand within the chord. (A tree would do, but importing one costs half
+    a second.)
     """
-    order = np.argsort(vectors[:, 2], kind="stable")
-    ordered = vectors[order]
+    chord = _chord(separation_rad)
+    order = np.argsort(others[:, 2], kind="stable")
+    ordered = others[order]
     x, z = np.ascontiguousarray(ordered[:, 0]), np.ascontiguousarray(ordered[:, 2])
+    first = np.searchsorted(z, ones[:, 2] - chord, side="left")
+    count = np.searchsorted(z, ones[:, 2] + chord, side="right") - first
     found = [np.empty((0, 2), dtype=np.intp)]
-    for shift in range(1, len(order)):
-        near = np.flatnonzero(z[shift:] - z[:-shift] <= chord)
-        if near.size == 0:
-            break
-        near = near[np.abs(x[near + shift] - x[near]) <= chord]
-        gap = ordered[near + shift] - ordered[near]
-        close = near[np.einsum("ij,ij->i", gap, gap) <= chord * chord]
-        found.append(np.column_stack([order[close], order[close + shift]]))
+    # so many at a time that their candidates fill no more than some megabytes
+    portion = np.cumsum(count) // _CANDIDATES
+    for start, end in itertools.pairwise([*np.flatnonzero(np.diff(portion, prepend=-1)).tolist(), len(ones)]):
+        one = np.repeat(np.arange(start, end), count[start:end])
+        before = np.cumsum(count[start:end]) - count[start:end]
+        other = np.arange(len(one)) + np.repeat(first[start:end] - before, count[start:end])
+        near = np.flatnonzero(np.abs(x[other] - ones[one, 0]) <= chord)
+        one, other = one[near], other[near]
+        gap = ordered[other] - ones[one]
+        close = np.einsum("ij,ij->i", gap, gap) <= chord * chord
+        found.append(np.column_stack([one[close], order[other[close]]]))
     return np.concatenate(found)

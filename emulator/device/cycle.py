@@ -2,7 +2,9 @@
 
 A frame begins on a grid of the update period, exposes, is read out, detected and identified; the times of these steps are
 those of the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On the other clocks a
-result that the machine has not ready in time is published when it comes, and flagged.
+result that the machine has not ready in time is published when it comes, and flagged. Where the machine falls behind by
+`MAX_PENDING` frames, exposures are left out: what the machine could not look at says nothing about the sky, so the last
+attitude stands until it is too old, and tracking goes on from it.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
 
 MAX_PENDING: Final = 2
-"""Frames in the pipeline above which the next exposure is left out."""
+"""Requests in the pipeline at which the next exposure is left out."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Measurement:
     capture_s, detect_s, identify_s
         Modelled times of the steps.
     late
-        The machine took longer than the model, or had no time for the frame at all.
+        The machine took longer than the model.
     """
 
     counter: int
@@ -153,6 +155,7 @@ class FrameCycle:
         """Number of the next frame of the run; never goes back, so that no two frames share their noise."""
         self.published = 0
         self.left_out = 0
+        """Exposures since start-up for which the machine had no time."""
 
     @property
     def running(self) -> bool:
@@ -207,6 +210,9 @@ class FrameCycle:
         missed = max(0, (now_ns - due_ns) // period_ns)
         self.left_out += missed
         self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._begin)
+        if self._imager.pending >= MAX_PENDING:
+            self.left_out += 1
+            return
         exposure_s = self._exposure_s()
         start_ns = due_ns + int(self._parameters["delay_time"]) * 1_000_000
         end_ns = start_ns + round(exposure_s * NANOSECONDS)
@@ -228,12 +234,6 @@ class FrameCycle:
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
         request = self.request(truth, exposure_s, predicted)
         self._in_flight.append(frame)
-        if self._imager.pending >= MAX_PENDING:
-            frame.late = True
-            self.left_out += 1
-            frame.result = FrameResult(request.index, reason="processing_error")
-            self._finish(frame, end_ns)
-            return
         timing = self._timing
         identify_s = timing.identify_tracking_s if frame.tracking else timing.identify_lost_s
         ready_ns = end_ns + round((timing.readout_s + timing.detect_s + identify_s) * NANOSECONDS)

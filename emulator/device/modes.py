@@ -11,7 +11,7 @@
                            └───(tracking lost, command)────┘
 
 A telecommand may ask for standby, lost_in_space and tracking. Tracking needs an attitude to start from: one that was found
-in this run and is not older than `Modes.prediction_limit_s`. Boot is entered by a reset and error by a fault only.
+in this run and is not older than `device.PREDICTION_LIMIT_S`. Boot is entered by a reset and error by a fault only.
 """
 
 from __future__ import annotations

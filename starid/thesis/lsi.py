@@ -264,24 +264,20 @@ def _sphere_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[
 
 
 @compiled
-def estimate_from_cell(
+def estimate_from_path(
     searched: SearchedCells,
     cell: int,
     observation: NDArray[np.float64],
     lambdas: NDArray[np.float64],
+    path: NDArray[np.float64],
+    chosen: tuple[int, int],
     work: LsiWork,
 ) -> None:
-    """Dictionary, LASSO and estimates about a cell.
+    """Estimates from the weights at two λ of a LASSO path.
 
     The boresight is F·ω (eq. 2.15, printed again as eq. 2.36) and the angle Θ·ω (eq. 2.37) with weights scaled to a
     sum of one; the reconstruction is T·ω (eq. 2.35). Should the weights cancel, the cell itself is the estimate.
     """
-    fill_dictionary(searched, cell, work)
-    dictionary = work.dictionary
-    path = np.empty((lambdas.size, 9))
-    error = np.empty(lambdas.size)
-    lasso_path(dictionary, observation, lambdas, path)
-    chosen = choose_lambdas(dictionary, observation, path, error)
     for row in range(2):
         omega = work.weights[row]
         result = work.results[row]
@@ -295,7 +291,7 @@ def estimate_from_cell(
         for f in range(5):
             residual = observation[f]
             for j in range(9):
-                residual -= dictionary[f, j] * omega[j]
+                residual -= work.dictionary[f, j] * omega[j]
             square += residual * residual
         result[0] = total
         result[4] = math.sqrt(square)
@@ -305,6 +301,23 @@ def estimate_from_cell(
         else:
             _flat_estimate(omega, work, result)
             result[6:12] = 0.0
+
+
+@compiled
+def estimate_from_cell(
+    searched: SearchedCells,
+    cell: int,
+    observation: NDArray[np.float64],
+    lambdas: NDArray[np.float64],
+    work: LsiWork,
+) -> None:
+    """Dictionary, LASSO and estimates about a cell."""
+    fill_dictionary(searched, cell, work)
+    path = np.empty((lambdas.size, 9))
+    error = np.empty(lambdas.size)
+    lasso_path(work.dictionary, observation, lambdas, path)
+    chosen = choose_lambdas(work.dictionary, observation, path, error)
+    estimate_from_path(searched, cell, observation, lambdas, path, chosen, work)
 
 
 @compiled

@@ -89,11 +89,12 @@ class Bench:
         self.picture = FakePicture()
         self.icd = load_icd()
         self.store = store or MemoryStore()
+        self.imager = DirectImager(self.picture.handle)
         self.device = Device(
             profile or Profile(),
             self.icd,
             self.clock,
-            DirectImager(self.picture.handle),
+            self.imager,
             self.store,
             truth or FixedTruth(ORION),
         )

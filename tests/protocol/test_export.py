@@ -13,7 +13,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import canmatrix.formats
+import canopen
+import cantools
 import pytest
+from space_packet_parser.xtce import definitions, validation
 
 from protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
 from protocol.codec import Field, Row
@@ -99,7 +103,6 @@ def _dbc_signals(row: Row, values: dict[str, Value]) -> dict[str, Value]:
 
 @cache
 def _cantools() -> Any:
-    cantools = pytest.importorskip("cantools", reason="cantools reads the DBC; install the extra `test`")
     return cantools.database.load_string(text("dbc"), database_format="dbc", strict=True)
 
 
@@ -159,10 +162,7 @@ def test_cantools_names_every_frame_of_a_dialogue() -> None:
 
 
 def test_canmatrix_reads_the_same_layout(folder: Path) -> None:
-    formats = pytest.importorskip(
-        "canmatrix.formats", reason="canmatrix reads the DBC; install the extra `test`"
-    )
-    matrix = formats.loadp_flat(str(on_disk("dbc", folder)))
+    matrix = canmatrix.formats.loadp_flat(str(on_disk("dbc", folder)))
     for row in TELEMETRY:
         frame = matrix.frame_by_name(f"TLM_{row.name}")
         assert frame is not None
@@ -189,18 +189,10 @@ def test_canmatrix_reads_the_same_layout(folder: Path) -> None:
 
 @cache
 def _xtce(file: Path) -> Any:
-    definitions = pytest.importorskip(
-        "space_packet_parser.xtce.definitions",
-        reason="space_packet_parser reads the XTCE; install the extra `test`",
-    )
     return definitions.XtcePacketDefinition.from_xtce(file, root_container_name="Packet")
 
 
 def test_the_xtce_is_valid_against_the_published_schema(folder: Path) -> None:
-    validation = pytest.importorskip(
-        "space_packet_parser.xtce.validation",
-        reason="space_packet_parser brings the schema; install the extra `test`",
-    )
     schema = Path(validation.__file__).parent / "schemas" / "SpaceSystem.xsd"
     result = validation.validate_xtce(
         on_disk("xtce", folder),
@@ -229,15 +221,12 @@ def test_an_xtce_reader_reads_our_telemetry(row: Row, folder: Path) -> None:
 
 
 def test_the_eds_is_read_by_canopen_and_passes_the_checker(folder: Path) -> None:
-    canopen = pytest.importorskip("canopen")
     file = on_disk("eds", folder)
     dictionary = canopen.import_od(str(file), node_id=5)
     names = {item.name for item in dictionary.values()}
     assert "Parameters" in names or any("arameter" in name for name in names)
     assert dictionary[0x1018][1] is not None
     checker = Path(sys.executable).with_name("dcfchk")
-    if not checker.exists():
-        pytest.skip("dcfchk of dcf-tools is not installed; it checks the EDS")
     result = subprocess.run([checker, "-n", "5", file], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr.strip(), result.stdout.strip()) == (0, "", "")
 

@@ -237,10 +237,12 @@ def test_blend_leaves_no_close_pair_of_leaders_and_no_light_behind(sky: StarCata
 
 def test_close_pairs_are_those_of_a_tree(sky: StarCatalog) -> None:
     vectors = sky.brighter_than(6.0).vectors
-    for chord in (1e-5, 1e-3, 0.05, 2.0):
-        some = vectors if chord < 1.0 else vectors[:60]
-        theirs = {tuple(sorted(pair)) for pair in cKDTree(some).query_pairs(chord)}
-        assert {tuple(sorted(pair)) for pair in catalog._close_pairs(some, chord).tolist()} == theirs
+    for angle in (1e-5, 1e-3, 0.05, math.pi):
+        some = vectors if angle < 1.0 else vectors[:60]
+        for ones, others in ((some, some), (some[::3], some[1::3])):
+            near = cKDTree(ones).query_ball_tree(cKDTree(others), 2.0 * math.sin(0.5 * angle))
+            theirs = {(one, other) for one, found in enumerate(near) for other in found}
+            assert {tuple(pair) for pair in catalog._close_pairs(ones, others, angle).tolist()} == theirs
 
 
 def lines_of_the_file(n: int) -> list[bytes]:

@@ -2,6 +2,7 @@
 
 import pytest
 
+from emulator.device.cycle import MAX_PENDING
 from emulator.profile import Profile
 from emulator.truth.source import FixedTruth
 from starid.attitude import Attitude
@@ -93,3 +94,24 @@ def test_delay_time_moves_the_exposure(make_bench):
     bench.step(0.9)
     mid_s = bench.read("precise_attitude")["time_of_exposure"] - Profile().run.start_unix_s
     assert mid_s == pytest.approx(begin + 0.35)
+
+
+def test_exposures_that_the_machine_has_no_time_for_are_left_out_and_tracking_goes_on(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(3.5)
+    before = bench.read("precise_attitude")
+    assert (before["valid"], bench.mode) == (True, "tracking")
+    bench.imager.pending = MAX_PENDING
+    bench.step(2.0)
+    during = bench.read("precise_attitude")
+    assert (during["valid"], during["mode"], bench.mode) == (True, "tracking", "tracking")
+    assert during["frame_counter"] == before["frame_counter"]
+    assert bench.device.cycle.left_out == 2
+    bench.imager.pending = 0
+    bench.step(2.0)
+    after = bench.read("precise_attitude")
+    assert (after["valid"], bench.mode) == (True, "tracking")
+    assert after["frame_counter"] == before["frame_counter"] + 2
+    bench.imager.pending = MAX_PENDING
+    bench.step(10.0)
+    assert bench.read("precise_attitude")["reason"] == "no_frame"  # what stands is too old by now

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections import deque
 
 import pytest
-
-from protocol.can_framing import CanFrame
-
-pytest.importorskip("durand", reason="PyPI durand is not installed")
-
 from durand.datatypes import DatatypeEnum
 from durand.network import NetworkABC
 from durand.node import MinimalNode
 from durand.object_dictionary import Record, Variable
 from durand.scheduler import VirtualScheduler, get_scheduler, set_scheduler
+
+from protocol.can_framing import CanFrame
 
 NODE = 0x2C
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import pytest
-
-durand = pytest.importorskip("durand", reason="PyPI durand is not installed")
-
-from durand.datatypes import DatatypeEnum  # noqa: E402
-from durand.network import NetworkABC  # noqa: E402
-from durand.node import MinimalNode  # noqa: E402
-from durand.object_dictionary import Record, Variable  # noqa: E402
+from durand.datatypes import DatatypeEnum
+from durand.network import NetworkABC
+from durand.node import MinimalNode
+from durand.object_dictionary import Record, Variable
 
 NODE = 0x2C
 PIXELS = bytes(number * 5 & 0xFF for number in range(1000))

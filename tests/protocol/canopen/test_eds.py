@@ -10,12 +10,11 @@ import warnings
 from pathlib import Path
 
 import canopen
+import dcf
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
 from protocol.canopen import build_dictionary, build_eds
-
-dcf = pytest.importorskip("dcf", reason="PyPI dcf-tools is not installed")
 
 
 @pytest.fixture(scope="module")
