@@ -27,16 +27,9 @@ $(VENV)/.developer: $(VENV)/.product
 demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
 
-# tests that only compute run beside those that start processes and open ports: one processor each
-COMPUTING := tests/conformance tests/protocol/canopen tests/starid
-
 test: $(VENV)/.developer
 	-@tools/install_test_packages tshark:tshark
-	@echo "tests that only compute, in the background: $(COMPUTING)"; \
-	$(BIN)/python -m pytest -m "not socketcan" $(COMPUTING) > $(VENV)/computing.log 2>&1 & computing=$$!; \
-	$(BIN)/python -m pytest -m "not socketcan" $(addprefix --ignore=,$(COMPUTING)); status=$$?; \
-	wait $$computing || status=1; cat $(VENV)/computing.log; exit $$status
-	tools/test_on_vcan $(BIN)/python
+	@tools/test_in_lanes $(BIN)/python
 
 lint: $(VENV)/.developer
 	$(BIN)/ruff check .

@@ -37,7 +37,7 @@ class _SerialPipeline:
             self._cycle += [(Request.of(stars.id), stars.size), *maps[:count]]
         self._next = 0
         self._under_way: deque[tuple[Request, int]] = deque()
-        self.answered = asyncio.Event()
+        self._came = asyncio.Event()
         self.exchanges = 0
         self.wrong = 0
         self.received = 0
@@ -72,7 +72,17 @@ class _SerialPipeline:
             for event in self._receiver.feed(data[start:end], time.monotonic()):
                 self._judge(event)
             start = end
-        self.answered.set()
+        self._came.set()
+
+    async def drain(self, left: int) -> bool:
+        """Wait until no more than `left` requests are under way; False if the line is silent for `REPLY_WITHIN_S` before."""
+        while self.under_way > left:
+            self._came.clear()
+            try:
+                await asyncio.wait_for(self._came.wait(), REPLY_WITHIN_S)
+            except TimeoutError:
+                return False
+        return True
 
     def _judge(self, event: Reply | LinkFault) -> None:
         if isinstance(event, LinkFault) or not self._under_way:
@@ -104,24 +114,15 @@ async def load_serial(spec: str, seconds: float, baud: int, dialect: Dialect) ->
     transport = open_serial(spec, baud)
     await transport.start(pipeline.take)
     begin = time.monotonic()
-    lost = False
-    while time.monotonic() - begin < seconds and not lost:
+    answers = True
+    while answers and time.monotonic() - begin < seconds:
         while pipeline.under_way < PIPELINE:
             transport.send(pipeline.next_request())
-        pipeline.answered.clear()
-        try:
-            await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
-        except TimeoutError:
-            lost = True
-    while pipeline.under_way and not lost:
-        pipeline.answered.clear()
-        try:
-            await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
-        except TimeoutError:
-            lost = True
+        answers = await pipeline.drain(PIPELINE - 1)
+    answers = answers and await pipeline.drain(0)
     duration = time.monotonic() - begin
     sent, received = transport.statistics.sent, pipeline.received
-    flags = 0 if lost else await _error_flags(icd, transport, pipeline)
+    flags = await _error_flags(icd, transport, pipeline) if answers else 0
     await transport.close()
     capacity = duration * baud / 10.0
     return SerialLoad(
@@ -141,12 +142,9 @@ async def _error_flags(
 ) -> int:
     """Count the error flags that the device reports of its serial link."""
     row = icd.telemetry["communication_status"]
-    pipeline.answered.clear()
     transport.send(pipeline.request(Request.of(row.id), row.size))
-    try:
-        await asyncio.wait_for(pipeline.answered.wait(), REPLY_WITHIN_S)
-    except TimeoutError:
-        return 1
+    if not await pipeline.drain(0) or len(pipeline.last) != row.size:
+        return 0  # the pipeline counts it
     values = row.decode(pipeline.last)
     return sum(
         bool(values[name]) for name in ("uart_protocol_error", "uart_incomplete", "telecommand_overrun")

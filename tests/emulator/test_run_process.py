@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import tty
 from pathlib import Path
 
@@ -234,16 +235,25 @@ def test_a_signal_ends_the_run_in_good_order(tmp_path, number):
     assert not link.is_symlink()
 
 
+def is_running(pid: str) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place(tmp_path):
     link = tmp_path / "tty"
     arguments = ("--symlink", str(link), "--state-dir", str(tmp_path), "--set", "links.serial.dialect=a")
     emulator = Emulator(*arguments)
     pid = emulator.process.pid
     (worker,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    code, _ = emulator.end(signal.SIGKILL)  # waits until the worker too has closed its end of the pipes
+    code, _ = emulator.end(signal.SIGKILL)
     assert code == -signal.SIGKILL
-    status = Path(f"/proc/{worker}/stat")
-    assert not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z"
+    until = time.monotonic() + READY_WITHIN_S
+    while is_running(worker):
+        assert time.monotonic() < until, "the worker goes on without its parent"
+        time.sleep(0.02)
     assert link.is_symlink()
     emulator = Emulator(*arguments)
     assert emulator.read("boot_status")["boot_count"] == 2
