@@ -19,6 +19,8 @@ from starid.imaging.image_io import write_image
 LENS = Camera(640, 512, (850.0, 850.0), (322.0, 250.0), "pinhole", (-0.08, 0.02, 0.0, 0.0, 0.0))
 POINTINGS = [(83.8, -1.2, 30.0), (283.0, 35.0, 200.0), (190.0, -60.0, 100.0), (170.0, 55.0, 300.0)]
 
+NOISE = np.random.default_rng(1).normal(100, 3, (512, 640)).clip(0, 255).astype(np.uint8)
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["starhil", "calibrate", *arguments])
@@ -60,8 +62,7 @@ def test_camera_is_found_and_saved(
 def test_frames_that_show_no_sky_end_in_status_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, images: list[str]
 ) -> None:
-    noise = np.random.default_rng(1).normal(100, 3, (512, 640)).clip(0, 255).astype(np.uint8)
-    write_image(tmp_path / "noise.png", noise)
+    write_image(tmp_path / "noise.png", NOISE)
     output = tmp_path / "camera.toml"
     assert run(monkeypatch, *images, str(tmp_path / "noise.png"), "--fov", "41", "-o", str(output)) == 1
     out = capsys.readouterr().out
@@ -73,6 +74,7 @@ def test_frames_that_show_no_sky_end_in_status_1(
 def test_bad_input_ends_in_one_line_and_status_2(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, images: list[str]
 ) -> None:
+    write_image(tmp_path / "noise.png", NOISE)
     write_image(tmp_path / "small.png", np.arange(64 * 64, dtype=np.uint16).reshape(64, 64))
     output = tmp_path / "camera.toml"
     for arguments, words in (
@@ -81,7 +83,7 @@ def test_bad_input_ends_in_one_line_and_status_2(
         ([images[0], "--fov", "0"], "fov_deg"),
         ([images[0], "--fov", "41", "--model", "mirror"], "'mirror'"),
         ([images[0], "--fov", "41", "--estimate", "colour"], "'colour'"),
-        ([images[0], "--fov", "70"], "none of 1 frames could be identified"),
+        ([str(tmp_path / "noise.png"), "--fov", "41"], "none of 1 frames could be identified"),
     ):
         assert run(monkeypatch, *arguments, "-o", str(output)) == 2, arguments
         captured = capsys.readouterr()
