@@ -7,6 +7,7 @@ process works on it, and a campaign that was interrupted continues where it stop
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections import Counter
@@ -153,7 +154,10 @@ class FrameMaker:
         sensor = SensorModel() if plan.sky == "clear" else HARD_SENSOR
         self.camera = Camera.from_fov(plan.fov_deg)
         self.renderer: Renderer = Renderer(self.camera, load_catalog(), sensor, seed=plan.seed)
-        self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera)
+        options: dict[str, Any] = {}
+        if plan.algorithm != "geometric":  # these count the stars of a field, and so need their magnitudes
+            options["zero_point"] = 2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s)
+        self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera, **options)
         self.settings = sensor.detection_settings()
 
     def solve(self, frame: int) -> tuple[Any, ...]:

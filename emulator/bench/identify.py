@@ -192,16 +192,18 @@ def _run_row(
     tallies = {name: Tally(row, name) for name in solvers}
     spent = dict.fromkeys(solvers, 0.0)
     warm = maker.scene(settings, np.random.default_rng([seed, 1]))
-    for solve in solvers.values():
-        solve(warm)
+    for solver in solvers.values():
+        # a row's figures are its own, whatever rows came before
+        solver.reset()
+        solver.solve(warm)
     rng = np.random.default_rng(seed)
     for _ in range(frames):
         scene = maker.scene(settings, rng)
         floor = None if settings.random_points else best_attitude(maker.camera, maker.stars, scene)
-        for name, solve in solvers.items():
+        for name, solver in solvers.items():
             if spent[name] > budget_s:
                 continue
-            reply = solve(scene)
+            reply = solver.solve(scene)
             spent[name] += reply.seconds
             tallies[name].add(scene, floor, reply)
     return list(tallies.values())

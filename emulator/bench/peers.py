@@ -61,7 +61,20 @@ class Stopwatch:
         return time.perf_counter() - self._wall, time.process_time() - self._cpu
 
 
-Solver = Callable[[Scene], Reply]
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """A program under comparison.
+
+    Attributes
+    ----------
+    solve : callable
+        Answers a scene.
+    reset : callable
+        Makes it forget the scenes that it has seen.
+    """
+
+    solve: Callable[[Scene], Reply]
+    reset: Callable[[], object] = lambda: None
 
 
 def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
@@ -108,7 +121,7 @@ def _own(name: str, camera: Camera) -> Solver:
             return Reply(None, *seconds)
         return Reply(solution.attitude.matrix, *seconds, solution.covariance)
 
-    return solve
+    return Solver(solve, getattr(identifier, "reset", lambda: None))
 
 
 def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
@@ -135,7 +148,7 @@ def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
         seconds = watch.read()
         return Reply(np.array(result.rotation_matrix_icrs_to_camera) if result else None, *seconds)
 
-    return solve
+    return Solver(solve)
 
 
 def _gaia_format(stars: StarCatalog) -> bytes:
@@ -177,4 +190,4 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
         # its quaternion turns the sensor into the sky
         return Reply(Rotation.from_quat(result.quat).inv().as_matrix(), *seconds)
 
-    return solve
+    return Solver(solve)

@@ -17,6 +17,7 @@ from emulator.reproduce.experiment import (
     Results,
     Row,
     row,
+    star_catalog,
     write_csv,
 )
 from emulator.reproduce.fsf_published import TABLES
@@ -45,13 +46,9 @@ _WORST_MOTION_DEG: Final = 0.0419
 _LEAST_PRECISION: Final = 99.8
 
 
-def first_frame(context: Context) -> tuple[Any, Any]:
+def first_frame() -> tuple[Any, Any]:
     """Magnitudes (7,) and offsets in degrees (7, 2) of the stars of the published experiments: Hp < 3 in the square."""
-    from emulator.reproduce.experiment import EPOCH
-    from starid.catalog import load_catalog
-
-    del context
-    catalog = load_catalog(epoch=EPOCH)
+    catalog = star_catalog()
     x = np.degrees(catalog.ra_rad) - _CORNER[0] - RADIUS_DEG
     y = np.degrees(catalog.dec_rad) - _CORNER[1] - RADIUS_DEG
     chosen = (catalog.hp < _BRIGHTEST) & (np.abs(x) <= RADIUS_DEG) & (np.abs(y) <= RADIUS_DEG)
@@ -102,7 +99,7 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame(context)
+    brightness, positions = first_frame()
     kind, false_stars, scale = part.values["kind"], part.values["false_stars"], part.values["scale"]
     count = int(context.parameters["frames"])
     shape = (len(FACTORS), 4)

@@ -47,7 +47,7 @@ def _pairs(brightness: NDArray[np.float64], positions: NDArray[np.float64]) -> N
 
 
 def _work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame(context)
+    brightness, positions = first_frame()
     noise = noise_of("both", part.values["factor"] * part.values["scale"], 0)
     frames = moved_frames(
         context.rng(part.key),

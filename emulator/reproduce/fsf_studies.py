@@ -64,7 +64,7 @@ def _choice_parts(parameters: Parameters) -> list[Part]:
 
 
 def _choice_work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame(context)
+    brightness, positions = first_frame()
     noise = NoiseModel(position_sigma_px=_SPREAD_DEG / PIXEL_DEG)
     lost, shift_errors = [], []
     frames = moved_frames(
@@ -156,7 +156,7 @@ def _case_parts(parameters: Parameters) -> list[Part]:
 
 
 def _case_work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame(context)
+    brightness, positions = first_frame()
     kind = part.values["kind"]
     noise = noise_of(
         "both" if kind == "none" else kind, 0.0 if kind == "none" else 1.0, part.values["false_stars"]
@@ -260,7 +260,7 @@ def _case_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
 
 def _reconstruction_figure(context: Context) -> str:
     """The stars of a moved frame and those of the frame before, moved by the estimated motion: figure 6.13."""
-    brightness, positions = first_frame(context)
+    brightness, positions = first_frame()
     fig, axes = figure(1, 2, width=9.5, height=4.6, sharey=True)
     for factor, ax in zip((0.0, 1.0), axes, strict=True):
         frames = moved_frames(
@@ -302,7 +302,7 @@ def _correlation_parts(parameters: Parameters) -> list[Part]:
 
 
 def _correlation_work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame(context)
+    brightness, positions = first_frame()
     factor = part.values["factor"]
     frames = moved_frames(
         context.rng(part.key),
@@ -419,11 +419,11 @@ def _crowd_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 at_least=99.5 if part.values["kind"] == "drifting" and context.quick else 99.8,
             )
         )
-        median = float(np.percentile(results[part.key]["ms"], 10.0))
+        quick = float(np.percentile(results[part.key]["ms"], 10.0))
         rows.append(
             row(
                 f"scalable filter, time a frame, {words}",
-                ours=median,
+                ours=quick,
                 unit="ms",
                 at_most=5.0 if true == 150 and not context.quick else None,
             )

@@ -40,11 +40,6 @@ def _logarithm(errors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(1.0 + np.log10(np.maximum(errors, _LEAST)), dtype=np.float64)
 
 
-def _rank_correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    first, second = (np.argsort(np.argsort(values)).astype(np.float64) for values in (a, b))
-    return float(np.corrcoef(first, second)[0, 1])
-
-
 def _patterns(context: Context, results: Mapping[str, Results], grid: str) -> str:
     fig, axes = figure(len(_CASES), 2, width=9.5, height=15.0, sharex=True)
     for i, (case, words) in enumerate(_CASES.items()):
@@ -111,6 +106,8 @@ def pattern_files(context: Context, results: Mapping[str, Results]) -> list[str]
 
 def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
     """How far ε_ψ and ε_f go together, and what a threshold on ε_ψ leaves."""
+    from scipy.stats import spearmanr
+
     rows = []
     for case in ("none", "both-1", "false-1", "missing-1"):
         for grid in (ON, OFF):
@@ -121,7 +118,7 @@ def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
                 row(
                     f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {_GRID_WORDS[grid]}",
                     published="positive",
-                    ours=_rank_correlation(psi, errors),
+                    ours=float(spearmanr(psi, errors).statistic),
                     remark=f"ε_ψ < 1 in {100.0 * kept.size / psi.size:.0f} % of the frames"
                     + (
                         f"; of these {100.0 * float(np.mean(kept > 1.0)):.1f} % are more than 1° off."

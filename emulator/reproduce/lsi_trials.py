@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from emulator.reproduce.experiment import Context, Results
 from starid.thesis.features import extract_features
 from starid.thesis.lsi import LsiEstimate
+from starid.thesis.metrics import boresight_error, rotation_error
 from starid.thesis.simulation import NoiseModel, add_noise, turned
 from starid.thesis.subcell import FineEstimate, SubcellSearch
 
@@ -50,17 +51,6 @@ def frames_under_test(
     if grid == OFF:
         places = places + step_deg * rng.uniform(0.0, 1.0, places.shape)
     return places
-
-
-def boresight_error(answer: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Error of the boresight ε_f in the flat plane, eq. 2.21, degrees; right ascension wraps."""
-    ra = (answer[..., 0] - truth[..., 0] + 180.0) % 360.0 - 180.0
-    return np.asarray(np.hypot(ra, answer[..., 1] - truth[..., 1]), dtype=np.float64)
-
-
-def angle_error(answer_rad: float, truth_rad: float) -> float:
-    """Error of an angle ε_θ, eq. 2.22, degrees, 0 … 180."""
-    return abs(math.degrees(math.remainder(answer_rad - truth_rad, 2.0 * math.pi)))
 
 
 def solve_frames(
@@ -111,7 +101,6 @@ def solve_frames(
     answers = np.empty((len(names), len(frames), 2))
     angles = np.empty((len(names), len(frames)))
     psi = np.empty((2, len(frames)))
-    roll = math.radians(roll_deg)
     for i, (ra, dec) in enumerate(frames):
         brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
         if noise is not None:
@@ -126,9 +115,10 @@ def solve_frames(
             estimates.append(compared.solve(features, places))
         for j, estimate in enumerate(estimates):
             answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
-            angles[j, i] = angle_error(features.theta_rad - estimate.theta_rad, roll)
+            turn = features.theta_rad - estimate.theta_rad
+            angles[j, i] = rotation_error(math.degrees(turn), roll_deg)
         psi[:, i] = solution.mse.error_psi, better.residual
-    errors = boresight_error(answers, frames)
+    errors = boresight_error(answers[..., 0], answers[..., 1], frames[:, 0], frames[:, 1])
     return {
         "frames": frames,
         **{f"f_{name}": errors[j] for j, name in enumerate(names)},

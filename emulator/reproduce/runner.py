@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,7 +108,7 @@ def _load_part(path: Path) -> tuple[Results, float]:
         with np.load(path, allow_pickle=False) as stored:
             results = {name: stored[name] for name in stored.files}
             seconds = float(results.pop("seconds_"))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise ReproduceError(
             f"reproduce: {path} cannot be read ({error}); remove it to have it made again"
         ) from error
@@ -146,6 +147,8 @@ def _finish(plan: _Plan, computed: int) -> Finished:
         results[part.key], spent = _load_part(plan.file(part))
         seconds += spent
     plan.context.folder.mkdir(parents=True, exist_ok=True)
+    # tables and figures are overwritten: an outcome of other parameters no longer belongs to them
+    (plan.context.folder / OUTCOME_FILE).unlink(missing_ok=True)
     outcome = plan.experiment.finish(plan.context, results)
     seconds += _processor_time() - start
     text = json.dumps(

@@ -78,8 +78,8 @@ def _work(context: Context, part: Part) -> Results:
     count = int(context.parameters["frames"])
     numbers = np.full((count, len(_COLUMNS)), np.nan)
     attitude = random_attitude(rng)
-    if recursive:
-        identifier.reset()
+    # this process may have done other parts with it
+    identifier.reset()
     predicted: Attitude | None = None
     for i in range(count):
         attitude = propagate(attitude, np.radians(_SLEW_DEG), 1.0) if recursive else random_attitude(rng)
@@ -199,5 +199,6 @@ EXPERIMENTS: Final = (
         _finish,
         full={"noises": _NOISES, "frames": 1000},
         quick={"noises": _NOISES[1:2], "frames": 60},
+        revision=2,
     ),
 )

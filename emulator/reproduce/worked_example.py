@@ -20,8 +20,9 @@ from emulator.reproduce.experiment import (
     row,
     write_csv,
 )
-from emulator.reproduce.lsi_trials import HALF_FRAME_DEG, boresight_error
+from emulator.reproduce.lsi_trials import HALF_FRAME_DEG
 from emulator.reproduce.plots import figure, save
+from starid.thesis.metrics import boresight_error
 
 if TYPE_CHECKING:
     from starid.thesis.features import FeatureVector
@@ -152,7 +153,7 @@ def _list(values: Any, digits: int = 2) -> str:
 
 def _estimate_rows(result: Results, kind: str) -> list[Row]:
     corner = result[f"boresight_{kind}"] - HALF_FRAME_DEG
-    error = float(boresight_error(corner, np.array(_CORNER)))
+    error = float(boresight_error(corner[0], corner[1], *_CORNER))
     return [
         row(
             f"ω ({_WORDS[kind]}) of the nine cells",
@@ -179,6 +180,7 @@ def _estimate_rows(result: Results, kind: str) -> list[Row]:
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     result = results["example"]
     vectors = result["dictionary"]
+    fine = result["fine"] - HALF_FRAME_DEG
     right = [
         _agree(ours, published, _LAST_DIGIT) for ours, published in zip(vectors, _DICTIONARY, strict=True)
     ]
@@ -248,7 +250,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
         *_estimate_rows(result, "one_se"),
         row(
             "error of the sub-cell search (ours), from the whole database",
-            ours=float(boresight_error(result["fine"] - HALF_FRAME_DEG, np.array(_CORNER))),
+            ours=float(boresight_error(fine[0], fine[1], *_CORNER)),
             unit="°",
             digits=6,
         ),

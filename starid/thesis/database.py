@@ -25,12 +25,6 @@ from starid.thesis.frame_sky import Direction, FrameSky, cell_features, make_fra
 CODE_MAX: Final = 255
 """Largest code of a stored feature; codes span 0 … 100 of the normalised scale."""
 
-CODE_STEP: Final = 100.0 / CODE_MAX
-"""One step of a stored feature on the normalised scale."""
-
-THETA_CODES: Final = 255
-"""Number of codes of the polar angle; the code 255 marks a cell without a star."""
-
 THESIS_FRAME_DEG: Final = 40.0
 """Frame width of every published number (the text says 42°)."""
 
@@ -175,10 +169,6 @@ class FeatureDatabase:
     def scale(self) -> NDArray[np.float64]:
         """Normalised units per unit of each feature, (5,); 0 for a feature that is the same everywhere."""
         return normalising_scale(self.minimum, self.maximum)
-
-    def stored_vector(self, cell: int) -> NDArray[np.float64]:
-        """Normalised features of a cell as stored, (5,)."""
-        return np.asarray(self.features[cell] * CODE_STEP, dtype=np.float64)
 
     def exact_features(self, cell: int) -> FeatureVector:
         """Features of a cell in full precision, computed from the stars."""

@@ -3,8 +3,8 @@
 The solution of min 1/(2M)·‖ψ̂ − Tω‖² + λ‖ω‖₁ is piecewise linear in λ. With five features and nine columns it has a
 dozen or two breakpoints, which the least-angle regression of Efron et al. (2004) with the LASSO modification finds one
 by one; between them the solution is interpolated. Neighbouring cells look nearly alike, so that the columns are nearly
-parallel: each breakpoint's solution is checked against the optimality conditions, and where the path fails them
-(columns that are exactly alike, as stored codes can be) coordinate descent takes over.
+parallel: the solution at the path's end, where its errors have added up, is checked against the optimality conditions,
+and where it fails them (columns that are exactly alike, as stored codes can be) coordinate descent takes over.
 """
 
 from __future__ import annotations

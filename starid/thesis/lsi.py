@@ -32,8 +32,8 @@ _FULL_TURN: Final = 360.0
 _RESULT_SIZE: Final = 16
 _LEAST_WEIGHT: Final = 1e-3
 
-SUM, RA, DEC, THETA, ERROR, LAMBDA, BORESIGHT, POINTER = 0, 1, 2, 3, 4, 5, 6, 9
-"""Places in a row of results: Σω, α, δ (degrees), θ (radians), ε_ψ, λ, boresight and pointer vectors."""
+RA, DEC, THETA, ERROR, LAMBDA, BORESIGHT, POINTER = 1, 2, 3, 4, 5, 6, 9
+"""Places in a row of results after Σω: α, δ (degrees), θ (radians), ε_ψ, λ, boresight and pointer vectors."""
 
 
 class SearchedCells(NamedTuple):

@@ -9,10 +9,9 @@ refined and verified by the geometric identifier's tracking stage. What does not
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +20,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starid.attitude import Attitude
-from starid.cache import cache_dir
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
@@ -31,8 +29,8 @@ from starid.geometric.pattern_index import seen_stars
 from starid.solution import Reason, Solution
 from starid.thesis.cell_search import stored_neighbours
 from starid.thesis.coarse_match import next_candidate
-from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDatabase, build_database
-from starid.thesis.database_file import load_database, save_database
+from starid.thesis.database import DatabaseParameters
+from starid.thesis.database_choice import given_database, obtain_database
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.frame_sky import UX, UZ
 from starid.thesis.lsi import LostInSpace
@@ -40,9 +38,6 @@ from starid.wahba import solve_wahba
 
 STARS_PER_FIELD: Final = 60
 """Stars in a field that the default brightness limit of the features aims at."""
-
-DATABASE_VERSION: Final = 1
-"""Part of the name of a cached database; raised when its contents change."""
 
 _FEWEST_STARS: Final = 5
 _MAGNITUDE_GATE: Final = 0.8
@@ -113,7 +108,8 @@ class LsiOptions:
     neighbours
         Most neighbours tried, the nearest first.
     zero_point
-        Magnitude V of one unit of flux, where it is known; found from the frame, and kept, where it is not.
+        Magnitude V of one unit of flux, where it is known. Where it is not it is found: every answer shows it, the next
+        frame is tried with that first, and then with what its own brightnesses suggest.
     limiting_magnitude
         Faintest V of the verification, as `Identifier` takes it.
     database
@@ -152,7 +148,9 @@ class LsiIdentifier:
     Raises
     ------
     DatabaseError
-        If the database given belongs to another camera, catalogue or geometry.
+        If the database given belongs to another camera, catalogue, band or geometry.
+    StaridError
+        If the catalogue is empty.
     """
 
     def __init__(
@@ -164,16 +162,23 @@ class LsiIdentifier:
     ) -> None:
         options = dataclasses.replace(options or LsiOptions(), **changes)
         self._catalog = load_catalog() if catalog is None else catalog
+        if len(self._catalog) == 0:
+            raise StaridError("identifier catalog: it holds no star")
         self._camera = camera
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
         limit = self._limit_for(share) if options.feature_limit is None else options.feature_limit
         parameters = dataclasses.replace(probe, kappa=limit)
         seen = seen_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
-        self.database = self._load(seen, parameters, options.database, cache=options.cache)
+        self.database = (
+            obtain_database(seen, parameters, cache=options.cache)
+            if options.database is None
+            else given_database(Path(options.database), parameters, (self._catalog.identity, seen.identity))
+        )
         self.lost_in_space = LostInSpace(self.database)
         self._offset_px = _OFFSET_SHARE * self.database.parameters.half_width_px
         self._neighbours = options.neighbours
+        self._given_zero_point = options.zero_point
         self._zero_point = options.zero_point
         self._star_magnitude = self._magnitude_of_rank(share)
         self.verifier = Identifier(
@@ -193,8 +198,12 @@ class LsiIdentifier:
 
     @property
     def zero_point(self) -> float | None:
-        """Magnitude V of one unit of flux; None before it was given or found."""
+        """Magnitude V of one unit of flux, as given or as the last answer showed it; None before either."""
         return self._zero_point
+
+    def reset(self) -> None:
+        """Forget what frames have shown: the zero point is again the one given, or none."""
+        self._zero_point = self._given_zero_point
 
     def _limit_for(self, share: float) -> float:
         v = np.sort(self._catalog.v)
@@ -206,49 +215,13 @@ class LsiIdentifier:
         v = np.sort(self._catalog.v)
         return float(v[min(int(_ZERO_POINT_STAR / share), v.size - 1)])
 
-    @staticmethod
-    def _load(
-        stars: StarCatalog, parameters: DatabaseParameters, path: str | Path | None, *, cache: bool
-    ) -> FeatureDatabase:
-        if path is not None:
-            database = load_database(Path(path))
-            if database.parameters.geometry != "spherical":
-                raise DatabaseError(
-                    f"database: {path} is planar; a sensor needs one with --geometry spherical"
-                )
-            numbers = (database.parameters.focal_px, database.parameters.half_width_px)
-            if not np.allclose(numbers, (parameters.focal_px, parameters.half_width_px), rtol=1e-6):
-                raise DatabaseError(
-                    f"database: {path} belongs to another camera: focal length {numbers[0]:.2f} px and field radius "
-                    f"{numbers[1]:.2f} px, not {parameters.focal_px:.2f} and {parameters.half_width_px:.2f}"
-                )
-            if database.parameters.direction != "brightest" or database.parameters.full_field:
-                raise DatabaseError(
-                    f"database: {path} does not hold circles of the brightest stars; build it anew"
-                )
-            return database
-        text = repr((DATABASE_VERSION, stars.identity, dataclasses.astuple(parameters)))
-        key = hashlib.sha256(text.encode()).hexdigest()[:16]
-        file = cache_dir() / f"features-{key}.bin"
-        if cache and file.is_file():
-            try:
-                return load_database(file)
-            except DatabaseError:
-                file.unlink(missing_ok=True)
-        database = build_database(stars, parameters)
-        if cache:
-            save_database(database, file)
-        return database
-
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""
         self.verifier.warm_up()
-        zero_point, self._zero_point = self._zero_point, 0.0
         xy = self._camera.border(4)[:_FEWEST_STARS] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
-        self.identify(xy, np.ones(len(xy)))
-        self._zero_point = zero_point
+        self._identify(xy, np.ones(len(xy)), None, [0.0])
 
     def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
         """Lost in space: attitude without any knowledge of it.
@@ -265,10 +238,23 @@ class LsiIdentifier:
         """
         begin = time.perf_counter()
         xy, brightness, _ = checked_detections(xy_px, flux)
+        solution = self._identify(xy, brightness, xy_sigma_px, self._zero_points(brightness))
+        if solution.valid:
+            self.learn(solution, brightness)
+        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+
+    def _identify(
+        self,
+        xy: NDArray[np.float64],
+        brightness: NDArray[np.float64],
+        xy_sigma_px: ArrayLike | None,
+        zero_points: Sequence[float],
+    ) -> Solution:
+        """First verified answer of the zero points, tried in their order."""
         tried = verified = 0
         coarse: Attitude | None = None
         enough = False
-        for zero_point in self._zero_points(brightness):
+        for zero_point in zero_points:
             field = self.field_stars(xy, brightness, zero_point)
             features = self.features(field)
             if features is None:
@@ -283,14 +269,11 @@ class LsiIdentifier:
                 verified += 1
                 solution = self.verifier.verify(xy, brightness, attitude, xy_sigma_px, window_px=_WINDOW_PX)
                 if solution.valid:
-                    self.learn(solution, brightness)
                     self.last_report = LsiReport(coarse, tried, verified, zero_point)
-                    return dataclasses.replace(
-                        solution, mode="lost_in_space", elapsed=time.perf_counter() - begin
-                    )
+                    return dataclasses.replace(solution, mode="lost_in_space")
         self.last_report = LsiReport(coarse, tried, verified, math.nan)
         reason = Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS
-        return Solution.invalid(reason, elapsed=time.perf_counter() - begin)
+        return Solution.invalid(reason)
 
     def track(
         self,
@@ -311,18 +294,20 @@ class LsiIdentifier:
         return self.verifier.track(xy_px, flux, predicted, xy_sigma_px, window_px=window_px)
 
     def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
-        if self._zero_point is not None:
-            return [self._zero_point]
+        """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""
+        if self._given_zero_point is not None:
+            return [self._given_zero_point]
+        shown = [] if self._zero_point is None else [self._zero_point]
         bright = np.sort(flux[flux > 0.0])[::-1]
         if bright.size < _FEWEST_STARS:
-            return []
+            return shown
         rank = min(_ZERO_POINT_STAR, bright.size) - 1
         guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
-        return [guess + step for step in _ZERO_POINT_STEPS]
+        return shown + [guess + step for step in _ZERO_POINT_STEPS]
 
     def learn(self, solution: Solution, flux: NDArray[np.float64]) -> None:
-        """Keep the zero point that the matched stars show, where none was given."""
-        if self._zero_point is None and solution.star_count >= _FEWEST_STARS:
+        """Take the zero point that the matched stars of a valid answer show, where none was given."""
+        if self._given_zero_point is None and solution.star_count >= _FEWEST_STARS:
             magnitudes = self._catalog.v[solution.catalog_index]
             found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
             self._zero_point = float(np.median(found))

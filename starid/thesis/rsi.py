@@ -19,9 +19,6 @@ from starid.thesis.rsi_memory import AnswerMemory, Place
 
 Mode = Literal["lsi", "rsi"]
 
-THRESHOLDS: Final = (0.5, 1.0)
-"""The two published values of the threshold τ."""
-
 _FEWEST_MATCHES: Final = 2
 _FEWEST_VOTES: Final = 2
 

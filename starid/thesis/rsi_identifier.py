@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.errors import StaridError
 from starid.geometric.given import checked_detections
 from starid.solution import Reason, Solution
 from starid.thesis.cme import estimate_motion
@@ -137,7 +138,8 @@ class RsiIdentifier:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames and the statistics."""
+        """Forget the frames, the zero point that they showed, and the statistics."""
+        self.lsi.reset()
         self._before = None
         if self._filter is not None:
             self._filter.reset()
@@ -175,14 +177,22 @@ class RsiIdentifier:
         predicted
             Attitude expected, or its scalar-last quaternion.
         window_px
-            Where it is wider than the region, the region is widened to it.
+            Where it is wider than the region, the region is widened to it, up to the field of view.
+
+        Raises
+        ------
+        StaridError
+            The arrays do not fit each other, or a value is not finite or out of its range.
         """
         begin = time.perf_counter()
         xy, brightness, _ = checked_detections(xy_px, flux)
+        if window_px is not None and not 0.0 < window_px < math.inf:
+            raise StaridError(f"tracking window_px: {window_px} given, a positive number of pixels needed")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         true_stars, side = self._follow(xy, brightness)
         if window_px is not None:
             side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
+        side = min(side, self.lsi.database.parameters.fov_deg)
         solution = self._in_region(xy, brightness, true_stars, attitude, side, xy_sigma_px)
         triggered = not solution.valid
         if triggered:

@@ -151,25 +151,6 @@ def add_noise(
     return mags, places, identity
 
 
-def simulate_frame(
-    rng: np.random.Generator, sky: FrameSky, ra_deg: float, dec_deg: float, noise: NoiseModel
-) -> SimulatedFrame:
-    """One frame of the flat sky with north up, and its noise.
-
-    Raises
-    ------
-    SkyError
-        If the sky is not planar.
-    """
-    if sky.geometry != "planar":
-        raise SkyError("simulator: the thesis's frames are planar; give a planar sky")
-    mags, positions, _ = sky.stars_in_frame(ra_deg, dec_deg)
-    brightness, places, identity = add_noise(rng, mags, positions, noise, sky.half_width)
-    return SimulatedFrame(
-        ObservedFrame(brightness, places), identity, ra_deg % 360.0, dec_deg, 0.0, np.zeros(2), 0.0
-    )
-
-
 def moved_frames(
     rng: np.random.Generator,
     brightness: NDArray[np.float64],

@@ -7,9 +7,11 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from emulator.bench import peers
 from emulator.bench.identify import ROWS, run
 from emulator.cli.bench import group
 from emulator.errors import EmulatorError
+from starid.solution import Reason, Solution
 
 PROMISED = [
     "row", "solver", "frames", "valid_pct", "wrong", "boresight_median_arcsec", "floor_ratio", "median_ms", "p99_ms",
@@ -18,13 +20,14 @@ OWN = ("geometric", "lsi", "rsi")
 
 
 def test_every_solver_of_our_own_answers_the_same_scenes() -> None:
-    answer = run(4, 5, own=OWN, rows=["0.5", "100 random points"])
-    assert [(row["row"], row["solver"]) for row in answer["rows"]] == [
-        (row, solver) for row in ("0.5", "100 random points") for solver in OWN
+    frames = {"0.5": 4, "100 random points": 1}
+    rows = [row for name, count in frames.items() for row in run(count, 5, own=OWN, rows=[name])["rows"]]
+    assert [(row["row"], row["solver"]) for row in rows] == [
+        (name, solver) for name in frames for solver in OWN
     ]
-    for row in answer["rows"]:
+    for row in rows:
         assert list(row)[: len(PROMISED)] == PROMISED
-        assert row["frames"] == 4
+        assert row["frames"] == frames[row["row"]]
         assert row["wrong"] == 0
         assert 0.0 < row["median_ms"] <= row["p99_ms"]
         assert 0.0 < row["cpu_median_ms"] <= row["cpu_p99_ms"]
@@ -34,6 +37,29 @@ def test_every_solver_of_our_own_answers_the_same_scenes() -> None:
         else:
             assert row["valid_pct"] == 0.0
             assert row["floor_ratio"] is None
+
+
+class Recorder:
+    """An identifier that notes how many frames it remembers at each."""
+
+    def __init__(self) -> None:
+        self.remembered = 0
+        self.notes: list[int] = []
+
+    def reset(self) -> None:
+        self.remembered = 0
+
+    def identify(self, *_: object) -> Solution:
+        self.notes.append(self.remembered)
+        self.remembered += 1
+        return Solution.invalid(Reason.NO_MATCH)
+
+
+def test_a_row_does_not_depend_on_the_rows_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = Recorder()
+    monkeypatch.setattr(peers, "make_identifier", lambda *_: recorder)
+    run(2, 5, own=["lsi"], rows=["0.5", "1"])
+    assert recorder.notes == [0, 1, 2] * 2
 
 
 def test_json_is_one_object_and_repeats_with_the_seed() -> None:

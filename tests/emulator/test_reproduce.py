@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -27,14 +28,13 @@ from emulator.reproduce.lsi_trials import (
     FRAMES,
     OFF,
     ON,
-    angle_error,
-    boresight_error,
     centres,
     frames_under_test,
 )
 from starid.thesis.frame_grid import make_grid
 
 WORKED_EXAMPLE_CHECKS = 8
+TIME_COLUMN = 6
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -127,6 +127,52 @@ def test_a_damaged_part_is_refused_by_name(tmp_path):
     (tmp_path / "toy" / "outcome.json").unlink()
     with pytest.raises(EmulatorError, match=r"part2.*remove it"):
         runner.run([_experiment()], tmp_path, jobs=1)
+
+
+def test_a_part_with_damaged_contents_is_refused_by_name(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    part = next((tmp_path / "toy" / "parts").glob("part2-*.npz"))
+    content = bytearray(part.read_bytes())
+    with zipfile.ZipFile(part) as archive:
+        start = archive.getinfo("value.npy").header_offset
+    names = int.from_bytes(content[start + 26 : start + 28], "little")
+    extra = int.from_bytes(content[start + 28 : start + 30], "little")
+    content[start + 30 + names + extra] = 0xFF  # a block type that deflate does not have
+    part.write_bytes(content)
+    (tmp_path / "toy" / "outcome.json").unlink()
+    with pytest.raises(EmulatorError, match=r"part2.*invalid block type.*remove it"):
+        runner.run([_experiment()], tmp_path, jobs=1)
+
+
+def test_an_interrupted_finish_leaves_no_outcome_of_other_parameters(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    values = (tmp_path / "toy" / "values.csv").read_text()
+
+    def interrupted(context: Context, results: Mapping[str, Results]) -> Outcome:
+        _finish(context, results)
+        raise KeyboardInterrupt
+
+    longer = dataclasses.replace(
+        _experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9}, finish=interrupted
+    )
+    with pytest.raises(KeyboardInterrupt):
+        runner.run([longer], tmp_path, jobs=1)
+    runner.run([_experiment()], tmp_path, jobs=1)
+    assert (tmp_path / "toy" / "values.csv").read_text() == values
+
+
+def test_parts_on_the_sphere_do_not_depend_on_what_the_process_did_before(tmp_path):
+    spherical = registry.experiments()["spherical"]
+    parameters = {**spherical.full, "frames": 2}
+    context = Context(tmp_path, tmp_path, "spherical", 1, parameters, quick=False)
+    parts = {part.key: part for part in spherical.parts(parameters)}
+
+    def numbers(key: str) -> np.ndarray:
+        return np.delete(spherical.work(context, parts[key])["numbers"], TIME_COLUMN, axis=1)
+
+    first = numbers("lsi-1")
+    numbers("lsi-2")
+    np.testing.assert_array_equal(numbers("lsi-1"), first)
 
 
 def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
@@ -248,11 +294,6 @@ def test_all_test_frames_lie_on_the_grid_and_the_moved_ones_do_not():
         else:
             assert away.min() > 1e-6
             assert 0.2 < away.mean() < 0.3
-
-
-def test_errors_wrap_at_the_full_turn():
-    assert boresight_error(np.array([359.9, 10.0]), np.array([0.1, 10.0])) == pytest.approx(0.2)
-    assert angle_error(np.pi - 0.01, -np.pi + 0.01) == pytest.approx(np.degrees(0.02))
 
 
 def test_the_worked_example_agrees_with_the_thesis(tmp_path):

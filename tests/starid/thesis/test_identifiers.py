@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from starid.errors import StaridError
 from starid.interface import StarIdentifier, make_identifier
 from starid.solution import Reason
 from starid.thesis.database import DatabaseError, DatabaseParameters, build_database
+from starid.thesis.database_choice import obtain_database
 from starid.thesis.database_file import save_database
 from starid.thesis.lsi_identifier import LsiIdentifier
 from starid.thesis.rsi_identifier import RsiIdentifier
@@ -88,6 +91,40 @@ def test_rsi_with_a_wrong_prediction_asks_the_whole_sky():
     assert recursion.statistics.triggers == 1
 
 
+def test_a_change_of_exposure_is_no_reason_to_be_lost():
+    xy, flux = points(np.random.default_rng(8), Attitude.from_radec_roll(80.0, 10.0, 0.0))
+    lsi().reset()
+    assert lsi().identify(xy, flux).valid
+    before = lsi().zero_point
+    assert lsi().identify(xy, 10.0 * flux).valid
+    assert lsi().zero_point == pytest.approx(before + 2.5, abs=1e-6)
+
+
+def test_after_a_reset_an_answer_is_what_it_is_first():
+    rng = np.random.default_rng(8)
+    before, frame = (points(rng, random_attitude(rng)) for _ in range(2))
+    recursion = RsiIdentifier()
+    for identifier, search in ((lsi(), lsi()), (recursion, recursion.lsi)):
+        reports = []
+        for _ in range(2):
+            identifier.reset()
+            assert search.zero_point is None
+            assert identifier.identify(*frame).valid
+            reports.append((search.last_report.tried, search.last_report.zero_point))
+            assert identifier.identify(*before).valid
+        assert reports[0] == reports[1]
+
+
+def test_a_given_zero_point_is_kept():
+    identifier = LsiIdentifier(zero_point=20.3)
+    xy, flux = points(np.random.default_rng(8), Attitude.from_radec_roll(80.0, 10.0, 0.0))
+    assert identifier.identify(xy, flux).valid
+    assert identifier.zero_point == 20.3
+    assert not identifier.identify(xy, 10.0 * flux).valid
+    identifier.reset()
+    assert identifier.zero_point == 20.3
+
+
 def test_both_are_star_identifiers_by_name():
     for name in ("lsi", "rsi"):
         assert isinstance(make_identifier(name), StarIdentifier)
@@ -107,12 +144,79 @@ def test_bad_input(make):
         identifier.identify([[1.0, 1.0]], [1.0, 2.0])
 
 
-def test_a_database_of_another_camera_or_geometry_is_refused(tmp_path):
+@pytest.mark.parametrize("window", [np.nan, -1.0, 0.0, np.inf])
+def test_a_window_that_is_none_is_refused(window):
+    recursion = RsiIdentifier()
+    with pytest.raises(
+        StaridError, match=r"tracking window_px: .* given, a positive number of pixels needed"
+    ):
+        recursion.track(np.empty((0, 2)), np.empty(0), Attitude.identity(), window_px=window)
+
+
+def test_a_window_wider_than_the_field_searches_the_field():
+    recursion = RsiIdentifier()
+    recursion.track(np.empty((0, 2)), np.empty(0), Attitude.identity(), window_px=1e5)
+    assert recursion.statistics.region_sum_deg == recursion.lsi.database.parameters.fov_deg
+
+
+@pytest.mark.parametrize("options", [{}, {"feature_limit": 5.0}])
+def test_an_empty_catalogue_is_refused(options):
     catalog = load_catalog()
-    other = DatabaseParameters.for_camera(Camera.from_fov(30.0), overlap=0.95, kappa=5.0)
-    save_database(build_database(catalog, other), tmp_path / "other.db")
-    save_database(build_database(catalog, DatabaseParameters(overlap=0.9)), tmp_path / "planar.db")
-    with pytest.raises(DatabaseError, match=r"other\.db belongs to another camera"):
+    nothing = catalog.subset(np.zeros(len(catalog), dtype=bool))
+    with pytest.raises(StaridError, match="identifier catalog: it holds no star"):
+        LsiIdentifier(DEFAULT_CAMERA, nothing, **options)
+
+
+CAMERA_DATABASE = DatabaseParameters.for_camera(DEFAULT_CAMERA, overlap=0.9, kappa=5.0)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "epoch", "words"),
+    [
+        (
+            DatabaseParameters.for_camera(Camera.from_fov(30.0), overlap=0.9, kappa=5.0),
+            2026.0,
+            "another camera",
+        ),
+        (DatabaseParameters(overlap=0.9), 2026.0, "is planar"),
+        (dataclasses.replace(CAMERA_DATABASE, direction="faintest"), 2026.0, "circles of the brightest"),
+        (dataclasses.replace(CAMERA_DATABASE, band="hp"), 2026.0, "made of hp magnitudes"),
+        (CAMERA_DATABASE, 1991.25, "another catalogue or epoch"),
+    ],
+)
+def test_a_database_that_does_not_fit_is_refused(tmp_path, parameters, epoch, words):
+    save_database(build_database(load_catalog(epoch=epoch), parameters), tmp_path / "other.db")
+    with pytest.raises(DatabaseError, match=rf"other\.db .*{words}"):
         LsiIdentifier(database=tmp_path / "other.db")
-    with pytest.raises(DatabaseError, match=r"planar\.db is planar"):
-        LsiIdentifier(database=tmp_path / "planar.db")
+
+
+def test_a_database_that_fits_is_taken(tmp_path):
+    save_database(build_database(load_catalog(), CAMERA_DATABASE), tmp_path / "mine.db")
+    assert LsiIdentifier(database=tmp_path / "mine.db").database.parameters == CAMERA_DATABASE
+
+
+def test_without_a_folder_to_keep_it_in_the_database_is_only_built(tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    assert obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).parameters == CAMERA_DATABASE
+    assert "cannot be written" in caplog.text
+
+
+def test_a_cached_database_that_cannot_be_read_is_built_anew(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
+    made = obtain_database(load_catalog(), CAMERA_DATABASE, cache=True)
+    (file,) = tmp_path.glob("features-*.bin")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1])
+    np.testing.assert_array_equal(
+        obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).features, made.features
+    )
+    assert "truncated" in caplog.text
+    assert file.read_bytes() == whole
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_file", refuse)
+    assert obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).cells == made.cells
+    assert "Permission denied" in caplog.text

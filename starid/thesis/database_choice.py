@@ -1,0 +1,106 @@
+"""Which feature database an identifier works with: a file that it was given, or its camera's own from the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import logging
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from starid.cache import cache_dir
+from starid.catalog import StarCatalog
+from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDatabase, build_database
+from starid.thesis.database_file import load_database, save_database
+
+DATABASE_VERSION: Final = 1
+"""Part of the name of a cached database; raised when its contents change."""
+
+_log = logging.getLogger(__name__)
+
+
+def given_database(path: Path, parameters: DatabaseParameters, stars: Collection[str]) -> FeatureDatabase:
+    """Load a database that somebody built, if it fits.
+
+    Parameters
+    ----------
+    path
+        File written by `save_database`.
+    parameters
+        What the identifier would build for itself; grid and brightness limit may differ.
+    stars
+        Identities of the star lists that it may have been made from.
+
+    Raises
+    ------
+    DatabaseError
+        If the file cannot be used, or belongs to another camera, catalogue, band or geometry.
+    """
+    database = load_database(path)
+    made = database.parameters
+    if made.geometry != parameters.geometry:
+        raise DatabaseError(
+            f"database: {path} is {made.geometry}; a sensor needs one with --geometry {parameters.geometry}"
+        )
+    numbers = (made.focal_px, made.half_width_px)
+    if not np.allclose(numbers, (parameters.focal_px, parameters.half_width_px), rtol=1e-6):
+        raise DatabaseError(
+            f"database: {path} belongs to another camera: focal length {numbers[0]:.2f} px and field radius "
+            f"{numbers[1]:.2f} px, not {parameters.focal_px:.2f} and {parameters.half_width_px:.2f}"
+        )
+    if made.direction != parameters.direction or made.full_field != parameters.full_field:
+        raise DatabaseError(f"database: {path} does not hold circles of the brightest stars; build it anew")
+    if made.band != parameters.band:
+        raise DatabaseError(
+            f"database: {path} is made of {made.band} magnitudes; a sensor needs one with --band {parameters.band}"
+        )
+    if database.catalog_identity not in stars:
+        raise DatabaseError(
+            f"database: {path} belongs to another catalogue or epoch ({database.catalog_identity}); build it anew"
+        )
+    return database
+
+
+def obtain_database(stars: StarCatalog, parameters: DatabaseParameters, *, cache: bool) -> FeatureDatabase:
+    """Map the database from the cache, or build it and, where the folder can be written, keep it there.
+
+    Parameters
+    ----------
+    stars, parameters
+        What to build.
+    cache
+        Use the cache folder.
+
+    Raises
+    ------
+    DatabaseError, StaridError
+        If the parameters make no grid or leave no star.
+    """
+    if not cache:
+        return build_database(stars, parameters)
+    text = repr((DATABASE_VERSION, stars.identity, dataclasses.astuple(parameters)))
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    path = cache_dir() / f"features-{key}.bin"
+    stored = _load(path)
+    if stored is not None:
+        return stored
+    database = build_database(stars, parameters)
+    try:
+        save_database(database, path)
+    except DatabaseError as error:
+        _log.warning("%s: built again each time", error)
+    return database
+
+
+def _load(path: Path) -> FeatureDatabase | None:
+    """Database of a cached file; None where there is none or, with a warning in the log, it cannot be used."""
+    try:
+        if not path.is_file():
+            return None
+        return load_database(path)
+    except (OSError, DatabaseError) as error:
+        _log.warning("cache file %s is not usable (%s): built anew", path, error)
+        return None
