@@ -82,15 +82,16 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
     -------
     dict of ndarray
         As built. The file is an uncompressed ``.npz``, whose checksums are verified on loading; a damaged
-        one is built anew. Where the folder cannot be written the arrays are only returned.
+        one, or one that cannot be read, is built anew. Where the folder cannot be written the arrays are
+        only returned.
     """
     path = cache_dir() / f"{name}.npz"
-    if path.is_file():
-        try:
+    try:
+        if path.is_file():  # which raises where the folder cannot be searched
             with np.load(path, allow_pickle=False) as stored:
                 return {key: stored[key] for key in stored.files}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            _log.warning("cache file %s is damaged (%s): built anew", path, error)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        _log.warning("cache file %s is not usable (%s): built anew", path, error)
     tables = build()
 
     def write(part: Path) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any, Final, Literal, Self, cast
 
 import numpy as np
@@ -81,23 +82,14 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            side = getattr(self, name)
-            if isinstance(side, bool) or not isinstance(side, int | np.integer) or not 1 <= side <= _MAX_SIDE:
-                raise StaridError(f"camera {name}: {side!r} given, a whole number 1…{_MAX_SIDE} needed")
-            object.__setattr__(self, name, int(side))
-        if self.model not in _MODEL_CODES:
-            raise StaridError(f"camera model: {self.model!r} given, one of {', '.join(_MODEL_CODES)} needed")
+            object.__setattr__(self, name, _side(name, getattr(self, name)))
+        _check_model(self.model)
         fx, fy = _numbers("focal_px", self.focal_px, 2)
         if not (fx > 0.0 and fy > 0.0):
             raise StaridError(f"camera focal_px: ({fx}, {fy}) given, two positive numbers of pixels needed")
         object.__setattr__(self, "focal_px", (fx, fy))
         object.__setattr__(self, "centre_px", _numbers("centre_px", self.centre_px, 2))
-        given = tuple(self.distortion)
-        if len(given) > _DISTORTION_TERMS:
-            raise StaridError(
-                f"camera distortion: {len(given)} terms given, at most k1, k2, p1, p2, k3 are known"
-            )
-        object.__setattr__(self, "distortion", _numbers("distortion", _padded(given), _DISTORTION_TERMS))
+        object.__setattr__(self, "distortion", _terms(self.distortion))
         _ = self.params
 
     @classmethod
@@ -120,20 +112,27 @@ class Camera:
             Pixels.
         model, distortion
             As in the class.
+
+        Raises
+        ------
+        StaridError
+            As the class.
         """
-        widest = _WIDEST_FOV_DEG.get(model, 360.0)
-        if not 0.0 < fov_deg <= widest:
+        width, height = _side("width", width), _side("height", height)
+        _check_model(model)
+        widest = _WIDEST_FOV_DEG[model]
+        if not _is_number(fov_deg) or not 0.0 < fov_deg <= widest:
             raise StaridError(
-                f"camera fov_deg: {fov_deg} given, degrees in (0, {widest:g}] needed for {model}"
+                f"camera fov_deg: {fov_deg!r} given, degrees in (0, {widest:g}] needed for {model}"
             )
         half = math.radians(fov_deg) / 2.0
         reach = math.tan(half) if model == "pinhole" else half
         centre = ((width - 1) / 2.0, (height - 1) / 2.0)
-        terms = cast("tuple[float, float, float, float, float]", tuple(distortion))
+        terms = _terms(distortion)
         if not any(terms):
             focal = width / 2.0 / reach
             return cls(width, height, (focal, focal), centre, model, terms)
-        k1, k2, _, _, k3 = _numbers("distortion", _padded(terms), _DISTORTION_TERMS)
+        k1, k2, _, _, k3 = terms
         s = reach * reach
         stretch = 1.0 + s * (k1 + s * (k2 + s * k3))
         if stretch <= 0.0:
@@ -289,20 +288,56 @@ def flat_view(camera: Camera, ra_deg: float, dec_deg: float) -> tuple[Camera, At
     return moved, Attitude.from_radec_roll(ra_deg, 0.0, 0.0)
 
 
+def _is_number(value: object) -> bool:
+    """Whether a value is a number, which text and truth values are not."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _side(name: str, side: Any) -> int:
+    """Return the side of a pixel array, or raise an error that names the field."""
+    if isinstance(side, bool) or not isinstance(side, int | np.integer) or not 1 <= side <= _MAX_SIDE:
+        raise StaridError(f"camera {name}: {side!r} given, a whole number 1…{_MAX_SIDE} needed")
+    return int(side)
+
+
+def _check_model(model: Any) -> None:
+    """Refuse what is not the name of a model."""
+    if not isinstance(model, str) or model not in _MODEL_CODES:
+        raise StaridError(f"camera model: {model!r} given, one of {', '.join(_MODEL_CODES)} needed")
+
+
+def _floats(values: Any) -> tuple[float, ...] | None:
+    """Values as floats; None where they are no sequence of finite numbers."""
+    if not isinstance(values, Iterable):
+        return None
+    items = tuple(values)
+    if not all(_is_number(item) for item in items):
+        return None
+    try:
+        floats = tuple(float(item) for item in items)
+    except OverflowError:  # a whole number with hundreds of digits
+        return None
+    return floats if all(math.isfinite(number) for number in floats) else None
+
+
 def _numbers(name: str, values: Any, count: int) -> tuple[float, ...]:
     """`count` finite floats, or an error that names the field."""
-    try:
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+    numbers = _floats(values)
+    if numbers is None or len(numbers) != count:
         raise StaridError(f"camera {name}: {values!r} given, {count} finite numbers needed")
     return numbers
 
 
-def _padded(terms: tuple[float, ...]) -> tuple[float, ...]:
+def _terms(values: Any) -> tuple[float, float, float, float, float]:
     """Distortion terms filled up with zeros."""
-    return (*terms, *(0.0,) * (_DISTORTION_TERMS - len(terms)))
+    terms = _floats(values)
+    if terms is None or len(terms) > _DISTORTION_TERMS:
+        raise StaridError(
+            f"camera distortion: {values!r} given, at most {_DISTORTION_TERMS} finite numbers, "
+            "k1, k2, p1, p2, k3, needed"
+        )
+    padded = (*terms, *(0.0,) * (_DISTORTION_TERMS - len(terms)))
+    return cast("tuple[float, float, float, float, float]", padded)
 
 
 def _fold_error(terms: Sequence[float]) -> StaridError:

@@ -70,15 +70,23 @@ def has_dark_tail(image: Counts) -> bool:
 
 
 def _coarser(image: Counts, factor: int, settings: DetectionSettings) -> Detections:
-    """Detections on the sums of blocks of pixels, as positions on the image itself."""
+    """Detections on the means of blocks of pixels, in the pixels and counts of the image itself.
+
+    The noise of a pixel is told from that of a block as if it were independent from pixel to pixel.
+    """
     height, width = (side // factor * factor for side in image.shape)
     blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor)
     mean = blocks.mean(axis=(1, 3), dtype=np.float64)
-    gain = 65535.0 / max(float(np.iinfo(image.dtype).max), 1.0)
-    found = detect(np.rint(mean * gain).astype(np.uint16), settings)
+    finer = 65535.0 / float(np.iinfo(image.dtype).max)
+    found = detect(np.rint(mean * finer).astype(np.uint16), settings)
     return dataclasses.replace(
         found,
         xy_px=found.xy_px * factor + 0.5 * (factor - 1),
+        flux=found.flux * (factor**2 / finer),
+        flux_sigma=found.flux_sigma * (factor**2 / finer),
         xy_sigma_px=found.xy_sigma_px * factor,
+        background=found.background / finer,
+        noise=found.noise * (factor / finer),
         psf_sigma_px=found.psf_sigma_px * factor,
+        trail_px=found.trail_px * factor,
     )

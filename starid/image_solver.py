@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import time
 from dataclasses import dataclass
 from typing import Final
@@ -19,6 +20,8 @@ from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.rough_search import ALL_ROUNDS, RoughSearch
 from starid.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
 from starid.solution import Reason, Solution
+
+_log = logging.getLogger(__name__)
 
 _FEW: Final = 8
 """Fewer matched stars leave the lens as it was taken to be."""
@@ -149,9 +152,7 @@ def polished(
     refined = solution.camera or camera
     if solution.star_count >= _FEW:
         stars = Stars(found.xy_px, found.flux, found.xy_sigma_px)
-        refined = calibrate_identified(
-            [stars], {0: solution}, camera, identifier.catalog, models=IMAGE_MODELS
-        ).calibration.camera
+        refined = _refined(stars, solution, refined, camera, identifier.catalog)
     again = identifier.with_camera(refined).track(
         found.xy_px, found.flux, solution.attitude, found.xy_sigma_px
     )
@@ -159,6 +160,16 @@ def polished(
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
     solution = dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
     return ImageSolution(solution, found, solution.camera or camera, identifier.stars, look.mirrored)
+
+
+def _refined(stars: Stars, solution: Solution, found: Camera, given: Camera, catalog: StarCatalog) -> Camera:
+    """Camera calibrated on an identified image, or as it was found where no calibration holds."""
+    try:
+        outcome = calibrate_identified([stars], {0: solution}, given, catalog, models=IMAGE_MODELS)
+    except StaridError as error:
+        _log.info("lens left as it was found: %s", error)
+        return found
+    return outcome.calibration.camera
 
 
 def flipped(xy: NDArray[np.float64], width: int) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ that the start camera had missed; and so on until nothing changes.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -188,7 +188,7 @@ def calibrate_identified(
         )
     start = solutions[indices[0]].camera or camera
     seen = blend(sky.brighter_than(faintest + _FAINTER), _BLEND_PX * camera.pixel_scale_rad)
-    result = calibrate(matched, start, _enough(matched, ("focal", "k1")))
+    _, result = next(_calibrations(matched, start, (_enough(matched, ("focal", "k1")), ("focal",))))
     matches: tuple[NDArray[np.int64], ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
@@ -257,24 +257,52 @@ def _enough(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple
 def _best(
     frames: list[CalibrationFrame], camera: Camera, candidates: Sequence[tuple[str, ...]]
 ) -> Calibration:
-    """Calibrate with each model and keep that with the least Bayesian information criterion."""
+    """Calibrate with each model and keep that with the least Bayesian information criterion.
+
+    Models that `calibrate` refuses are passed over; its refusal of the last is raised only if none is left.
+    """
     models = [model for model in candidates if _enough(frames, model) == model] or [("focal",)]
-    results = [calibrate(frames, camera, model) for model in models]
+    tried = list(_calibrations(frames, camera, models))
     equations = 2 * sum(len(frame.xy_px) for frame in frames)
-    noise = results[-1].sigma_px
+    variance = _variance_factor(tried[-1][1], frames)
     costs = [
-        _misfit(result, frames, noise) + _unknowns(model, frames) * np.log(equations)
-        for model, result in zip(models, results, strict=True)
+        _misfit(result, frames, variance) + _unknowns(model, frames) * np.log(equations)
+        for model, result in tried
     ]
-    return results[int(np.argmin(costs))]
+    return tried[int(np.argmin(costs))][1]
 
 
-def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], noise: float) -> float:
-    """Sum of squared residuals in units of the noise, each star's share bounded."""
+def _calibrations(
+    frames: Sequence[CalibrationFrame], camera: Camera, models: Sequence[tuple[str, ...]]
+) -> Iterator[tuple[tuple[str, ...], Calibration]]:
+    """Calibrate with one model after the other, and give those that hold; at least one, or the last refusal."""
+    refusal: StaridError | None = None
+    held = 0
+    for model in models:
+        try:
+            result = calibrate(frames, camera, model)
+        except StaridError as error:
+            refusal = error
+            continue
+        held += 1
+        yield model, result
+    if refusal is not None and held == 0:
+        raise refusal
+
+
+def _variance_factor(result: Calibration, frames: Sequence[CalibrationFrame]) -> float:
+    """Mean square of the residuals of the used stars on one axis, in units of the stars' variances."""
+    weights = [
+        frame.axis_sigmas[used].ravel() ** -2.0 for frame, used in zip(frames, result.used, strict=True)
+    ]
+    return result.sigma_px**2 * float(np.concatenate(weights).mean())
+
+
+def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], variance: float) -> float:
+    """Sum of squared residuals in units of `variance` times the stars' own variances, each star's share bounded."""
     total = 0.0
     for residual, frame in zip(result.residual_px, frames, strict=True):
-        sigma = frame.axis_sigmas
-        squares = ((residual / sigma) ** 2).sum(axis=1) / (noise**2 * np.mean(sigma**-2.0))
+        squares = ((residual / frame.axis_sigmas) ** 2).sum(axis=1) / variance
         total += float(np.minimum(squares, _WINDOW_SIGMAS**2).sum())
     return total
 

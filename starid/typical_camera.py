@@ -21,7 +21,8 @@ WIDEST_SR: Final = 1.5
 def typical_camera(camera: Camera) -> Camera | None:
     """Camera with a square image of a rounded size whose index suits a camera; None for the widest fields.
 
-    Its pixels are no finer than the camera's, so that the index has room for the camera's matching windows.
+    Its pixels are no finer than the camera's, so that the index has room for the camera's matching windows;
+    only for images smaller than about 590 pixels they are finer, and such windows are cut to the index's.
     """
     area = field_solid_angle(camera)
     if not area < WIDEST_SR:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from starid.errors import StaridError
 
 Array = NDArray[np.float64]
+
+FARTHEST_PX: Final = 1e9
+"""Farther out than this there is no image, and squares of positions overflow in the end."""
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:
@@ -23,7 +27,8 @@ def _numbers(values: ArrayLike, name: str) -> Array:
 def _all_finite(array: Array) -> bool:
     """Whether no value is infinite or NaN; fast where the sum of the squares does not overflow."""
     flat = array.ravel()
-    return math.isfinite(float(flat @ flat)) or bool(np.isfinite(flat).all())
+    with np.errstate(over="ignore"):
+        return math.isfinite(float(flat @ flat)) or bool(np.isfinite(flat).all())
 
 
 def checked_detections(
@@ -39,7 +44,8 @@ def checked_detections(
     Raises
     ------
     StaridError
-        The arrays do not fit each other, or hold what is not a finite number.
+        The arrays do not fit each other, hold what is not a finite number, or a position beyond
+        `FARTHEST_PX`.
     """
     xy, brightness = _numbers(xy_px, "positions"), _numbers(flux, "flux")
     if xy.shape == (0,):
@@ -50,6 +56,8 @@ def checked_detections(
         )
     if not (_all_finite(xy) and _all_finite(brightness)):
         raise StaridError("detections: positions and flux must be finite numbers")
+    if xy.size and float(np.abs(xy).max()) > FARTHEST_PX:
+        raise StaridError(f"detections: every position must lie within ±{FARTHEST_PX:g} pixels")
     sigmas = np.ones(xy.shape)
     if xy_sigma_px is not None:
         given = _numbers(xy_sigma_px, "position errors")

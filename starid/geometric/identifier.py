@@ -39,7 +39,6 @@ from starid.geometric.settings import (
     LOG_CHANCE_TRACKING,
     MAGNITUDE_GATE,
     MAX_TRIANGLES,
-    NOISY,
     PART_STARS,
     PX_PER_RAD,
     SCALE_TOLERANCE,
@@ -63,8 +62,6 @@ _QUICK_TRIANGLES: Final = 60
 
 _SCALE_ERROR: Final = 0.012
 """Difference of scale across the field that the look-up of triangles bears."""
-
-_REASONS: Final = {TOO_FEW: Reason.TOO_FEW_STARS, NOISY: Reason.RESIDUAL}
 
 
 @dataclass(frozen=True)
@@ -172,23 +169,28 @@ class Identifier:
             raise StaridError(
                 f"identifier fov_tolerance: {fov_tolerance} given, 0…{WIDEST_TOLERANCE:g} needed"
             )
-        self._camera = camera
         self._catalog = load_catalog() if catalog is None else catalog
-        self._effort = effort or Effort()
+        if len(self._catalog) == 0:
+            raise StaridError("identifier catalog: it holds no star")
+        effort = effort or Effort()
         typical = camera if index_camera is None else index_camera
         if limiting_magnitude is None:
             limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(typical))
-        settings = index_settings(
-            typical, self._catalog, limiting_magnitude, blend_px, self._effort.window_px
-        )
+        settings = index_settings(typical, self._catalog, limiting_magnitude, blend_px, effort.window_px)
         self._stars = seen_stars(self._catalog, limiting_magnitude, settings.blend_rad)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
         self._index = obtain_index(self._stars, settings, cache)
+        self._set_camera(camera, fov_tolerance, effort)
+
+    def _set_camera(self, camera: Camera, fov_tolerance: float, effort: Effort) -> None:
+        """Set what depends on the camera and on the bounds of the search."""
+        self._camera = camera
+        self._fov_tolerance = fov_tolerance
+        self._effort = effort
         self._px_per_rad = pixels_per_radian(camera)
-        self._numbers = self._effort.numbers(camera, self._px_per_rad)
+        self._numbers = effort.numbers(camera, self._px_per_rad)
         self._numbers_with_errors = self._numbers.copy()
         self._numbers_with_errors[SIGMAS_KNOWN] = 1.0
-        self._fov_tolerance = fov_tolerance
 
     @property
     def camera(self) -> Camera:
@@ -379,19 +381,14 @@ class Identifier:
             )
         other = object.__new__(Identifier)
         other.__dict__.update(self.__dict__)
-        other._camera = camera
-        other._fov_tolerance = fov_tolerance
-        other._effort = effort or self._effort
-        other._px_per_rad = pixels_per_radian(camera)
-        other._numbers = other._effort.numbers(camera, other._px_per_rad)
-        other._numbers_with_errors = other._numbers.copy()
-        other._numbers_with_errors[SIGMAS_KNOWN] = 1.0
+        other._set_camera(camera, fov_tolerance, effort or self._effort)
         return other
 
     def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
         if answer.status != ACCEPTED:
-            lost = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST
-            reason = _REASONS.get(answer.status, lost)
+            reason = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST
+            if answer.status == TOO_FEW:
+                reason = Reason.TOO_FEW_STARS
             return Solution.invalid(reason, mode=mode, elapsed=time.perf_counter() - begin)
         rms, sigma, log_false, _, _, _ = answer.numbers.tolist()
         return Solution(

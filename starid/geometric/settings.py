@@ -35,5 +35,4 @@ SETTING_COUNT: Final = 13
 NOTHING: Final = 0
 ACCEPTED: Final = 1
 TOO_FEW: Final = 2
-NOISY: Final = 3
 """Status of an answer."""

@@ -109,29 +109,6 @@ def _smooth_along(
             out[x] += tap * (left[x] + right[x])
 
 
-def smooth_image(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], taps: npt.NDArray[np.float32]
-) -> npt.NDArray[np.float32]:
-    """Smooth a whole image (h, w) with the filter of `spot_taps`; beyond its edges it goes on with its last pixels."""
-    out = np.empty(image.shape, dtype=np.float32)
-    _smooth_all(image, taps, out)
-    return out
-
-
-@compiled_loops
-def _smooth_all(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    taps: npt.NDArray[np.float32],
-    out: npt.NDArray[np.float32],
-) -> None:
-    """Smooth every row of an image."""
-    reach = taps.size - 1
-    padded = np.empty(image.shape[1] + 2 * reach, np.float32)
-    for y in range(image.shape[0]):
-        _smooth_down(image, y, taps, padded[reach : reach + image.shape[1]])
-        _smooth_along(padded, taps, out[y])
-
-
 @compiled_loops
 def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
     """Values of row i of a grid of blocks at every image column."""

@@ -187,17 +187,12 @@ def shape_from_moments(
     still = np.zeros(FLOW_TERMS)
     if len(table) < _LEAST_FOR_SPOT:
         return SpotShape(known_sigma_px or assumed_sigma_px, still, 0.0, 0)
-    c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
-    mean, split = 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
+    mean, split = _mean_and_split(table)
     across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else median(mean - split)
     across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
     # a short trail of length L makes the split L²/24
     if math.sqrt(24.0 * median(split)) > _ROUND_BELOW_PX:
-        length = trail_length(mean + split, across)
-        angle = 0.5 * np.arctan2(2.0 * c_xy, c_xx - c_yy)
-        trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        half = 0.5 * max(width, height)
-        places = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / half
+        places, trails, length = _trails(table, width, height, across)
         flow = np.zeros(FLOW_TERMS)
         fit_flow(places, trails, flow)
         typical, off = typical_trail(flow, places, trails)
@@ -208,9 +203,8 @@ def shape_from_moments(
 
 def long_trails(table: Array, sigma_px: float) -> npt.NDArray[np.bool_]:
     """Which stars (n,) of a table of moments are so long that noise or a close neighbour hardly explains it."""
-    split = np.hypot(0.5 * (table[:, 2] - table[:, 4]), table[:, 3])
-    along = 0.5 * (table[:, 2] + table[:, 4]) + split
-    return np.asarray(trail_length(along, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
+    mean, split = _mean_and_split(table)
+    return np.asarray(trail_length(mean + split, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
 
 
 def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) -> SpotShape:
@@ -229,14 +223,26 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
     if len(longest) < _LEAST_LONG:
         return shape
     found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
-    seen = np.hypot(0.5 * (longest[:, 2] - longest[:, 4]), longest[:, 3])
-    length = trail_length(0.5 * (longest[:, 2] + longest[:, 4]) + seen, shape.sigma_px**2 + _PIXEL_VARIANCE)
-    angle = 0.5 * np.arctan2(2.0 * longest[:, 3], longest[:, 2] - longest[:, 4])
-    trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    places = (longest[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / (0.5 * max(width, height))
+    places, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
     off = np.array([mismatch(found.flow, places, trails, k)[0] for k in range(len(places))])
     agree = np.count_nonzero(off < _AGREES * length)
     return found if found.trail_px > 0.0 and agree >= max(_LEAST_LONG, _MOST_AGREE * len(longest)) else shape
+
+
+def _mean_and_split(table: Array) -> tuple[Array, Array]:
+    """Mean (n,) of the variances along and across each star of a table of moments, and half their difference (n,)."""
+    c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
+    return 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
+
+
+def _trails(table: Array, width: int, height: int, across: float) -> tuple[Array, Array, Array]:
+    """Places (n, 2) as `fit_flow` takes them, trails (n, 2) and their lengths (n,), for a variance across them."""
+    mean, split = _mean_and_split(table)
+    length = trail_length(mean + split, across)
+    angle = 0.5 * np.arctan2(2.0 * table[:, 3], table[:, 2] - table[:, 4])
+    trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    places = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / (0.5 * max(width, height))
+    return places, trails, length
 
 
 def _sigma(variance: float, known: float | None) -> float:

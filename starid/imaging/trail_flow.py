@@ -33,6 +33,13 @@ _SINGULAR: Final = 1e-12
 
 
 @compiled_loops
+def _drawn(flow: Array, u: float, v: float) -> tuple[float, float]:
+    """Trail of a flow at a place."""
+    inward = flow[3] * u + flow[4] * v
+    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
+
+
+@compiled_loops
 def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
     """Trail (dx, dy) in pixels at an image position, up to its sense.
 
@@ -46,10 +53,7 @@ def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[
         Size of the image.
     """
     half = 0.5 * max(width, height)
-    u = (x - 0.5 * (width - 1)) / half
-    v = (y - 0.5 * (height - 1)) / half
-    inward = flow[3] * u + flow[4] * v
-    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
+    return _drawn(flow, (x - 0.5 * (width - 1)) / half, (y - 0.5 * (height - 1)) / half)
 
 
 @compiled_loops
@@ -57,13 +61,6 @@ def _rows(u: float, v: float, rows: Array) -> None:
     """Factors (2, 5) of a flow in dx and in dy at a place."""
     rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3], rows[0, 4] = 1.0, 0.0, -v, u * u, u * v
     rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3], rows[1, 4] = 0.0, 1.0, u, u * v, v * v
-
-
-@compiled_loops
-def _drawn(flow: Array, u: float, v: float) -> tuple[float, float]:
-    """Trail of a flow at a place."""
-    inward = flow[3] * u + flow[4] * v
-    return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
 
 
 @compiled_loops

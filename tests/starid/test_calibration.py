@@ -16,7 +16,7 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.camera_file import load_camera, save_camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.self_calibration import Stars, self_calibrate
+from starid.self_calibration import IMAGE_MODELS, Stars, _best, self_calibrate
 from starid.wahba import solve_wahba
 
 WIDE = Camera(937, 937, (1230.0, 1226.0), (474.0, 463.0), "pinhole", (-0.06, 0.03, 8e-4, -5e-4, 0.0))
@@ -195,6 +195,40 @@ def test_bad_calibrations_are_refused(sky: StarCatalog) -> None:
         calibrate([behind], WIDE)
 
 
+def test_a_frame_of_false_matches_among_good_ones_is_named(sky: StarCatalog) -> None:
+    frames, truths = simulated(sky, WIDE, 3, 12)
+    order = np.random.default_rng(1).permutation(len(frames[1].xy_px))
+    frames[1] = CalibrationFrame(frames[1].xy_px[order], frames[1].reference, attitude=truths[1])
+    with pytest.raises(StaridError, match=r"frame 2 of 3: . of \d+ matched stars fit .* leave it out"):
+        calibrate(frames, WIDE)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_precise_frame_counts_in_the_choice_of_the_model(sky: StarCatalog, seed: int) -> None:
+    """A distortion that only one of six frames shows: it does so clearly, and the others have nothing against it."""
+    bent = dataclasses.replace(DEFAULT_CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0, 0.0))
+    frames = []
+    for sigma, count in ((0.05, 1), (1.0, 5)):
+        seen, _ = simulated(sky, bent, count, seed + 100 * (count > 1), sigma=sigma)
+        frames += [dataclasses.replace(f, sigma_px=np.full(len(f.xy_px), sigma)) for f in seen]
+    assert _best(frames, DEFAULT_CAMERA, IMAGE_MODELS).estimated == ("focal", "k1")
+
+
+def test_a_model_that_folds_the_image_leaves_the_choice_to_the_others(sky: StarCatalog) -> None:
+    camera = Camera.from_fov(90.0)
+    (frame,), _ = simulated(sky, camera, 1, 31, sigma=0.5)
+    off = frame.xy_px - camera.centre_px
+    radius = np.linalg.norm(off, axis=1)
+    barrel = 1.0 - 0.4 * (radius / camera.focal_px[0]) ** 2  # which would turn back within the image
+    central = radius < 150.0
+    middle = CalibrationFrame((camera.centre_px + off * barrel[:, None])[central], frame.reference[central])
+    with pytest.raises(StaridError, match="folds"):
+        calibrate([middle], camera, ("focal", "k1"))
+    assert _best([middle], camera, (("focal",), ("focal", "k1"))).estimated == ("focal",)
+    with pytest.raises(StaridError, match="folds"):
+        _best([middle], camera, (("focal", "k1"),))
+
+
 @pytest.mark.parametrize(
     ("xy", "reference", "sigma", "words"),
     [
@@ -238,6 +272,14 @@ def test_profile_brings_the_camera_back_exactly(tmp_path: Path, calibration: Cal
         ("[camera]\nwidth = 5\nheight = 5\nfov_deg = 9\ncolour = 1", "unknown key 'colour'"),
         ("[camera]\nwidth = 0\nheight = 5\nfov_deg = 9", "width"),
         ("[camera]\nheight = 5\nfocal_px = [1, 1]\ncentre_px = [1, 1]", "'width' missing"),
+        ('[camera]\nfov_deg = "42"', r"camera fov_deg: '42' given, degrees in \(0, 170\] needed"),
+        ('[camera]\nfov_deg = 42\nwidth = "937"', "camera width: '937' given, a whole number"),
+        ("[camera]\nfov_deg = 42\nheight = [937]", r"camera height: \[937\] given, a whole number"),
+        (
+            "[camera]\nfov_deg = 42\ndistortion = 0.1",
+            "camera distortion: 0.1 given, at most 5 finite numbers",
+        ),
+        ('[camera]\nfov_deg = 42\nmodel = ["pinhole"]', r"camera model: \['pinhole'\] given, one of pinhole"),
     ],
 )
 def test_bad_profiles_are_named(tmp_path: Path, text: str, words: str) -> None:

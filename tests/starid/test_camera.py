@@ -246,6 +246,14 @@ def test_from_dict_takes_a_field_of_view() -> None:
         ({"focal_px": (1.0,)}, "focal_px"),
         ({"centre_px": (math.nan, 1.0)}, "centre_px"),
         ({"centre_px": "ab"}, "centre_px"),
+        ({"centre_px": "12"}, "centre_px"),
+        ({"focal_px": 1000.0}, "focal_px"),
+        ({"focal_px": (True, True)}, "focal_px"),
+        ({"focal_px": (10**400, 1)}, "focal_px"),
+        ({"width": "937"}, "width"),
+        ({"model": ["pinhole"]}, "model"),
+        ({"distortion": 0.1}, "distortion"),
+        ({"distortion": ("a",)}, "distortion"),
         ({"model": "fisheye"}, "model"),
         ({"distortion": (1,) * 6}, "distortion"),
         ({"distortion": (math.inf,)}, "distortion"),
@@ -260,10 +268,19 @@ def test_bad_cameras_are_refused_by_name(values: dict[str, object], words: str) 
         Camera.from_dict({**DEFAULT_CAMERA.to_dict(), **values})
 
 
-@pytest.mark.parametrize("fov", [0.0, -1.0, 170.1, math.nan])
+@pytest.mark.parametrize("fov", [0.0, -1.0, 170.1, math.nan, "42", None, True, [42.0]])
 def test_bad_fields_of_view_are_refused(fov: float) -> None:
     with pytest.raises(StaridError, match="fov_deg"):
         Camera.from_fov(fov)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"width": "937"}, {"height": 0}, {"model": ["pinhole"]}, {"model": "fisheye"}, {"distortion": 0.1}],
+)
+def test_other_values_beside_a_field_of_view_are_refused_by_name(values: dict[str, object]) -> None:
+    with pytest.raises(StaridError, match=f"camera {next(iter(values))}"):
+        Camera.from_dict({"fov_deg": 42.0, **values})
 
 
 def test_missing_key_is_named() -> None:

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from starid import field_sweep
+from starid import field_sweep, image_solver
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
+from starid.errors import StaridError
 from starid.field_sweep import solve_any_field
 from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.image_looks import Look, has_dark_tail, looks
@@ -61,6 +63,17 @@ def test_a_negative_and_a_mirrored_photograph_are_seen_for_what_they_are(sky) ->
     assert centre_error_arcsec(mirror, truth, camera) < CENTRE_ARCSEC
     on_image = mirror.on_image(mirror.detections.xy_px)
     np.testing.assert_allclose(on_image[:, 0], WIDTH - 1 - mirror.detections.xy_px[:, 0])
+
+
+def test_a_lens_that_cannot_be_calibrated_leaves_the_answer(sky, monkeypatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise StaridError("calibration: folds the image")
+
+    image, truth, camera = photograph(sky, 1)
+    monkeypatch.setattr(image_solver, "calibrate_identified", refuse)
+    found = solve_image(image, TOLD, sky, fov_tolerance=0.1)
+    assert found.solution.valid
+    assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
 
 
 def test_stars_strewn_at_random_are_no_sky(sky) -> None:
@@ -130,6 +143,24 @@ def test_a_negative_is_known_by_its_dark_tail(sky) -> None:
     ways = list(looks(image))
     assert isinstance(ways[0], Look)
     assert [look.mirrored for look in ways] == [False] * (len(ways) - 1) + [True]
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_coarser_look_tells_what_the_plain_one_tells(sky, bits) -> None:
+    image, _, _ = photograph(sky, 12, trail_px=12.0)
+    if bits == 16:
+        image = image.astype(np.uint16) * 100
+    plain, coarse = (look.detections for look in list(looks(image))[:2])
+    distance, twin = cKDTree(coarse.xy_px).query(plain.xy_px)
+    bright = (distance < 1.0) & (plain.flux > 20.0 * plain.flux_sigma)
+    assert np.count_nonzero(bright) > 20
+    ratio = coarse.flux[twin[bright]] / plain.flux[bright]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
+    errors = coarse.flux_sigma[twin[bright]] / plain.flux_sigma[bright]
+    assert np.median(errors) == pytest.approx(1.0, abs=0.3)
+    assert coarse.background == pytest.approx(plain.background, rel=0.01)
+    assert coarse.noise == pytest.approx(plain.noise, rel=0.2)
+    assert coarse.trail_px == pytest.approx(plain.trail_px, rel=0.1)
 
 
 def test_pattern_stars_are_those_of_the_plain_rule() -> None:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from starid.attitude import Attitude
-from starid.camera import Camera
+from starid.camera import Camera, Model
+from starid.catalog import load_catalog
 from starid.errors import StaridError
+from starid.geometric.given import FARTHEST_PX
 from starid.geometric.identifier import Effort, Identifier
 from starid.solution import Reason, Solution
 from tests.starid.geometric.sky_points import identifier, sky
@@ -23,6 +25,8 @@ NAN, INF = math.nan, math.inf
     [
         ([[NAN, 1.0]], [1.0], None, "finite"),
         ([[1.0, INF]], [1.0], None, "finite"),
+        ([[1.0, 1e200]], [1.0], None, "within ±1e\\+09 pixels"),
+        ([[-1.1e9, 1.0]], [1.0], None, "within ±1e\\+09 pixels"),
         ([[1.0, 1.0]], [NAN], None, "finite"),
         ([[1.0, 1.0]], [INF], None, "finite"),
         ([[1.0, 1.0]], [1.0, 2.0], None, r"\(1, 2\) and flux \(2,\)"),
@@ -123,6 +127,24 @@ def test_a_tolerance_of_the_field_must_be_in_range(tolerance: float) -> None:
 def test_an_effort_out_of_range_is_named(change: dict[str, float]) -> None:
     with pytest.raises(StaridError, match=next(iter(change))):
         Effort(**change)
+
+
+@pytest.mark.parametrize("limit", [None, 6.0])
+def test_a_catalogue_without_a_star_is_refused(limit: float | None) -> None:
+    with pytest.raises(StaridError, match="identifier catalog: it holds no star"):
+        Identifier(catalog=load_catalog().brighter_than(-5.0), limiting_magnitude=limit, cache=False)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "equidistant", "flat"])
+def test_a_position_far_outside_the_image_is_only_a_false_star(model: Model) -> None:
+    camera = Camera.from_fov(42.0, model=model)
+    stars = load_catalog().brighter_than(5.5)
+    xy, inside = camera.project(AT.to_sensor(stars.vectors))
+    xy = xy[inside]
+    xy[0, 0] = -FARTHEST_PX
+    solution = Identifier(camera, limiting_magnitude=6.0).identify(xy, 10.0 ** (-0.4 * stars.v[inside]))
+    assert solution.valid
+    assert 0 not in solution.detection_index
 
 
 def test_a_camera_of_another_size_is_refused() -> None:
