@@ -19,7 +19,7 @@ given, comes back in the answer. An answer has `ok`; where that is false, `error
 
 Faults: `optical` = fields of `emulator.imaging.sky_objects.SkyObjects` (false_stars, missing_stars, moon, …) or blocked_share; `device` = stuck (requests are
 neither taken nor answered), error (a name of the enumeration `device_error`: enter the error mode), reset (a name of `reset_cause`:
-restart now); `serial` and `can` = drop, corrupt, junk (chances 0 … 1), delay_s, split (bytes a piece, serial only), gap_s.
+restart now); `serial` and `can` (CANopen too) = drop, corrupt, junk (chances 0 … 1), delay_s, split (bytes a piece, serial only), gap_s.
 """
 
 from __future__ import annotations
@@ -99,9 +99,10 @@ class ControlServer:
             raise EmulatorError(f"--control {where}: must be off, auto or HOST:PORT")
         try:
             self._server = await asyncio.start_server(self._serve, host, int(port), limit=MAX_LINE)
-        except OSError as error:
+        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+            reason = error.strerror if isinstance(error, OSError) else None
             raise EmulatorError(
-                f"control channel {where}: cannot listen ({error.strerror or error}); choose another port, or auto"
+                f"control channel {where}: cannot listen ({reason or error}); choose another port, or auto"
             ) from None
         address = self._server.sockets[0].getsockname()
         return f"{address[0]}:{address[1]}"
@@ -116,12 +117,17 @@ class ControlServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         try:
-            while line := await reader.readline():
+            while True:
+                try:
+                    line = await reader.readline()
+                except ValueError:
+                    writer.write(b'{"ok": false, "error": "line too long"}\n')
+                    break
+                if not line:
+                    break
                 if line.strip():
                     writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
                     await writer.drain()
-        except ValueError:
-            writer.write(b'{"ok": false, "error": "line too long"}\n')
         except ConnectionError as error:
             log.info("control channel: peer gone (%s)", error)
         finally:
@@ -144,6 +150,10 @@ class ControlServer:
             return {**identity, "ok": True, **await action(request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {**identity, "ok": False, "error": str(error)}
+        except Exception as error:  # a fault of ours shall not end the run, nor the peer's connection
+            log.exception("control channel: %.200r", line)
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            return {**identity, "ok": False, "error": f"internal error: {text}; see the emulator's log"}
 
     async def _status(self, request: dict[str, Any]) -> Answer:
         _only(request)

@@ -99,6 +99,8 @@ class Emulation:
         self.can: CanLink | None = None
         self.canopen: CanopenLink | None = None
         self.feed: LiveFeed | None = None
+        self._feed_wanted = ""
+        """Where the feed was to listen, in the profile's words."""
         self.warm: Warm | None = None
         self.ready_words: dict[str, str] = {}
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
@@ -206,20 +208,30 @@ class Emulation:
         Raises
         ------
         EmulatorError
-            A file is bad or a port is busy; the source before it stays.
+            A file is bad or a port cannot be had; the source before it stays.
         """
         truth = config.build(self.clock.now_ns() / 1e9, self.profile.folder)
         feed: LiveFeed | None = None
         if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
-            same = self.feed is not None and config.port != 0
-            if same and self.feed is not None:
-                self.feed.close()
-            self.ready_words["truth"] = await feed.start(config.protocol, config.host, config.port)
-        if self.feed is not None:
-            self.feed.close()
+            wanted = f"{config.protocol}:{config.host}:{config.port}"
+            if config.port != 0 and wanted in (self.ready_words.get("truth"), self._feed_wanted):
+                self._close_feed()  # the same port: it has to be free first
+                await asyncio.sleep(0)  # … and is so when the loop has come around
+            where = await feed.start(config.protocol, config.host, config.port)
+            self._close_feed()
+            self.ready_words["truth"], self._feed_wanted = where, wanted
+        else:
+            self._close_feed()
         self.feed = feed
         return truth
+
+    def _close_feed(self) -> None:
+        if self.feed is not None:
+            self.feed.close()
+            self.feed = None
+        self._feed_wanted = ""
+        self.ready_words.pop("truth", None)
 
     async def _open_links(self, device: Device) -> None:
         links, seed = self.profile.links, self.profile.run.seed
@@ -257,18 +269,21 @@ class Emulation:
 
     async def _warm_up(self) -> None:
         """Wait for the pipeline, then wait for boot to end; start the pipeline anew when it ends by itself."""
+        device = self.device
         try:
             self.warm = await self.imager.start()
+            log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
+            self.imager.on_failure = self._pipeline_failed
+            device.on_mode.append(
+                lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
+            )
+            device.pipeline_ready(camera_constants(self.warm))
         except EmulatorError as error:
-            self.device.start_refused()
+            device.start_refused()
             raise EmulatorError(f"profile {self.profile.source}: {error}") from None
-        log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
-        self.imager.on_failure = self._pipeline_failed
-        device = self.device
-        device.on_mode.append(
-            lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
-        )
-        device.pipeline_ready(camera_constants(self.warm))
+        except ProtocolError as error:  # a constant of the camera is beyond what its parameter can be
+            device.start_refused()
+            raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
 
@@ -285,7 +300,7 @@ class Emulation:
         try:
             warm = await self.imager.restart()
         except EmulatorError as error:
-            log.warning("%s; commands other than standby stay refused", error)
+            log.warning("%s; no mode can be commanded any more: start the emulator anew", error)
             return
         self.device.pipeline_ready(camera_constants(warm))
 
@@ -319,7 +334,7 @@ class Emulation:
         for task in (self._warming, self._reviving):
             if task is not None:
                 task.cancel()
-                with contextlib.suppress(asyncio.CancelledError, EmulatorError):
+                with contextlib.suppress(asyncio.CancelledError, EmulatorError, ProtocolError):
                     await task
         for link in (self.serial, self.canopen, self.can):  # the bus may be a hub that the CAN link holds
             if link is not None:

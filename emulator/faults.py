@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator, Field
 
 from emulator.errors import EmulatorError
 from emulator.imaging.sky_objects import SkyObjects
-from emulator.links.wire_faults import WireFaultSettings
+from emulator.links.wire_faults import WireFaults, WireFaultSettings
 from emulator.truth.config import Strict
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class FaultRequest(Strict):
     device: DeviceFault | None = None
     serial: WireFault | None = None
     can: WireFault | None = None
+    """What the device sends on the CAN bus, CANopen's frames too."""
 
 
 class Faults:
@@ -93,10 +95,11 @@ class Faults:
         if request.optical is not None:
             self._optical = dict(request.optical)
             device.cycle.faults = lambda _index: self._optical
-        if request.serial is not None and self._emulation.serial is not None:
-            self._emulation.serial.wire.settings = request.serial.settings()
-        if request.can is not None and self._emulation.can is not None:
-            self._emulation.can.wire.settings = request.can.settings()
+        faults = {"serial": request.serial, "can": request.can}
+        for name, wire in self._wires():
+            fault = faults[name]
+            if fault is not None:
+                wire.settings = fault.settings()
         if request.device is not None:
             device.deaf = request.device.stuck
             if request.device.reset is not None:
@@ -113,12 +116,17 @@ class Faults:
             ):
                 if name is not None and name not in enum.values:
                     raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(enum.values)}")
-        for name, fault, link in (
-            ("serial", request.serial, self._emulation.serial),
-            ("can", request.can, self._emulation.can),
-        ):
-            if fault is not None and link is None:
+        there = {name for name, _ in self._wires()}
+        for name, fault in (("serial", request.serial), ("can", request.can)):
+            if fault is not None and name not in there:
                 raise EmulatorError(f"{name}: this run has no such link")
+
+    def _wires(self) -> Iterator[tuple[str, WireFaults[Any]]]:
+        """Each wire of the run under the name of its faults: both users of the CAN bus have the same."""
+        emulation = self._emulation
+        for name, link in (("serial", emulation.serial), ("can", emulation.can), ("can", emulation.canopen)):
+            if link is not None:
+                yield name, link.wire
 
     def clear(self) -> None:
         """Set everything right; the error mode is left by telecommand."""
@@ -126,9 +134,8 @@ class Faults:
         device = self._emulation.device
         device.cycle.faults = lambda _index: {}
         device.deaf = False
-        for link in (self._emulation.serial, self._emulation.can):
-            if link is not None:
-                link.wire.settings = WireFaultSettings()
+        for _, wire in self._wires():
+            wire.settings = WireFaultSettings()
 
     def describe(self) -> dict[str, Any]:
         """Return what is wrong, by level."""
@@ -137,7 +144,7 @@ class Faults:
             found["optical"] = dict(self._optical)
         if self._emulation.device.deaf:
             found["device"] = {"stuck": True}
-        for name, link in (("serial", self._emulation.serial), ("can", self._emulation.can)):
-            if link is not None and not link.wire.settings.none:
-                found[name] = vars(link.wire.settings)
+        for name, wire in self._wires():
+            if not wire.settings.none:
+                found[name] = vars(wire.settings)
         return found

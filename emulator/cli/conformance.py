@@ -68,6 +68,7 @@ def command(
     from hil_tests.conformance.conformance_run import ConformanceRequest, all_cases, run_conformance
     from hil_tests.conformance.link_probe import ProbeTimes
     from hil_tests.errors import BenchError
+    from hil_tests.results import prepare_report
     from protocol.icd import load_icd
 
     if dialect not in ("a", "b", "c"):
@@ -100,6 +101,9 @@ def command(
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
         return
+    for path in (junit, html):
+        if path is not None:
+            prepare_report(path)
     outcomes = run_conformance(
         request, lambda outcome: report.print_outcome(console, outcome, verbose=verbose)
     )
@@ -109,13 +113,10 @@ def command(
         canopen and f"CANopen node {canopen}",
     )
     unit = ", ".join(word for word in words if word) + (", emulator started for this run" if start else "")
-    try:
-        if junit is not None:
-            report.write_junit_report(junit, outcomes)
-        if html is not None:
-            report.write_html_report(html, outcomes, unit)
-    except OSError as error:
-        raise BenchError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    if junit is not None:
+        report.write_junit_report(junit, outcomes)
+    if html is not None:
+        report.write_html_report(html, outcomes, unit)
     if as_json:
         json.dump(report.to_json(outcomes, unit), sys.stdout)
         print()

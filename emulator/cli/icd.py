@@ -51,6 +51,8 @@ def _write(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     from emulator.errors import EmulatorError
 
+    if path.is_dir():
+        raise EmulatorError(f"{path}: is a folder; name a file with -o")
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         fresh.write_text(text, encoding="utf-8")

@@ -141,6 +141,8 @@ class Device:
         self._boot_over: Event | None = None
         self._unsolicited: Event | None = None
         self._stored_parameters: dict[str, object] = {}
+        self._saving = 0
+        """Saves under way: until they are done, the store is behind what the device knows."""
         self.parameters.observe(self._parameters_changed)
         missing = missing_handlers(icd)
         if missing:
@@ -166,24 +168,24 @@ class Device:
             observer()
 
     def _start(self, cause: str) -> None:
-        state = self.store.load()
+        state = self._content() if self._saving else self.store.load()
         count, stored = state.get("boot_count"), state.get("parameters")
         self.boot_count = ((count if isinstance(count, int) else 0) + 1) & 0xFFFF
         self.reset_cause = cause
-        self._stored_parameters = stored if isinstance(stored, dict) else {}
+        self._stored_parameters = dict(stored) if isinstance(stored, dict) else {}
         self.cycle.reset()
         self.images.clear()
         self.files.clear()
         self.counters.clear()
         self.acknowledge = Acknowledge()
         self.latest = None
-        self.mode_changes = self.frames_valid = 0
+        self.selected_parameter = next(iter(self.icd.parameters_by_id))
         self.started_ns = self.clock.now_ns()
         self.time.offset_ns = round(self.profile.run.start_unix_s * NANOSECONDS) - self.started_ns
         self.time.was_set = False
         self.modes.reset()
-        self.parameters.set_defaults()
-        for name in self.parameters.take_stored(self._stored_parameters):
+        self.mode_changes = self.frames_valid = 0
+        for name in self.parameters.restore(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; its default is used", name)
         self._plan_unsolicited()
         self._persist(lambda error: log.error("%s", error) if error else None)
@@ -230,13 +232,13 @@ class Device:
     def _store_parameters(
         self, content: dict[str, ParameterValue], done: Callable[[EmulatorError | None], None]
     ) -> None:
-        before = self._stored_parameters
-        self._stored_parameters = dict(content)
+        before, stored = self._stored_parameters, dict[str, object](content)
+        self._stored_parameters = stored
 
         def finish(error: EmulatorError | None) -> None:
             if error is None:
                 self.parameters.mark_stored(content)
-            else:
+            elif self._stored_parameters is stored:  # neither another save nor a restart has followed
                 self._stored_parameters = before
             done(error)
 
@@ -244,12 +246,21 @@ class Device:
 
     def restore_parameters(self) -> None:
         """Set all parameters to what is stored, or to their defaults where nothing is."""
-        self.parameters.set_defaults()
-        self.parameters.take_stored(self._stored_parameters)
+        self.parameters.restore(self._stored_parameters)
 
     def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
-        content = {"boot_count": self.boot_count, "parameters": self._stored_parameters}
-        self._background(lambda: self.store.save(content), done)
+        content = self._content()
+        self._saving += 1
+
+        def saved(error: EmulatorError | None) -> None:
+            self._saving -= 1
+            done(error)
+
+        self._background(lambda: self.store.save(content), saved)
+
+    def _content(self) -> dict[str, object]:
+        """What the store holds when all that is being saved has been: a restart may come before that."""
+        return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---
 
@@ -286,6 +297,7 @@ class Device:
             self.cycle.start()
         else:
             self.cycle.stop()
+            self.images.cycle_stopped()
             self.latest = None
         for observer in self.on_mode:
             observer(transition)
@@ -319,8 +331,12 @@ class Device:
         row = self.icd.telemetry_by_id.get(int(self.parameters["unsolicited_selection"]))
         if row is None or self.deaf:
             return
+        try:
+            data = self.telemetry(row.name)
+        except Refused:  # an image is being opened: nothing to tell this time
+            return
         destination = int(self.parameters["host_address"])
-        reply = Reply(ReplyKind.UNSOLICITED, row.id, self.telemetry(row.name), destination=destination)
+        reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=destination)
         for outlet in self.outlets:
             outlet(reply)
 

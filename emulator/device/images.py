@@ -96,12 +96,12 @@ class ImageStore:
         self._single_frame = single_frame
         self._exposure_s = exposure_s
         self._generation = 0
-        self._count = 0
         self.clear()
 
     def clear(self) -> None:
         """Forget all, as a restart of the device does."""
         self._generation += 1
+        self._count = 0
         self._cycle.after_exposure = None
         self.stored: StoredImage | None = None
         self.percent = 0
@@ -153,6 +153,12 @@ class ImageStore:
                 then()
 
         self._scheduler.at(start_ns + exposure_ns, expose)
+
+    def cycle_stopped(self) -> None:
+        """Expose one frame for a capture that waits for the next one, as none comes by itself now."""
+        then, self._cycle.after_exposure = self._cycle.after_exposure, None
+        if then is not None:
+            self._capture(then)
 
     def _stored_image(self, answer: ImageResult) -> StoredImage:
         self._count = (self._count + 1) % 256

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
@@ -90,21 +91,27 @@ class Parameters(Mapping[str, ParameterValue]):
         self._defaults.update(checked)
         self._take(follow)
 
-    def take_stored(self, stored: Mapping[str, object]) -> list[str]:
-        """Take values from a store; return the names that are unknown or no longer allowed, which are passed over."""
-        refused: list[str] = []
-        taken: dict[str, ParameterValue] = dict(self._values)
+    def restore(self, stored: Mapping[str, object]) -> list[str]:
+        """Set all parameters to what a store has, or to their defaults; return the names that are passed over.
+
+        Passed over is what is unknown or no longer allowed. What the store holds need be free of contradictions only as
+        a whole, and observers are told once, of what is another value than before.
+        """
+        allowed: dict[str, Value] = {}
         for name, value in stored.items():
-            if name not in self._definitions or not isinstance(value, (bool, int, float, str)):
-                refused.append(name)
-                continue
-            try:
-                taken |= self._checked(taken, {name: value})
-            except MessageError:
-                refused.append(name)
-        self._stored = {name: taken[name] for name in stored if name in taken and name not in refused}
-        self._take(taken)
-        return refused
+            if name in self._definitions and isinstance(value, (bool, int, float, str)):
+                with contextlib.suppress(MessageError):
+                    allowed[name] = self._definitions[name].check(value)
+        taken: dict[str, ParameterValue] = {}
+        try:
+            taken = self._checked(self._defaults, allowed)
+        except MessageError:  # two contradict each other: the later one is passed over
+            for name, value in allowed.items():
+                with contextlib.suppress(MessageError):
+                    taken |= self._checked({**self._defaults, **taken}, {name: value})
+        self._stored = taken
+        self._take({**self._defaults, **taken})
+        return [name for name in stored if name not in taken]
 
     def mark_stored(self, stored: Mapping[str, ParameterValue]) -> None:
         """Remember what a restart would bring."""

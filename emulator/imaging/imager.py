@@ -146,6 +146,7 @@ class ProcessImager(_Queue):
         """
         if self._writer is not None:
             self._writer.close()
+            self._writer = None  # what is asked for until the other one is reached is refused
         self._worker.end()
         self._worker = WorkerProcess()
         return await self.start()

@@ -6,14 +6,13 @@ All are plain values, so that profiles and tests can name them; how they look is
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
 from emulator.errors import EmulatorError
 
-_ANY: Final = (-math.inf, math.inf)
+_ANGLE: Final = (-1e6, 1e6)
 _MOST_OBJECTS: Final = 100_000
 
 
@@ -129,18 +128,19 @@ class Obstruction:
 
 
 _RANGES: Final[dict[str, tuple[float, float]]] = {
-    "ra_deg": _ANY,
+    "ra_deg": _ANGLE,
     "dec_deg": (-90.0, 90.0),
     "diameter_deg": (1e-3, 90.0),
     "magnitude": (-30.0, 20.0),
     "illuminated": (0.0, 1.0),
-    "bright_limb_deg": _ANY,
+    "bright_limb_deg": _ANGLE,
     "glare_share": (0.0, 1.0),
     "electrons_s": (0.0, 1e12),
     "radius_deg": (0.1, 179.0),
     "atmosphere_deg": (1e-3, 20.0),
     "share": (0.0, 1.0),
-    "angle_deg": _ANY,
+    "angle_deg": _ANGLE,
+    "polygon_px": (-1e5, 1e5),
     "softness_px": (0.0, 1000.0),
     "false_stars": (0, _MOST_OBJECTS),
     "fixed_false_stars": (0, _MOST_OBJECTS),
@@ -221,7 +221,7 @@ class SkyObjects:
             if not isinstance(rows, (list, tuple)):
                 raise EmulatorError(f"sky {name}: a list of tables is needed")
             given[name] = tuple(_body(name, element, row) for row in rows)
-        if share:
+        if share is not None and share != 0:
             given["obstructions"] = (
                 *given["obstructions"],
                 _body("blocked_share", Obstruction, {"share": share}),
@@ -267,17 +267,30 @@ def _body(name: str, kind: Any, values: Any) -> Any:
     return kind(**chosen)
 
 
+def _flat(value: Any) -> Iterator[Any]:
+    """Each value of a tuple, of the tuples in it, or the value itself."""
+    if isinstance(value, tuple):
+        for element in value:
+            yield from _flat(element)
+    else:
+        yield value
+
+
 def _check(where: str, body: Any) -> None:
-    """Check the numbers of one of the classes above."""
+    """Check the values of one of the classes above."""
     for field in dataclasses.fields(body):
+        value = getattr(body, field.name)
+        if type(field.default) is bool and not isinstance(value, bool):
+            raise EmulatorError(f"sky {where} {field.name}: {value!r} given, true or false needed")
+        if type(field.default) is str and not isinstance(value, str):
+            raise EmulatorError(f"sky {where} {field.name}: {value!r} given, a text needed")
         if field.name not in _RANGES:
             continue
         low, high = _RANGES[field.name]
-        value = getattr(body, field.name)
         whole = isinstance(low, int)
-        for number in value if isinstance(value, tuple) else (value,):
+        for number in _flat(value):
             good = isinstance(number, int if whole else (int, float)) and not isinstance(number, bool)
-            if not good or not math.isfinite(number) or not low <= number <= high:
+            if not good or not low <= number <= high:
                 kind = "a whole number" if whole else "a number"
                 raise EmulatorError(
                     f"sky {where} {field.name}: {number!r} given, {kind} {low:g}…{high:g} needed"

@@ -63,7 +63,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._loop = asyncio.get_running_loop()
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
-        self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, self._loop.call_later, seed)
+        self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, self._loop, seed)
         device.outlets.append(self._unsolicited)
         device.on_reset.append(self._forget)
 

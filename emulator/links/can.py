@@ -90,7 +90,3 @@ class CanLink(DeviceLink[CanFrame, int]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:
             self._receiver = self._new_receiver()
-
-    def _forget(self) -> None:
-        super()._forget()
-        self._waiting.clear()

@@ -59,6 +59,15 @@ FRAME_ROWS: Final = (
 Action: TypeAlias = Callable[[float], list[CanFrame]]
 
 
+def not_before(deadline: float) -> int:
+    """First nanosecond at which a deadline in seconds has come, exactly.
+
+    One nanosecond less, and on the stepped clock the slave would be called again and again before its time.
+    """
+    numerator, denominator = deadline.as_integer_ratio()
+    return -(-numerator * NANOSECONDS // denominator)
+
+
 class BaseFramePieces:
     """How frames of the base format are damaged: what a bus with a checksum lets through is another frame."""
 
@@ -215,7 +224,7 @@ class CanopenLink:
         self._timer: Event | None = None
         self._reconnects = 0
         loop = asyncio.get_running_loop()
-        self.wire: WireFaults[CanFrame] = WireFaults(transport.send, BaseFramePieces(), loop.call_later, seed)
+        self.wire: WireFaults[CanFrame] = WireFaults(transport.send, BaseFramePieces(), loop, seed)
         device.on_frame.append(self._frame_made)
         device.on_mode.append(self._mode_changed)
         device.on_reset.append(self._device_reset)
@@ -263,11 +272,11 @@ class CanopenLink:
         self._plan()
 
     def _plan(self) -> None:
-        """Wake up when the slave wants to; a wake-up that is too early does no harm and stays."""
+        """Wake up when the slave wants to; a wake-up that was entered for an earlier time does no harm and stays."""
         deadline = self.slave.next_deadline()
         if deadline is None:
             return
-        due_ns = round(deadline * NANOSECONDS)
+        due_ns = not_before(deadline)
         if self._timer is not None:
             if self._timer.due_ns <= due_ns:
                 return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -54,8 +55,18 @@ class Pieces(Protocol[Item]):
         """Cut into pieces."""
 
 
+class Timer(Protocol):
+    """What tells the time and wakes up: an event loop."""
+
+    def time(self) -> float:
+        """Time, seconds."""
+
+    def call_later(self, delay: float, callback: Callable[[], None], /) -> object:
+        """Run a function after some seconds."""
+
+
 class WireFaults(Generic[Item]):
-    """The outgoing side of a wire, as bad as it is told to be.
+    """The outgoing side of a wire, as bad as it is told to be. What is held back leaves in the order in which it came.
 
     Parameters
     ----------
@@ -63,8 +74,8 @@ class WireFaults(Generic[Item]):
         Where undamaged pieces go.
     pieces
         How pieces of this wire are damaged.
-    call_later
-        Runs a function after some seconds.
+    timer
+        Tells when what is held back leaves.
     seed
         Seed of what goes wrong.
     """
@@ -73,39 +84,60 @@ class WireFaults(Generic[Item]):
         self,
         send: Callable[[Item], object],
         pieces: Pieces[Item],
-        call_later: Callable[[float, Callable[[], None]], object],
+        timer: Timer,
         seed: int,
     ) -> None:
         self.settings = WireFaultSettings()
         self.dropped = self.corrupted = 0
         self._send = send
         self._pieces = pieces
-        self._call_later = call_later
+        self._timer = timer
         self._rng = random.Random(seed)  # noqa: S311 (faults, not secrets)
+        self._waiting: deque[tuple[float, Item]] = deque()
+        self._free_at = 0.0
+        self._awaited = False
 
     def send(self, item: Item) -> None:
         """Send a piece, or what becomes of it."""
         settings, rng = self.settings, self._rng
         if settings.none:
-            self._send(item)
+            if self._waiting:
+                self._leave([item], settings)
+            else:
+                self._send(item)
             return
         if rng.random() < settings.junk:
-            self._after(settings.delay_s, self._pieces.junk(rng))
+            self._leave([self._pieces.junk(rng)], settings)
         if rng.random() < settings.drop:
             self.dropped += 1
             return
         if rng.random() < settings.corrupt:
             self.corrupted += 1
             item = self._pieces.corrupt(item, rng)
-        parts = self._pieces.split(item, settings.split) if settings.split else [item]
-        for number, part in enumerate(parts):
-            self._after(settings.delay_s + number * settings.gap_s, part)
+        self._leave(self._pieces.split(item, settings.split) if settings.split else [item], settings)
 
-    def _after(self, seconds: float, item: Item) -> None:
-        def send() -> None:
-            self._send(item)
+    def _leave(self, parts: Sequence[Item], settings: WireFaultSettings) -> None:
+        """Let the parts of one piece go, behind all that was sent before."""
+        now = self._timer.time()
+        at = max(now + settings.delay_s, self._free_at)
+        gap_s = settings.gap_s if len(parts) > 1 else 0.0
+        for part in parts:
+            if at > now or self._waiting:
+                self._waiting.append((at, part))
+            else:
+                self._send(part)
+            at += gap_s
+        self._free_at = at
+        self._await()
 
-        if seconds > 0.0:
-            self._call_later(seconds, send)
-        else:
-            send()
+    def _await(self) -> None:
+        if self._waiting and not self._awaited:
+            self._awaited = True
+            self._timer.call_later(max(0.0, self._waiting[0][0] - self._timer.time()), self._send_due)
+
+    def _send_due(self) -> None:
+        self._awaited = False
+        now = self._timer.time()
+        while self._waiting and self._waiting[0][0] <= now:
+            self._send(self._waiting.popleft()[1])
+        self._await()

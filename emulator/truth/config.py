@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from emulator.truth.file import read_truth_file
 from emulator.truth.live import LiveTruth
 from emulator.truth.source import (
+    MAX_RATE_DEG_S,
     FixedTruth,
     HoldSegment,
     RateSegment,
@@ -23,8 +24,11 @@ from emulator.truth.source import (
 )
 from starid.attitude import Attitude
 
-Rate: TypeAlias = Annotated[list[float], Field(min_length=3, max_length=3)]
+AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
+Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
 """Body rate in the sensor frame, degrees a second."""
+
+SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 class Strict(BaseModel):
@@ -91,7 +95,7 @@ class HoldConfig(Strict):
     """Rest for a time."""
 
     do: Literal["hold"]
-    seconds: Annotated[float, Field(gt=0.0)]
+    seconds: SegmentSeconds
 
     def build(self) -> Segment:
         """Make the segment."""
@@ -102,7 +106,7 @@ class TurnConfig(Strict):
     """Turn at a constant body rate for a time."""
 
     do: Literal["rate"]
-    seconds: Annotated[float, Field(gt=0.0)]
+    seconds: SegmentSeconds
     rate_deg_s: Rate
 
     def build(self) -> Segment:
@@ -115,9 +119,9 @@ class SlewToConfig(Strict):
 
     do: Literal["slew"]
     to: AttitudeConfig
-    max_rate_deg_s: Annotated[float, Field(gt=0.0, le=100.0)]
+    max_rate_deg_s: Annotated[float, Field(ge=1e-6, le=100.0)]
     shape: Literal["smooth", "limited"] = "smooth"
-    acceleration_deg_s2: Annotated[float, Field(gt=0.0)] = 0.1
+    acceleration_deg_s2: Annotated[float, Field(ge=1e-6, le=1e6)] = 0.1
 
     def build(self) -> Segment:
         """Make the segment."""

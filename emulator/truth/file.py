@@ -116,8 +116,12 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else f"not UTF-8, {error.reason}"
+    except (OSError, ValueError) as error:  # a path that no file can have is a ValueError
+        reason = str(error)
+        if isinstance(error, OSError):
+            reason = error.strerror or reason
+        elif isinstance(error, UnicodeDecodeError):
+            reason = f"not UTF-8, {error.reason}"
         raise EmulatorError(
             f"truth file {path}: cannot be read ({reason}); give a CSV file of times and attitudes"
         ) from None

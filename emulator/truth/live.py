@@ -9,7 +9,7 @@ One message a line (TCP) or one or more lines a datagram (UDP)::
 ``q``
     Quaternion ICRS→sensor, scalar last (x, y, z, w), of length 1 within 1 %.
 ``rate``
-    Body rate in the sensor frame, degrees a second. May be left out: then it is taken from the last two messages.
+    Body rate in the sensor frame, degrees a second, at most `MAX_RATE_DEG_S` an axis. May be left out: then it is taken from the last two messages.
 
 The sender's time line is tied to run time by its first message: what came first is taken to hold at its receipt. With
 ``timeline = "run"`` in the profile, ``t`` is run time as it stands. Between two messages the attitude is interpolated, after
@@ -31,7 +31,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from emulator.errors import EmulatorError
-from emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
+from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
 from starid.attitude import Attitude, interpolate, propagate, rate_between
 
 HISTORY: Final = 512
@@ -39,6 +39,9 @@ HISTORY: Final = 512
 
 RESTART_S: Final = 1.0
 """A sender's time that falls back by more than this begins a new time line, seconds."""
+
+SHORTEST_S: Final = 1e-9
+"""Least time between two messages, seconds: what run time tells apart."""
 
 NORM_TOLERANCE: Final = 0.01
 MAX_LINE: Final = 4096
@@ -81,6 +84,8 @@ def parse_message(line: bytes | str) -> FeedMessage:
     if abs(float(np.linalg.norm(quaternion)) - 1.0) > NORM_TOLERANCE:
         raise FeedError("q is not of length 1")
     rate = _numbers("rate", message["rate"], 3) if message.get("rate") is not None else None
+    if rate is not None and np.abs(rate).max() > MAX_RATE_DEG_S:
+        raise FeedError(f"rate is beyond {MAX_RATE_DEG_S:g} degrees a second")
     t = _numbers("t", [message["t"]], 1)[0] if message.get("t") is not None else None
     return FeedMessage(
         None if t is None else float(t), Attitude(quaternion), None if rate is None else np.radians(rate)
@@ -146,7 +151,7 @@ class LiveTruth:
             if self._offset_s is None:
                 self._offset_s = received_s - message.t
             t = message.t + self._offset_s
-        if self._times and t <= self._times[-1]:
+        if self._times and t < self._times[-1] + SHORTEST_S:
             if self._times[-1] - t <= RESTART_S:
                 raise FeedError(f"t = {message.t} is not later than the message before")
             self._times.clear()
@@ -229,9 +234,10 @@ class LiveFeed:
             else:
                 self._server = await asyncio.start_server(self._serve, host, port, limit=MAX_LINE)
                 address = self._server.sockets[0].getsockname()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+            reason = error.strerror if isinstance(error, OSError) else None
             raise EmulatorError(
-                f"truth feed {protocol}:{host}:{port}: cannot listen ({error.strerror or error}); choose another port, or 0"
+                f"truth feed {protocol}:{host}:{port}: cannot listen ({reason or error}); choose another port, or 0"
             ) from None
         return f"{protocol}:{address[0]}:{address[1]}"
 

@@ -23,6 +23,9 @@ Vector: TypeAlias = NDArray[np.float64]
 ZERO_RATE: Final[Vector] = np.zeros(3)
 ZERO_RATE.flags.writeable = False
 
+MAX_RATE_DEG_S: Final = 600.0
+"""Largest body rate about one axis, degrees a second: with all three at it frames can still be drawn."""
+
 SMOOTH_PEAK: Final = 1.875
 """Peak of the derivative of the quintic 10τ³ − 15τ⁴ + 6τ⁵, at τ = ½."""
 

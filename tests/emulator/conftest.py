@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -11,6 +12,7 @@ import pytest
 from emulator.clock import SteppedClock
 from emulator.device.device import Device
 from emulator.device.state_store import MemoryStore, StateStore
+from emulator.emulation import Emulation, RunOptions
 from emulator.imaging.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
 from emulator.imaging.imager import Answer, Asked, DirectImager
 from emulator.profile import Profile
@@ -18,6 +20,7 @@ from emulator.truth.source import FixedTruth, TruthSource
 from protocol.icd import load_icd
 from protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starid.attitude import Attitude
+from tests.emulator.runs import FakeImager
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 STARS = (
@@ -148,3 +151,33 @@ def bench() -> Bench:
 def make_bench() -> Callable[..., Bench]:
     """Make devices of one's own."""
     return Bench
+
+
+@pytest.fixture
+def run(monkeypatch, make_bench):
+    """Run a scenario with an emulation that is started and ready."""
+    picture = make_bench().picture
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(picture.handle))
+
+    def run(scenario, *, clock="stepped", options=None, **overrides):
+        profile = Profile.model_validate(
+            {
+                "run": {"clock": clock},
+                "links": {"serial": {"port": "auto"}, "can": {"channel": "off"}},
+                **overrides,
+            }
+        )
+
+        async def whole():
+            emulation = Emulation(profile, options or RunOptions(control="auto"))
+            try:
+                await emulation.start()
+                line = await emulation.ready()
+                return await scenario(emulation, line)
+            finally:
+                await emulation.close()
+
+        return asyncio.run(whole())
+
+    run.picture = picture
+    return run

@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import random
+from fractions import Fraction
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from emulator.links.canopen import FRAME_ROWS, STATUS_ROW, BaseFramePieces, CanopenLink, open_canopen
+from emulator.clock import NANOSECONDS
+from emulator.links.canopen import (
+    FRAME_ROWS,
+    STATUS_ROW,
+    BaseFramePieces,
+    CanopenLink,
+    not_before,
+    open_canopen,
+)
 from protocol.can_framing import CanFrame
 from protocol.canopen import FileStorage, MemoryStorage, NmtState
 from protocol.icd import load_icd
@@ -309,6 +320,34 @@ def test_bus_that_was_lost_and_is_back_is_an_emergency(linked):
         link.transport.statistics.reconnects += 1
         codes = [data[:4] for identifier, data in link.step(1.5) if identifier == 0x80 + NODE]
         assert codes == ["4081", "0000"]
+
+    linked(test)
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.floats(0.0, 1e9))
+def test_a_deadline_is_never_taken_for_a_time_before_it(deadline):
+    due_ns = not_before(deadline)
+    assert due_ns / NANOSECONDS >= deadline  # as the link tells the time
+    assert Fraction(due_ns - 1, NANOSECONDS) < Fraction(deadline)
+
+
+@pytest.mark.parametrize("period_ms", [100, 1000])
+def test_heartbeats_go_on_whatever_their_deadlines_add_up_to(linked, period_ms):
+    def test(link):
+        link.bench.step(0.234)
+        link.sdo(f"2b 17 10 00 {period_ms.to_bytes(2, 'little').hex(' ')}")
+        link.take()
+        clock, scheduler = link.bench.clock, link.device.scheduler
+        end_ns = clock.now_ns() + 100 * period_ms * 1_000_000 + 1_000_000
+        for _ in range(250):  # a wake-up a heartbeat, and room for those that are none
+            event = scheduler.pop_due(end_ns)
+            if event is None:
+                break
+            clock.set_ns(max(event.due_ns, clock.now_ns()))
+            event.action(event.due_ns)
+        assert event is None
+        assert len([answer for answer in link.take() if answer[0] == 0x700 + NODE]) == 100
 
     linked(test)
 

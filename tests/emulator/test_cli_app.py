@@ -39,18 +39,18 @@ def test_what_the_system_refuses_is_one_line_and_status_2(
     assert (printed.out, printed.err) == ("", f"starhil: {said}\n")
 
 
+@pytest.mark.parametrize("name", ["", ".", ".."])
 def test_a_folder_where_a_file_goes_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["starhil", "icd", "export", "markdown", "-o", str(tmp_path)])
+    folder = name or str(tmp_path)
+    monkeypatch.setattr("sys.argv", ["starhil", "icd", "export", "markdown", "-o", folder])
     with pytest.raises(SystemExit) as caught:
         app.main()
     printed = capsys.readouterr()
     assert caught.value.code == 2
     assert printed.out == ""
-    assert printed.err.startswith("starhil: ")
-    assert str(tmp_path) in printed.err
-    assert printed.err.count("\n") == 1
+    assert printed.err == f"starhil: {folder}: is a folder; name a file with -o\n"
 
 
 @pytest.mark.parametrize(

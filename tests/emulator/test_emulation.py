@@ -1,89 +1,23 @@
-"""A whole run in one process, with a pipeline that makes no pictures: control channel, feeds, files, pumps."""
+"""A whole run in one process, with a pipeline that makes no pictures: scenarios, files, pumps, refusals."""
 
 import asyncio
 import csv
-import json
 import resource
 
 import pytest
 
-import emulator.emulation
 from emulator.clock import SteppedClock
+from emulator.device.modes import Mode
 from emulator.emulation import Emulation, RunOptions
 from emulator.errors import EmulatorError
 from emulator.imaging.frames import Warm
-from emulator.imaging.imager import DirectImager, ProcessImager
+from emulator.imaging.imager import ProcessImager
 from emulator.profile import Profile, RunConfig, configs_folder
 from emulator.scenario import load_scenario
 from emulator.truth.file import read_truth_file
 from emulator.truth.log import COLUMNS
 from protocol.errors import ProtocolError
-
-CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
-ORION = {"ra_deg": 83.8, "dec_deg": -1.2}
-
-
-class FakeImager(DirectImager):
-    """A pipeline that is ready at once."""
-
-    on_failure = None
-
-    async def start(self) -> Warm:
-        return Warm(CAMERA, 5, 0.0)
-
-    async def close(self) -> None:
-        return
-
-
-@pytest.fixture
-def run(monkeypatch, make_bench):
-    """Run a scenario with an emulation that is started and ready."""
-    picture = make_bench().picture
-    monkeypatch.setattr(emulator.emulation.Emulation, "_make_imager", lambda *_: FakeImager(picture.handle))
-
-    def run(scenario, *, clock="stepped", options=None, **overrides):
-        profile = Profile.model_validate(
-            {
-                "run": {"clock": clock},
-                "links": {"serial": {"port": "auto"}, "can": {"channel": "off"}},
-                **overrides,
-            }
-        )
-
-        async def whole():
-            emulation = Emulation(profile, options or RunOptions(control="auto"))
-            try:
-                await emulation.start()
-                line = await emulation.ready()
-                return await scenario(emulation, line)
-            finally:
-                await emulation.close()
-
-        return asyncio.run(whole())
-
-    run.picture = picture
-    return run
-
-
-class Control:
-    """A peer on the control channel."""
-
-    def __init__(self, emulation) -> None:
-        self.address = emulation.ready_words["control"].rsplit(":", 1)
-
-    async def __aenter__(self):
-        self.reader, self.writer = await asyncio.open_connection(*self.address)
-        return self
-
-    async def __aexit__(self, *_exc):
-        self.writer.close()
-
-    async def raw(self, line: bytes) -> dict:
-        self.writer.write(line + b"\n")
-        return json.loads(await self.reader.readline())
-
-    async def do(self, action, **values) -> dict:
-        return await self.raw(json.dumps({"do": action, **values}).encode())
+from tests.emulator.runs import CAMERA, Control, FakeImager
 
 
 def test_the_ready_line_tells_what_was_taken(run):
@@ -95,173 +29,6 @@ def test_the_ready_line_tells_what_was_taken(run):
         assert words["control"].startswith("127.0.0.1:")
 
     run(scenario)
-
-
-def test_time_passes_only_by_steps(run):
-    async def scenario(emulation, _line):
-        async with Control(emulation) as control:
-            assert (await control.do("status"))["mode"] == "boot"
-            await asyncio.sleep(0.05)
-            assert (await control.do("status"))["run_time_s"] == 0.0
-            assert (await control.do("step", seconds=1.0))["run_time_s"] == 1.0
-            assert (await control.do("status"))["mode"] == "standby"
-            for bad in (
-                {},
-                {"seconds": 0},
-                {"seconds": -1},
-                {"seconds": "1"},
-                {"seconds": True},
-                {"seconds": 1, "x": 2},
-            ):
-                answer = await control.do("step", **bad)
-                assert not answer["ok"]
-                assert answer["error"]
-
-    run(scenario)
-
-
-def test_truth_is_read_back_and_swapped_while_running(run):
-    async def scenario(emulation, _line):
-        async with Control(emulation) as control:
-            await control.do("step", seconds=1.0)
-            truth = await control.do("truth")
-            assert (truth["ra_deg"], truth["dec_deg"]) == pytest.approx((83.8, -1.2))
-            swap = {
-                "kind": "rate",
-                "attitude": {"ra_deg": 10.0, "dec_deg": 0.0},
-                "rate_deg_s": [0.0, 0.0, 2.0],
-            }
-            assert (await control.do("set_truth", truth=swap))["ok"]
-            later = await control.do("truth", run_time_s=4.0)
-            assert later["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
-            assert later["roll_deg"] == pytest.approx(6.0)  # three seconds after the swap
-            by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
-            assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
-            for wrong, said in (
-                ({}, "truth: an object is needed, with the keys of [truth] in a profile"),
-                ({"truth": 3}, "truth: an object is needed, with the keys of [truth] in a profile"),
-                ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind"),
-                ({"truth": {}}, "truth.kind: must be one of 'file', 'fixed', 'live', 'rate', 'slew'"),
-                (
-                    {"truth": {"kind": "fixed", "attitude": {"ra_deg": "x"}}},
-                    "truth.attitude.ra_deg: must be a valid number (given: 'x')",
-                ),
-            ):
-                assert await control.do("set_truth", **wrong) == {"ok": False, "error": said}
-            bad = await control.do("set_truth", truth={"kind": "rate"})
-            assert bad == {"ok": False, "error": "truth.rate_deg_s: missing; give it"}
-            assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
-            assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
-
-    run(scenario)
-
-
-def test_frames_are_told_with_truth_and_error(run):
-    run.picture.turn_rad = 1e-5
-
-    async def scenario(emulation, _line):
-        async with Control(emulation) as control:
-            await control.do("step", seconds=1.0)
-            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
-            await control.do("step", seconds=3.0)
-            frames = (await control.do("frames", count=2))["frames"]
-            assert [frame["frame"] for frame in frames] == [2, 3]
-            assert frames[-1]["cross_boresight_arcsec"] == pytest.approx(2.0626, abs=1e-3)
-            assert list(frames[-1]) == list(COLUMNS)
-            assert not (await control.do("frames", count=0))["ok"]
-
-    run(scenario)
-
-
-@pytest.mark.parametrize(
-    "line", [b"nonsense", b"[1]", b'{"do": "dance"}', b"{}", b'{"do": "status", "x": 1}', b"\xff\xfe"]
-)
-def test_bad_requests_are_answered_and_the_next_good_one_too(run, line):
-    async def scenario(emulation, _line):
-        async with Control(emulation) as control:
-            answer = await control.raw(line)
-            assert answer["ok"] is False
-            assert answer["error"]
-            assert (await control.raw(b'{"do": "status", "id": [7]}'))["id"] == [7]
-
-    run(scenario)
-
-
-def test_faults_are_brought_about_and_cleared(run):
-    async def scenario(emulation, _line):
-        device = emulation.device
-        async with Control(emulation) as control:
-            await control.do("step", seconds=1.0)
-            assert (await control.do("fault", device={"stuck": True}))["faults"] == {
-                "device": {"stuck": True}
-            }
-            assert device.deaf
-            await control.do("fault", serial={"drop": 0.5, "split": 4}, device={"error": "injected"})
-            assert device.modes.error == "injected"
-            assert emulation.serial.wire.settings.drop == 0.5
-            assert not device.deaf
-            assert (await control.do("clear_faults"))["faults"] == {}
-            assert emulation.serial.wire.settings.none
-            await control.do("fault", device={"reset": "watchdog"})
-            assert device.reset_cause == "watchdog"
-            assert device.modes.mode.value == "boot"
-            for bad in (
-                {"can": {"drop": 0.1}},
-                {"device": {"error": "boredom"}},
-                {"device": {"reset": "boredom"}},
-                {"serial": {"drop": 2.0}},
-                {"serial": {"dorp": 0.1}},
-                {"weather": {}},
-            ):
-                answer = await control.do("fault", **bad)
-                assert not answer["ok"], bad
-
-    run(scenario)
-
-
-def test_optical_faults_go_with_each_frame(run):
-    async def scenario(emulation, _line):
-        async with Control(emulation) as control:
-            await control.do("step", seconds=1.0)
-            assert (await control.do("fault", optical={"false_stars": 7, "blocked_share": 0.25}))["ok"]
-            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
-            await control.do("step", seconds=1.0)
-            assert run.picture.frames[-1].faults == {"false_stars": 7, "blocked_share": 0.25}
-            await control.do("clear_faults")
-            await control.do("step", seconds=1.0)
-            assert run.picture.frames[-1].faults == {}
-
-    run(scenario)
-
-
-@pytest.mark.parametrize("protocol", ["udp", "tcp"])
-def test_a_live_feed_drives_the_truth(run, protocol):
-    message = json.dumps({"t": 5.0, "q": [0.0, 0.0, 0.0, 1.0], "rate": [0.0, 0.0, 1.0]}).encode()
-
-    async def scenario(emulation, line):
-        kind, host, port = emulation.ready_words["truth"].split(":")
-        assert kind == protocol
-        assert f"truth={protocol}:127.0.0.1:" in line
-        loop = asyncio.get_running_loop()
-        if protocol == "udp":
-            transport, _ = await loop.create_datagram_endpoint(
-                asyncio.DatagramProtocol, remote_addr=(host, int(port))
-            )
-            transport.sendto(message + b"\nbad\n")
-        else:
-            _, transport = await asyncio.open_connection(host, int(port))
-            transport.write(message + b"\nbad\n")
-        async with Control(emulation) as control:
-            while (status := await control.do("status"))["feed"]["refused"] == 0:
-                await asyncio.sleep(0.01)
-            assert status["feed"]["accepted"] == 1
-            assert status["feed"]["last_fault"] == "not a JSON line"
-            assert (await control.do("truth", run_time_s=0.5))["roll_deg"] >= 0.0
-            assert (await control.do("truth", run_time_s=0.5))["status"] == "extrapolated"
-            assert (await control.do("truth", run_time_s=9.0))["status"] == "stale"
-        transport.close()
-
-    run(scenario, truth={"kind": "live", "protocol": protocol})
 
 
 def test_the_real_clock_goes_by_itself(run):
@@ -405,20 +172,12 @@ def test_an_unknown_scenario_tells_the_known_ones():
         load_scenario("bad_dya")
 
 
-def test_quit_ends_the_run(run):
-    async def scenario(emulation, _line):
-        async with Control(emulation) as control:
-            assert (await control.do("quit"))["ok"]
-        await asyncio.wait_for(emulation.ended.wait(), 5.0)
-
-    run(scenario)
-
-
 @pytest.mark.parametrize(
     ("options", "overrides", "said"),
     [
         (RunOptions(control="nowhere"), {}, "--control nowhere"),
         (RunOptions(control="127.0.0.1:99999"), {}, "--control"),
+        (RunOptions(control="127.0.0..1:9000"), {}, "control channel 127.0.0..1:9000: cannot listen"),
         (RunOptions(), {"truth": {"kind": "live", "port": 1, "host": "192.0.2.1"}}, "choose another port"),
         (RunOptions(), {"parameters": {"exposure": 0}}, "exposure"),
         (
@@ -461,6 +220,42 @@ def test_a_start_that_is_refused_is_not_counted(run, tmp_path, monkeypatch):
         with pytest.raises(EmulatorError, match="no catalogue"):
             run(scenario, run=state)
     assert run(scenario, run=state) == 3
+
+
+def test_a_camera_beyond_its_parameters_is_refused_and_all_is_given_back(run, tmp_path, monkeypatch):
+    link = tmp_path / "tty"
+    links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
+    state = {"clock": "stepped", "state_dir": str(tmp_path)}
+
+    async def odd(_imager) -> Warm:
+        return Warm({**CAMERA, "centre_px": [-5.0, 468.0]}, 5, 0.0)
+
+    async def scenario(emulation, _line):
+        return emulation.device.boot_count
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeImager, "start", odd)
+        with pytest.raises(EmulatorError, match="profile odd: camera: centroid_x: -5 is outside"):
+            run(scenario, name="odd", run=state, links=links)
+    assert not link.is_symlink()
+    assert run(scenario, run=state, links=links) == 1
+
+
+def test_a_pipeline_that_cannot_come_back_is_told_with_the_remedy(run, monkeypatch, caplog):
+    async def restart(_imager) -> Warm:
+        raise EmulatorError("no memory")
+
+    monkeypatch.setattr(FakeImager, "restart", restart, raising=False)
+    monkeypatch.setattr("emulator.emulation.PIPELINE_RESTART_S", 0.0)
+
+    async def scenario(emulation, _line):
+        emulation.imager.on_failure("gone")
+        await emulation._reviving
+        assert "no memory" in caplog.text
+        assert "start the emulator anew" in caplog.text
+        assert emulation.device.command_mode(Mode.STANDBY) is False
+
+    run(scenario)
 
 
 def test_a_symlink_in_use_is_refused_and_stays(run, tmp_path):

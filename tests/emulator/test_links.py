@@ -6,8 +6,8 @@ import random
 import pytest
 
 from emulator.links.can import CanLink
-from emulator.links.serial import SerialLink
-from emulator.links.wire_faults import WireFaultSettings
+from emulator.links.serial import SerialLink, SerialPieces
+from emulator.links.wire_faults import WireFaults, WireFaultSettings
 from protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
 from protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from protocol.serial_framing import Dialect, HostReceiver, encode_request
@@ -194,6 +194,27 @@ def test_a_gap_between_frames_is_kept(bench):
     in_loop(scenario())
 
 
+def test_the_acknowledge_of_a_reset_waits_for_its_turn_and_leaves(bench):
+    async def scenario():
+        bus = Wire()
+        link = CanLink(bench.device, bus, frame_gap_s=0.001)
+        await link.start()
+        reset = bench.icd.telecommands["reset"]
+        for request in (Request.of(211), Request.of(reset.id, reset.encode({}))):
+            for frame in encode_request_frames(request, 1, 4):
+                bus.arrive(frame)
+        boots = bench.device.boot_count
+        bench.step(0.1)
+        assert bench.device.boot_count == boots + 1
+        async with asyncio.timeout(10.0):
+            while len(bus.sent) < 9:  # eight of the telemetry, one of the acknowledge
+                await asyncio.sleep(0.001)
+        assert CanIdentifier.unpack(bus.sent[-1].id).type == MessageType.TELECOMMAND_ACK
+        await link.close()
+
+    in_loop(scenario())
+
+
 def test_ten_thousand_random_strings_do_no_harm(bench):
     async def scenario():
         linked = await Linked(bench).start()
@@ -312,6 +333,44 @@ def test_wire_faults_damage_what_goes_out(bench, settings, expected):
         assert linked.over_serial(128)[0].kind is ReplyKind.TELEMETRY
 
     in_loop(scenario())
+
+
+class HandTimer:
+    """Time that a test lets pass."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.calls: list = []
+
+    def time(self) -> float:
+        return self.now
+
+    def call_later(self, delay, callback) -> None:
+        self.calls.append((self.now + delay, callback))
+
+    def run(self) -> None:
+        """Let time pass until nothing waits any more."""
+        while self.calls:
+            self.now, callback = self.calls.pop(self.calls.index(min(self.calls, key=lambda call: call[0])))
+            callback()
+
+
+def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
+    timer, sent = HandTimer(), []
+    wire = WireFaults(lambda item: sent.append((round(timer.now - 100.0, 6), item)), SerialPieces(), timer, 1)
+    wire.settings = WireFaultSettings(split=2, gap_s=0.5)
+    wire.send(b"abcd")
+    wire.send(b"efg")
+    wire.settings = WireFaultSettings(delay_s=0.25)
+    wire.send(b"hi")
+    wire.settings = WireFaultSettings()
+    wire.send(b"jk")
+    timer.run()
+    assert sent == [
+        (0.0, b"ab"), (0.5, b"cd"), (1.0, b"ef"), (1.5, b"g"), (2.0, b"hi"), (2.0, b"jk"),
+    ]  # fmt: skip
+    wire.send(b"l")
+    assert sent[-1] == (2.0, b"l")
 
 
 def test_can_faults_lose_frames_and_the_host_notices(bench):

@@ -29,6 +29,11 @@ ACCURACY_ARCSEC = 20.0
 ICD = load_icd()
 
 
+def told(errors: str) -> list[str]:
+    """Lines on stderr, but for the one that asks for patience."""
+    return [line for line in errors.splitlines() if "a first start compiles" not in line]
+
+
 class Emulator:
     """A running emulator with its control channel and serial line."""
 
@@ -83,8 +88,7 @@ class Emulator:
         self.control.close()
         self.process.send_signal(number)
         _, errors = self.process.communicate(timeout=30)
-        said = [line for line in errors.splitlines() if "a first start compiles" not in line]
-        return self.process.returncode, said
+        return self.process.returncode, told(errors)
 
 
 @pytest.fixture(scope="module")
@@ -285,6 +289,6 @@ def test_bad_input_ends_in_one_line_and_status_2(arguments, said):
     done = subprocess.run(command, capture_output=True, text=True, timeout=READY_WITHIN_S, check=False)
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
+    (line,) = told(done.stderr)
     assert line.startswith("starhil: ")
     assert said in line

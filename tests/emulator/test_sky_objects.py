@@ -190,6 +190,15 @@ def test_plain_values_make_the_same_objects() -> None:
         ({"false_star_magnitudes": "bright"}, "two numbers needed"),
         ({"blocked_share": 1.5}, "share: 1.5 given"),
         ({"obstructions": [{"polygon_px": [1, 2]}]}, "polygon_px"),
+        ({"obstructions": [{"polygon_px": [["a", "b"], [1, 2], [3, 4]]}]}, "polygon_px: 'a' given, a number"),
+        ({"obstructions": [{"polygon_px": [[True, 0], [1, 2], [3, 4]]}]}, "polygon_px: True given"),
+        ({"obstructions": [{"polygon_px": [[float("nan"), 0], [1, 2], [3, 4]]}]}, "polygon_px: nan given"),
+        ({"obstructions": [{"polygon_px": [[1e200, 0], [1, 2], [3, 4]]}]}, "polygon_px: 1e+200 given"),
+        ({"moon": {"ra_deg": 10**400, "dec_deg": 0.0}}, "ra_deg: 1000"),
+        ({"moon": {"ra_deg": float("inf"), "dec_deg": 0.0}}, "ra_deg: inf given"),
+        ({"blocked_share": ""}, "share: '' given"),
+        ({"blank": "no"}, "blank: 'no' given, true or false"),
+        ({"planets": [{"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 1.0, "name": 3}]}, "name: 3 given"),
     ],
 )
 def test_bad_objects_are_refused_in_one_line(values: dict[str, object], text: str) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from emulator.device.images import StoredImage
+from emulator.imaging.frames import Failure
 from protocol.messages import ErrorCode, ReplyKind, Request
 
 
@@ -128,11 +129,66 @@ def test_a_whole_frame_is_taken_beside_what_is_stored(bench):
     assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
 
 
+@pytest.mark.parametrize("stop", ["command", "sensor"])
+def test_a_capture_is_done_though_frames_stop_before_the_next_one(bench, stop):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    count = len(bench.picture.frames)
+    bench.command("save_image", image_size="size_64")
+    bench.step(0.55)  # in the middle of an exposure
+    if stop == "command":
+        bench.command("set_mode", mode="standby")
+    else:
+        bench.device.modes.fail("sensor")
+    bench.step(0.25)  # exposed anew, and stored
+    assert bench.read("image_status") == {"percent": 100, "status": "ok"}
+    (frame,) = bench.picture.frames[count:]
+    assert not frame.solve
+    assert bench.device.images.stored.frame == frame.index
+    assert not bench.device.images.busy
+
+
+def test_a_whole_frame_is_taken_though_frames_stop(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    taken = []
+    bench.device.images.take_full(taken.append)
+    bench.command("set_mode", mode="standby")
+    bench.step(0.25)
+    assert [frame.frame for frame in taken] == [bench.picture.frames[-1].index]
+
+
+def test_a_capture_ends_when_the_pipeline_is_lost(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    bench.command("save_image", image_size="size_64")
+    bench.imager._handle = lambda _request: Failure("gone", fatal=True)
+    bench.device.pipeline_lost()
+    bench.step(0.25)
+    assert bench.read("image_status") == {"percent": 0, "status": "storage_error"}
+    assert not bench.device.images.busy
+
+
+def test_a_capture_does_not_outlive_a_reset(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    count = len(bench.picture.requests)
+    bench.command("save_image", image_size="size_64")
+    bench.command("reset")
+    bench.step(5.0)
+    assert len(bench.picture.requests) == count
+    assert not bench.device.images.busy
+
+
 def test_a_reset_forgets_images(bench):
-    save(bench)
+    for number in (1, 2):
+        save(bench)
+        assert bench.device.images.stored.number == number
     bench.command("reset")
     bench.step(1.0)
     assert not bench.read("device_status")["image_stored"]
+    save(bench)
+    assert bench.device.images.stored.number == 1
 
 
 # --- files in bursts ---

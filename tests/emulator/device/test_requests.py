@@ -100,5 +100,21 @@ def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
     assert sent[0].id == 128
 
 
+def test_unsolicited_image_frame_is_left_out_while_an_image_is_opened(bench):
+    sent = []
+    bench.device.outlets.append(sent.append)
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    bench.command("set_unsolicited", telemetry=192, rate=20.0)
+    bench.step(0.01)
+    assert len(sent) == 1
+    bench.command("init_image_download", sram=1, image_size="size_64")  # busy for 100 ms: two periods
+    bench.step(0.09)
+    assert len(sent) == 1
+    bench.step(0.1)
+    assert len(sent) == 3
+    assert len(sent[-1].data) == 128
+
+
 def test_unsolicited_telemetry_needs_a_row(bench):
     assert bench.command("set_unsolicited", telemetry=200, rate=1.0) is ErrorCode.INVALID_PARAMETER

@@ -45,6 +45,132 @@ def test_saved_parameters_survive_a_restart_and_others_do_not(make_bench, tmp_pa
     again.store.close()
 
 
+class LaterBackground:
+    """A writer that does nothing until it is told to, as a slow disk."""
+
+    def __init__(self):
+        self.waiting = []
+
+    def __call__(self, work, done):
+        self.waiting.append((work, done))
+
+    def catch_up(self):
+        waiting, self.waiting = self.waiting, []
+        for work, done in waiting:
+            try:
+                work()
+            except EmulatorError as error:
+                done(error)
+            else:
+                done(None)
+
+
+def test_a_reset_before_the_disk_has_parameters_keeps_them(make_bench, tmp_path):
+    bench = make_bench(store=FileStore(tmp_path)).start()
+    bench.device._background = disk = LaterBackground()
+    bench.command("set_parameter", parameter=1, value=55.0)
+    bench.command("save_parameters")
+    bench.command("reset")
+    bench.step(1.0)
+    assert bench.device.parameters["exposure"] == 55
+    disk.catch_up()
+    assert not bench.read("device_status")["parameters_changed"]
+    assert bench.store.load()["parameters"]["exposure"] == 55
+    assert bench.store.load()["boot_count"] == 2
+    bench.store.close()
+
+
+def test_resets_faster_than_the_disk_are_all_counted(make_bench):
+    bench = make_bench()
+    bench.device._background = disk = LaterBackground()
+    bench.start()
+    for count in (2, 3):
+        bench.command("reset")
+        bench.step(0.1)
+        assert bench.read("boot_status")["boot_count"] == count
+    disk.catch_up()
+    assert bench.store.load()["boot_count"] == 3
+    bench.command("reset")
+    bench.step(0.1)
+    assert bench.read("boot_status")["boot_count"] == 4
+
+
+def test_a_save_that_fails_after_a_reset_takes_back_nothing_that_the_next_one_wrote(make_bench, monkeypatch):
+    bench = make_bench().start()
+    bench.device._background = disk = LaterBackground()
+    bench.command("set_parameter", parameter=1, value=55.0)
+    bench.command("save_parameters")
+    bench.command("reset")
+    bench.step(1.0)
+    really, failed = bench.store.save, []
+
+    def fail_once(content):
+        if not failed:
+            failed.append(content)
+            raise EmulatorError("state file: cannot be written")
+        really(content)
+
+    monkeypatch.setattr(bench.store, "save", fail_once)
+    disk.catch_up()
+    assert failed
+    assert bench.store.load()["parameters"]["exposure"] == 55
+    bench.command("restore_parameters")
+    assert bench.device.parameters["exposure"] == 55
+
+
+def told_by(bench):
+    told = []
+    bench.device.parameters.observe(
+        lambda names: told.append({name: bench.device.parameters[name] for name in names})
+    )
+    return told
+
+
+@pytest.mark.parametrize("restart", ["reset", "restore_parameters"])
+def test_what_stays_as_it_is_saved_is_no_change(bench, restart):
+    bench.device.parameters.set({"canopen_node": 45, "exposure": 55})
+    bench.command("save_parameters")
+    bench.device.parameters.set({"exposure": 77, "analog_gain": 2.0})
+    told = told_by(bench)
+    bench.command(restart)
+    bench.step(1.0)
+    assert told == [{"exposure": 55, "analog_gain": 1.0}]
+    assert bench.device.parameters["canopen_node"] == 45
+
+
+@pytest.mark.parametrize("pair", [(1, 1), (251, 255)])  # the defaults are 2 and 250
+def test_a_stored_pair_is_checked_as_a_whole(make_bench, pair):
+    bench = make_bench().start()
+    smallest, largest = pair
+    bench.device.parameters.set({"min_star_pixels": smallest, "max_star_pixels": largest})
+    bench.command("save_parameters")
+    again = make_bench(store=bench.store).start()
+    assert again.device.parameters["min_star_pixels"] == smallest
+    assert again.device.parameters["max_star_pixels"] == largest
+    assert not again.read("device_status")["parameters_changed"]
+
+
+def test_a_stored_value_that_is_not_allowed_takes_no_other_one_along(bench):
+    stored = {"exposure": 1e9, "max_star_pixels": 1, "min_star_pixels": 1, "colour": 3}
+    assert bench.device.parameters.restore(stored) == ["exposure", "colour"]
+    assert bench.device.parameters["max_star_pixels"] == 1
+    contradicting = {"min_star_pixels": 9, "max_star_pixels": 8, "analog_gain": 2.0}
+    assert bench.device.parameters.restore(contradicting) == ["max_star_pixels"]
+    assert bench.device.parameters["min_star_pixels"] == 9
+    assert bench.device.parameters["analog_gain"] == 2.0
+
+
+def test_a_reset_forgets_what_was_chosen_and_counted(bench):
+    fresh = bench.read("device_status")["mode_changes"], bench.read("parameter")
+    bench.command("set_parameter", parameter=29, value=2.0)
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(1.0)
+    bench.command("reset")
+    bench.step(1.0)
+    assert bench.mode == "standby"
+    assert (bench.read("device_status")["mode_changes"], bench.read("parameter")) == fresh
+
+
 def test_forgotten_parameters_are_defaults_after_the_next_restart(make_bench, tmp_path):
     bench = make_bench(store=FileStore(tmp_path)).start()
     bench.command("set_parameter", parameter=1, value=55.0)

@@ -1,5 +1,6 @@
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -233,6 +234,7 @@ def test_live_feed_on_run_time_takes_times_as_they_stand():
         ('{"q":[0,0,0,1],"rate":[1,2]}', "rate is not 3 numbers"),
         ('{"q":[0,0,0,1],"t":"x"}', "t holds"),
         ('{"q":[0,0,0,1],"t":1e999}', "t holds"),
+        ('{"q": [0, 0, 0, 1], "rate": [0, 1e9, 0]}', "rate is beyond 600"),
     ],
 )
 def test_bad_messages_are_counted_and_named_and_change_nothing(text, said):
@@ -249,6 +251,19 @@ def test_messages_that_do_not_rise_are_refused():
     live.receive(line(5.0, ORION), 0.0)
     assert not live.receive(line(5.0, EAST), 0.1)
     assert "not later" in live.last_fault
+
+
+def test_two_messages_at_almost_the_same_time_make_no_endless_rate():
+    live = LiveTruth(EAST, timeline="run")
+    live.receive(line(0.0, ORION), 0.0)
+    assert not live.receive(line(5e-324, EAST), 0.1)
+    assert live.receive(line(2e-9, EAST), 0.1)
+    assert np.all(np.isfinite(live.state(0.5).rate_rad_s))
+
+
+def test_a_path_that_no_file_can_have_is_named():
+    with pytest.raises(EmulatorError, match="cannot be read"):
+        read_truth_file(Path("a\0b"))
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
