@@ -14,6 +14,7 @@ from hil_tests.emulator_process import EmulatorProcess
 from hil_tests.errors import BenchError
 from hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
 from hil_tests.wire_log import CandumpLog, SerialLog, WireLog
+from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
 
 SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
@@ -43,6 +44,8 @@ class LinkOptions:
 class Bench:
     """Clients on one unit; a context manager that opens them at need and closes all.
 
+    Leaving it raises `EmulatorProcessError` if its emulator has ended by itself, or does not end as it should.
+
     Parameters
     ----------
     options : LinkOptions
@@ -70,6 +73,7 @@ class Bench:
         self.logs: list[WireLog] = []
         self._log_of: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
+        self._started = False
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -135,13 +139,16 @@ class Bench:
         if self.emulator is None:
             raise BenchError("only an emulator that the bench started can be restarted: use --start")
         self.close_clients()
+        self._started = False  # one that cannot be restarted has been cleared away, and has been told of
         self.emulator.restart(SIGNAL_NUMBERS[how])
+        self._started = True
 
     def __enter__(self) -> Self:
         if self.log_folder is not None:
             self.log_folder.mkdir(parents=True, exist_ok=True)
         if self.emulator is not None:
             self.emulator.start()
+            self._started = True
         return self
 
     def __exit__(
@@ -152,8 +159,14 @@ class Bench:
         finally:
             for log in self.logs:
                 log.close()
-            if self.emulator is not None and self.emulator.running:
-                if kind is None:
-                    self.emulator.stop()
-                else:
-                    self.emulator.kill()
+            self._end_emulator(kind)
+
+    def _end_emulator(self, kind: type[BaseException] | None) -> None:
+        """End the emulator; one that has ended by itself is told of with its last words, also after what came of that."""
+        if self.emulator is None or not self._started:
+            return
+        came_of_it = kind is not None and issubclass(kind, BenchError | ProtocolError)
+        if kind is None or (came_of_it and not self.emulator.running):
+            self.emulator.stop()
+        else:
+            self.emulator.kill()

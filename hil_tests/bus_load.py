@@ -46,10 +46,10 @@ ASKED: Final = (
 """Telemetry that is asked for in turn."""
 PAUSE_S: Final = 0.004
 """Mean pause between two requests; the moments are random, so that they meet every phase of a frame's processing."""
-REPLY_WITHIN_S: Final = 1.0
+REPLY_WITHIN_S: Final = 2.0
 TICK_S: Final = 0.001
 """Time between two bunches of the other traffic."""
-SETTLE_S: Final = 0.5
+SETTLE_S: Final = 5.0
 """How long the last frames may take to arrive."""
 
 
@@ -89,7 +89,9 @@ async def _talk_until_told(spec: str, rate: float, pipe: Connection) -> None:
         await asyncio.sleep(TICK_S)
     seconds = time.monotonic() - begin
     await talker.drain()
-    await asyncio.sleep(SETTLE_S)
+    end = time.monotonic() + SETTLE_S
+    while len(seen) < sent - refused and time.monotonic() < end:
+        await asyncio.sleep(TICK_S)
     disordered = sum(later <= earlier for earlier, later in pairwise(seen))
     pipe.send((seconds, sent, sent - len(set(seen)), disordered, refused))
     await talker.close()

@@ -117,8 +117,11 @@ class Expectation:
             return None
         expected = resolve(self.equals, variables)
         if not _is_number(value) or not _is_number(expected):
-            same = value == (bytes.fromhex(str(expected)) if isinstance(value, bytes) else expected)
-            return None if same and isinstance(value, bool) == isinstance(expected, bool) else show(expected)
+            return (
+                None
+                if value == expected and isinstance(value, bool) == isinstance(expected, bool)
+                else show(expected)
+            )
         wanted = float(expected) + self.plus
         tolerance = RELATIVE_ROUNDING * abs(wanted) if self.within is None else self.within
         if isinstance(value, int) and self.within is None:

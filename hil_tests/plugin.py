@@ -5,7 +5,8 @@
         starhil_serial.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20)
 
 Without options the emulator is started as a process of its own, once a module, and ended in good order. With
-`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is connected there.
+`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is connected there. An answer may
+take `--starhil-timeout` seconds; a test that measures answers in time gives `timeout_s` with the call.
 
 pytest loads this module in every run, so it imports the bench only when a fixture is used.
 """
@@ -34,6 +35,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator that is started")
     group.addoption(
         "--starhil-seed", default=1, type=int, metavar="N", help="seed of the emulator (default 1)"
+    )
+    group.addoption(
+        "--starhil-timeout", default=10.0, type=float, metavar="S", help="time for an answer (default 10 s)"
     )
 
 
@@ -70,9 +74,12 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
     if spec is None:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
         spec = emulator.ready[link]
+    timeout_s = request.config.getoption("--starhil-timeout")
     if link == "can":
-        return ObcClient.open(can=spec)
-    return ObcClient.open(serial=spec, dialect=request.config.getoption("--starhil-dialect"))
+        return ObcClient.open(can=spec, timeout_s=timeout_s)
+    return ObcClient.open(
+        serial=spec, dialect=request.config.getoption("--starhil-dialect"), timeout_s=timeout_s
+    )
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from typing import Final
 
 from hil_tests.client import ObcClient
@@ -13,6 +14,7 @@ from protocol.can_framing import CanFrame
 from protocol.errors import ProtocolError
 
 _FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8})")
+_LOOK_S: Final = 0.02
 _BYTES: Final = re.compile(r"(?:[0-9A-F]{2}|\.\.)*")
 
 
@@ -62,27 +64,62 @@ def matches(expected: str, seen: str) -> bool:
     return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
 
 
-def send_and_listen(client: ObcClient, data: tuple[str, ...], listen_s: float) -> tuple[str, ...]:
-    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames of the device."""
-    return client.run(_send_and_listen(client, data, listen_s))
+def send_and_listen(
+    client: ObcClient,
+    data: tuple[str, ...],
+    listen_s: float,
+    wanted: tuple[str, ...] = (),
+    timeout_s: float | None = None,
+) -> tuple[str, ...]:
+    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames of the device.
+
+    Parameters
+    ----------
+    client
+        The open link.
+    data
+        What to send, in hexadecimal or as `cansend` takes it.
+    listen_s
+        How long to listen at least, seconds.
+    wanted
+        Patterns of the answer.
+    timeout_s
+        How long to listen at most while less than that has come, seconds; None: as long as the client waits for a reply.
+    """
+    return client.run(_send_and_listen(client, data, listen_s, wanted, timeout_s))
 
 
-async def _send_and_listen(client: ObcClient, data: tuple[str, ...], listen_s: float) -> tuple[str, ...]:
+async def _send_and_listen(
+    client: ObcClient,
+    data: tuple[str, ...],
+    listen_s: float,
+    wanted: tuple[str, ...],
+    timeout_s: float | None,
+) -> tuple[str, ...]:
     link = client.core.link
+    if not isinstance(link, (SerialLink, CanLink)):
+        raise BenchError(f"{link.description}: cannot send as it stands")
+    size = len("".join(wanted))
+    end = time.monotonic() + (client.core.timeout_s if timeout_s is None else timeout_s)
     seen: list[bytes | CanFrame] = []
     before, link.on_raw = link.on_raw, seen.append
     try:
         if isinstance(link, SerialLink):
             for text in data:
                 link.send(bytes.fromhex(text))
-        elif isinstance(link, CanLink):
+        else:
             for text in data:
                 link.send(parse_frame(text))
-        else:
-            raise BenchError(f"{link.description}: cannot send as it stands")
         await asyncio.sleep(listen_s)
+        while len("".join(_texts(link, seen))) < size and time.monotonic() < end:
+            await asyncio.sleep(_LOOK_S)
     finally:
         link.on_raw = before
+    return _texts(link, seen)
+
+
+def _texts(link: SerialLink | CanLink, seen: list[bytes | CanFrame]) -> tuple[str, ...]:
+    """What came: one text of all bytes, or one of each frame of the device."""
     if isinstance(link, SerialLink):
         return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
     device = link.device_address

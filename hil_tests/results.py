@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree as ET
 
+from hil_tests.errors import BenchError
 from hil_tests.expect import show
 from protocol.values import Value
 
@@ -117,6 +120,43 @@ class TestCase:
     output: str = ""
 
 
+def prepare_report(path: Path) -> None:
+    """Make the folder of a report; to be called before the run that it is about, so that no run is lost.
+
+    Raises
+    ------
+    BenchError
+        No file can be written there.
+    """
+    if path.is_dir():
+        raise BenchError(f"{path}: is a folder; name the file of the report")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BenchError(f"{path}: its folder cannot be made: {error.strerror}") from None
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise BenchError(f"{path}: cannot be written: its folder takes no new files")
+
+
+def write_report(path: Path, data: bytes) -> None:
+    """Write a report, whole or not at all; its folder is made if need be.
+
+    Raises
+    ------
+    BenchError
+        No file can be written there.
+    """
+    prepare_report(path)
+    partial = path.with_name(path.name + ".part")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise BenchError(f"{path}: cannot be written: {error.strerror}") from None
+
+
 def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float) -> None:
     """Write a JUnit XML file, whole or not at all."""
     counts = {
@@ -146,9 +186,7 @@ def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float
         if case.output:
             ET.SubElement(item, "system-out").text = _printable(case.output)
     ET.indent(root)
-    partial = path.with_name(path.name + ".part")
-    ET.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
-    partial.replace(path)
+    write_report(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
 def _printable(text: str) -> str:

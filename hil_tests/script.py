@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -70,7 +71,7 @@ from hil_tests.script_model import (
     Wait,
 )
 from hil_tests.script_reader import TableReader
-from protocol.codec import Row
+from protocol.codec import Field, Row
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
 from protocol.values import Parameter, Value
@@ -209,8 +210,7 @@ class _Checker:
         for name, value in table.items():
             self._check_field(place, row, name)
             expectation = read_expectation(name, value, place, known)
-            self._check_kind(place, row, expectation)
-            expectations.append(expectation)
+            expectations.append(self._check_kind(place, row, expectation))
         return tuple(expectations)
 
     def _attitude(self, reader: TableReader, row: Row | None) -> AttitudeCheck | None:
@@ -240,11 +240,16 @@ class _Checker:
                 f"row '{row.name}' has no field '{name}'{near_matches(name, row.named_fields) or known}"
             )
 
-    def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> None:
-        """Refuse an expectation that can never hold: another type, or no name of the enumeration."""
+    def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> Expectation:
+        """Refuse an expectation that can never hold: another type, or no name of the enumeration.
+
+        Bytes stand in the script as hexadecimal text; in what is returned they are bytes.
+        """
         if row is None:
-            return
+            return expectation
         item = row.named_fields[expectation.field]
+        if item.kind == "bytes":
+            return _in_bytes(reader, item, expectation)
         for value in (expectation.equals, expectation.differs_from, *expectation.one_of):
             if value is None or isinstance(value, Variable):
                 continue
@@ -258,6 +263,7 @@ class _Checker:
                 reader.fail(f"'{item.name}' is {kind}, not {value!r}")
             elif item.kind in ("integer", "float", "bits") and isinstance(value, str):
                 reader.fail(f"'{item.name}' is a number, not {value!r}")
+        return expectation
 
     def _row(self, reader: TableReader, key: str, *, telecommand: bool) -> Row:
         name = reader.text(key)
@@ -424,6 +430,38 @@ STEP_KEYS: Final = (
     "timeout_s", "retries", "max_latency_s", "count", "for_s", "file", "at_least", "min_samples", "value", "size", "method", "answer",
     "listen_s",
 )  # fmt: skip
+
+
+def _in_bytes(reader: TableReader, item: Field, expectation: Expectation) -> Expectation:
+    """Return what is expected of a field of bytes with its hexadecimal text as bytes."""
+
+    def convert(value: Operand) -> Operand:
+        if isinstance(value, Variable):
+            return value
+        try:
+            data = bytes.fromhex(value) if isinstance(value, str) else b""
+        except ValueError:
+            data = b""
+        if len(data) != item.size:
+            reader.fail(f"'{item.name}' is {item.size} bytes in hexadecimal, not {show(value)!r}")
+        return data
+
+    for word, given in (
+        ("min", expectation.minimum),
+        ("max", expectation.maximum),
+        ("above", expectation.above),
+        ("within", expectation.within),
+        ("plus", expectation.plus or None),
+        ("angle_deg", expectation.angle or None),
+    ):
+        if given is not None:
+            reader.fail(f"'{item.name}' is bytes, and '{word}' is for numbers; give value, one_of or not")
+    return replace(
+        expectation,
+        equals=None if expectation.equals is None else convert(expectation.equals),
+        one_of=tuple(convert(value) for value in expectation.one_of),
+        differs_from=None if expectation.differs_from is None else convert(expectation.differs_from),
+    )
 
 
 def static_values(values: Mapping[str, Operand]) -> dict[str, Value]:

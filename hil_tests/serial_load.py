@@ -17,7 +17,7 @@ from protocol.messages import LinkFault, Reply, ReplyKind, Request
 from protocol.serial_framing import Dialect, HostReceiver, encode_request
 from protocol.transports import SerialTransport, open_serial
 
-REPLY_WITHIN_S: Final = 1.0
+REPLY_WITHIN_S: Final = 2.0
 MAPS_BETWEEN_STARS: Final = (6, 6, 6, 7)
 """Long telecommands after each long telemetry: with these, as many bytes go out as come in."""
 PIPELINE: Final = 60

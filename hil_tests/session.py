@@ -205,7 +205,7 @@ class SessionRunner:
             case DownloadImage():
                 return self._download(action, client)
             case Send():
-                return self._send(action, client)
+                return self._send(step, action, client)
 
     # --- actions ---
 
@@ -355,12 +355,12 @@ class SessionRunner:
         return Outcome(problem, detail, {}, figures)
 
     @staticmethod
-    def _send(action: Send, client: ObcClient) -> Outcome:
-        seen = send_and_listen(client, action.data, action.listen_s)
+    def _send(step: Step, action: Send, client: ObcClient) -> Outcome:
+        wanted = [pattern(text) for text in action.answer or ()]
+        seen = send_and_listen(client, action.data, action.listen_s, tuple(wanted), step.timeout_s)
         shown = ", ".join(text for text in seen if text) or "nothing"
         if action.answer is None:
             return Outcome(detail=f"came back: {shown}")
-        wanted = [pattern(text) for text in action.answer]
         if client.core.link.name == "serial":
             wanted = ["".join(wanted)]
         if len(seen) == len(wanted) and all(matches(a, b) for a, b in zip(wanted, seen, strict=True)):

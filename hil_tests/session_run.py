@@ -14,9 +14,18 @@ from rich.text import Text
 
 from hil_tests.bench import Bench, LinkOptions
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.errors import BenchError, ScriptError, near_matches
+from hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
 from hil_tests.own_hub import OwnBus
-from hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, junit_cases, write_junit
+from hil_tests.results import (
+    FAILED,
+    PASSED,
+    SKIPPED,
+    SessionResult,
+    StepResult,
+    junit_cases,
+    prepare_report,
+    write_junit,
+)
 from hil_tests.script import load_script
 from hil_tests.script_model import Script
 from hil_tests.session import MS_PER_S, SessionRunner
@@ -80,25 +89,34 @@ def run_session(request: SessionRequest) -> SessionResult:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BenchError(f"{folder}: the log folder cannot be made: {error.strerror}") from None
+    if request.junit is not None:
+        prepare_report(request.junit)
     show = _printer(quiet=request.quiet)
     if not request.quiet:
         Console(highlight=False).print(Text(script.title, style="bold"))
-    with ExitStack() as stack:
-        emulator = None
-        if request.start:
-            if options.can == "auto":
-                options = replace(options, can=stack.enter_context(OwnBus()))
-            state = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-session-")))
-            emulator = _emulator(request, script, options, folder, state)
-        bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
-        for link in bench.links:
-            bench.client(link)  # a port that cannot be had is refused before the first step
-        result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
+    result: SessionResult | None = None
+    try:
+        with ExitStack() as stack:
+            emulator = None
+            if request.start:
+                if options.can == "auto":
+                    options = replace(options, can=stack.enter_context(OwnBus()))
+                state = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-session-")))
+                emulator = _emulator(request, script, options, folder, state)
+            bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+            for link in bench.links:
+                bench.client(link)  # a port that cannot be had is refused before the first step
+            result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
+    except EmulatorProcessError as error:
+        if result is None:
+            raise
+        end = StepResult(
+            len(script.steps) + 1, "the emulator lasts until it is ended", "", FAILED, str(error), 0.0
+        )
+        show(end)
+        result = replace(result, results=(*result.results, end))
     if request.junit is not None:
-        try:
-            write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
-        except OSError as error:
-            raise BenchError(f"{request.junit}: cannot be written: {error.strerror}") from None
+        write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
     if not request.quiet:
         _print_summary(result, folder)
     return result

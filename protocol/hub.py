@@ -8,6 +8,9 @@ alone, and counted. Malformed commands are answered by an error and change nothi
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,6 +23,8 @@ from protocol.errors import ProtocolError
 from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
+_LOGGER: Final = logging.getLogger("starhil.hub")
+
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 29536
 DEFAULT_BUS: Final = "vcan0"
@@ -27,10 +32,11 @@ DEFAULT_BUS: Final = "vcan0"
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
 """Bytes that wait for one slow client at most; about 70 000 frames."""
 
-SETTLE_S: Final = 0.1
-"""How long frames are held back from a client that has just entered raw mode.
+SETTLE_S: Final = 1.0
+"""Longest time that frames are held back from a client that has just entered raw mode.
 
-python-can's client takes the answer to `< rawmode >` for broken if a frame follows it in the same read.
+python-can's client takes the answer to `< rawmode >` for broken if a frame follows it in the same read. What the client
+sends itself shows that it has read the answer, and ends the wait.
 """
 
 FLUSH_LOG_S: Final = 0.5
@@ -207,9 +213,11 @@ class CanHub:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: _Client(self), self.host, self.port)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
+            remedy = "--host" if isinstance(error, UnicodeError | socket.gaierror) else "--port"
             raise ProtocolError(
-                f"CAN hub: cannot listen at {self.host}:{self.port}: {error.strerror}; choose another --port"
+                f"CAN hub: cannot listen at {self.host}:{self.port}: {getattr(error, 'strerror', None) or error}; "
+                f"choose another {remedy}"
             ) from None
         self.port = self._server.sockets[0].getsockname()[1]
         if self._log_path is not None:
@@ -232,7 +240,10 @@ class CanHub:
         while self._clients:
             await asyncio.sleep(0)
         if self._log is not None:
-            self._log.close()
+            try:
+                self._log.close()
+            except OSError as error:
+                self._give_up_log(error)
             self._log = None
 
     def join(self, client: _Client) -> None:
@@ -261,10 +272,28 @@ class CanHub:
             self.statistics.dropped += dropped
         if self._log is not None:
             bus = sender.bus or DEFAULT_BUS
-            for frame in frames:
-                self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
+            try:
+                for frame in frames:
+                    self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
+            except OSError as error:
+                self._give_up_log(error)
 
     def _flush_log(self) -> None:
-        if self._log is not None:
+        if self._log is None:
+            return
+        try:
             self._log.flush()
+        except OSError as error:
+            self._give_up_log(error)
+        else:
             self._flusher = asyncio.get_running_loop().call_later(FLUSH_LOG_S, self._flush_log)
+
+    def _give_up_log(self, error: OSError) -> None:
+        """Say once that the log ends here; the bus goes on without it."""
+        log, self._log = self._log, None
+        _LOGGER.warning(
+            "CAN hub: log %s ends here: %s; the bus goes on", self._log_path, error.strerror or error
+        )
+        if log is not None:
+            with contextlib.suppress(OSError):  # what it holds back cannot be written either
+                log.close()

@@ -103,6 +103,23 @@ class CanopenProbe:
         self._boots = True
         self._multiplexer = bytes(3)
 
+    # Around a case
+
+    def begin(self, *, intrusive: bool) -> None:
+        """Start a case: an intrusive one begins with the communication reset."""
+        if intrusive:
+            self.begin_anew()
+        else:
+            self.abandon_transfer()
+
+    def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same after any case)
+        """End a case: an intrusive one ends with the communication reset."""
+        if intrusive:
+            self.begin_anew()
+
+    def recover(self) -> None:
+        """Nothing is left to pass: the next case begins by abandoning what was under way."""
+
     # Frames
 
     def send(

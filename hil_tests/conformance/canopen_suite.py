@@ -1,10 +1,8 @@
-"""CANopen conformance: all areas, and how one case is run between resets of the communication."""
+"""CANopen conformance: the cases of all areas, and how one is run."""
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 from hil_tests.conformance import (
     canopen_design,
@@ -20,7 +18,8 @@ from hil_tests.conformance import (
     canopen_tpdo,
 )
 from hil_tests.conformance.canopen_probe import CanopenProbe
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
+from hil_tests.conformance.case import Case
+from hil_tests.conformance.runner import Outcome, run_case
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_eds.CASES,
@@ -36,41 +35,7 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_design.CASES,
 )
 
-Status = Literal["passed", "failed", "skipped"]
 
-
-@dataclass(frozen=True)
-class CanopenOutcome:
-    """What came of one case: expected and seen if it failed, the reason if it was skipped, frames sent and seen."""
-
-    case: Case[CanopenProbe]
-    status: Status
-    expected: str = ""
-    seen: str = ""
-    seconds: float = 0.0
-    log: tuple[str, ...] = field(default=())
-
-
-def run_canopen_case(probe: CanopenProbe, case: Case[CanopenProbe]) -> CanopenOutcome:
+def run_canopen_case(probe: CanopenProbe, case: Case[CanopenProbe]) -> Outcome:
     """Run one case; an intrusive one begins and ends with the communication reset."""
-    probe.log.clear()
-    begin = time.perf_counter()
-    status: Status = "passed"
-    expected = seen = ""
-    try:
-        if case.intrusive:
-            probe.begin_anew()
-        else:
-            probe.abandon_transfer()
-        case.run(probe)
-    except CaseFailed as failure:
-        status, expected, seen = "failed", failure.expected, failure.seen
-    except CaseSkipped as reason:
-        status, seen = "skipped", str(reason)
-    log = tuple(probe.log)
-    if case.intrusive:
-        try:
-            probe.begin_anew()
-        except CaseFailed as failure:
-            status, expected, seen = "failed", failure.expected, failure.seen
-    return CanopenOutcome(case, status, expected, seen, time.perf_counter() - begin, log)
+    return run_case(probe, case)

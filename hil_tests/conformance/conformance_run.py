@@ -17,8 +17,9 @@ from hil_tests.conformance.runner import Outcome, run_cases, select_cases
 from hil_tests.conformance.serial_probe import SerialProbe
 from hil_tests.conformance.suites import can_suite, serial_suite
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.errors import BenchError
+from hil_tests.errors import BenchError, EmulatorProcessError
 from hil_tests.own_hub import OwnBus
+from hil_tests.results import FAILED
 from protocol.icd import InterfaceDefinition, load_icd
 
 DEFAULT_BAUD: Final = 115200
@@ -78,11 +79,32 @@ def run_conformance(
     """
     icd = load_icd()
     cases = all_cases(request, icd)
+    outcomes: list[Outcome] | None = None
+    try:
+        with ExitStack() as stack:
+            serial, can = request.serial, request.can
+            if request.start:
+                serial, can = _start(request, stack)
+            outcomes = _run_on_links(request, icd, cases, serial, can, on_outcome)
+    except EmulatorProcessError as error:
+        if outcomes is None:
+            raise
+        outcomes.append(_fallen(error))
+        on_outcome(outcomes[-1])
+    return outcomes
+
+
+def _run_on_links(
+    request: ConformanceRequest,
+    icd: InterfaceDefinition,
+    cases: Sequence[Case[Any]],
+    serial: str | None,
+    can: str | None,
+    on_outcome: Callable[[Outcome], None],
+) -> list[Outcome]:
+    """Run the cases of one link after those of the other."""
     outcomes: list[Outcome] = []
     with ExitStack() as stack:
-        serial, can = request.serial, request.can
-        if request.start:
-            serial, can = _start(request, stack)
         mine = [item for item in cases if item.id.startswith("serial.")]
         if mine and serial is not None:
             port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD, request.speed))
@@ -100,6 +122,22 @@ def run_conformance(
         if mine and can is not None:
             outcomes += _run_canopen(request, can, mine, on_outcome)
     return outcomes
+
+
+def _fallen(error: EmulatorProcessError) -> Outcome:
+    """Return the outcome that says that the emulator did not last; what was found until then stays."""
+    return Outcome(
+        "emulator.end",
+        "emulator",
+        "the emulator lasts until it is ended, and ends in good order",
+        "starhil run",
+        intrusive=False,
+        status=FAILED,
+        expected="an end with status 0, when it is asked for",
+        seen=str(error),
+        seconds=0.0,
+        log=(),
+    )
 
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, str | None]:
@@ -133,7 +171,6 @@ def _run_canopen(
     from canopen.objectdictionary import import_od
 
     from hil_tests.conformance.canopen_probe import CanopenProbe
-    from hil_tests.conformance.canopen_suite import run_canopen_case
 
     node = int(request.canopen_node or 0)
     text = _data_sheet(request.eds)
@@ -144,18 +181,8 @@ def _run_canopen(
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
             raise BenchError(f"{request.eds}: not a data sheet that can be read: {error}") from None
-    outcomes = []
     with live_can(can, request.speed) as bus:
-        probe = CanopenProbe(bus, node, dictionary, text)
-        for item in cases:
-            found = run_canopen_case(probe, item)
-            outcome = Outcome(
-                item.id, item.area, item.title, item.clause, item.intrusive,
-                found.status, found.expected, found.seen, found.seconds, found.log,
-            )  # fmt: skip
-            outcomes.append(outcome)
-            on_outcome(outcome)
-    return outcomes
+        return run_cases(CanopenProbe(bus, node, dictionary, text), cases, on_outcome)
 
 
 def _data_sheet(path: Path | None) -> str:

@@ -26,6 +26,9 @@ SEQUENCE: Final = 7
 FIRST_TELEMETRY: Final = 128
 BURST_ID: Final = 119
 
+RECOVERY_S: Final = 1.0
+"""Pause after a failed case, for time-outs of the device to pass."""
+
 AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malformed", "none"]
 
 
@@ -238,14 +241,20 @@ class LinkProbe(ABC):
             raise CaseSkipped(f"the interface definition has no telemetry '{name}'")
         return self.icd.telemetry[name]
 
-    def begin(self) -> None:
-        """Start a case with an empty log and an empty line."""
-        self.log.clear()
+    # --- around a case ---
+
+    def begin(self, *, intrusive: bool) -> None:  # noqa: ARG002 (the same for all cases)
+        """Start a case with an empty line."""
         self.drain()
 
-    def end(self) -> None:
+    def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
         """End a case: nothing more may come."""
-        self.expect_silence("the case is over", self.times.quiet_s / 4)
+        if passed:
+            self.expect_silence("the case is over", self.times.quiet_s / 4)
+
+    def recover(self) -> None:
+        """Let time-outs of the device pass after a failed case."""
+        self.sleep(RECOVERY_S)
 
 
 def checked_values(row: Row, data: bytes) -> dict[str, Value]:

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hil_tests.conformance.runner import Outcome
-from hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit
+from hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit, write_report
 
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
 
@@ -123,9 +123,7 @@ def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> Non
         areas=f"<table><tr>{heads}</tr>{''.join(rows)}</table>",
         details="".join(_area_table(area, outcomes) for area in areas_of(outcomes)),
     )
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    write_report(path, text.encode())
 
 
 def _area_table(area: str, outcomes: Sequence[Outcome]) -> str:

@@ -24,6 +24,8 @@ from protocol.errors import ProtocolError
 LENGTH: Final = 8
 """Data bytes of every SDO frame; others are no SDO."""
 ABORT: Final = 0x80
+RESULT_TIMEOUT_S: Final = 30.0
+"""Longer than the device needs for any result: an exposure, with the processing of the frame before it, takes seconds."""
 
 
 @dataclass
@@ -45,11 +47,16 @@ class SdoServer:
         What is read and written.
     timeout_s
         A transfer is aborted when its client is silent for so long.
+    result_timeout_s
+        A download is aborted when the device has no result of it for so long; meanwhile it is the client that waits.
     """
 
-    def __init__(self, dictionary: Dictionary, timeout_s: float = 1.0) -> None:
+    def __init__(
+        self, dictionary: Dictionary, timeout_s: float = 1.0, result_timeout_s: float = RESULT_TIMEOUT_S
+    ) -> None:
         self._dictionary = dictionary
         self._timeout_s = timeout_s
+        self._result_timeout_s = result_timeout_s
         self._transfer: Transfer | None = None
         self._waiting: _Waiting | None = None
         self.deadline: float | None = None
@@ -79,7 +86,7 @@ class SdoServer:
         return [self._abort(refusal.code, waiting.index, waiting.subindex)]
 
     def tick(self, now: float) -> list[bytes]:
-        """Abort the transfer whose client has been silent for too long."""
+        """Abort the transfer whose client is silent, or whose result stays away, for too long."""
         under_way = self._transfer or self._waiting
         if under_way is None or self.deadline is None or now < self.deadline:
             return []
@@ -112,9 +119,10 @@ class SdoServer:
             if self._transfer.deferred is not None:
                 self._waiting = _Waiting(self._transfer.deferred, [], index, subindex)
             self._transfer = None
+        self.deadline = now + self._timeout_s if self.busy else None
         if self._waiting is not None:
             self._waiting.answers, answers = answers, []
-        self.deadline = now + self._timeout_s if self.busy else None
+            self.deadline = now + self._result_timeout_s
         return answers
 
     def _streaming(self) -> bool:

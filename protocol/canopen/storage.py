@@ -59,7 +59,8 @@ class FileStorage:
     Parameters
     ----------
     path
-        The file; its folder is made at the first save.
+        The file; its folder is made at the first save. One process at a time may use it (the emulator locks its
+        state folder): the new file always has the same name, so that a killed save leaves nothing for good.
     """
 
     def __init__(self, path: Path) -> None:
@@ -109,7 +110,7 @@ class FileStorage:
 
     def _write(self, groups: Mapping[str, Mapping[str, str]]) -> None:
         text = json.dumps({"crc32": _checksum(groups), "groups": groups}, indent=1)
-        temporary = self._path.with_name(f"{self._path.name}.{os.getpid()}.new")
+        temporary = self._path.with_name(f"{self._path.name}.new")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with temporary.open("w", encoding="ascii") as file:

@@ -118,8 +118,8 @@ class HubTransport(ReturningTransport[CanFrame]):
             _, connection = await loop.create_connection(
                 lambda: _Connection(self._take, self._ended), self._host, self._port
             )
-        except OSError as error:
-            reason = os.strerror(error.errno) if error.errno else str(error)
+        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
             raise TransportError(
                 f"CAN {self.description}: cannot connect: {reason}; start `starhil hub --port {self._port}` first"
             ) from None
@@ -133,6 +133,8 @@ class HubTransport(ReturningTransport[CanFrame]):
             raise TransportError(
                 f"CAN {self.description}: no answer within {HANDSHAKE_S:g} s; is this a socketcand server?"
             ) from None
+        if connection.transport is None:  # gone after its last answer: `_ended` did not take it for ours
+            raise TransportError(f"CAN {self.description}: lost: the hub closed the connection")
         self._connection = connection
 
     async def _shake_hands(self, connection: _Connection) -> None:

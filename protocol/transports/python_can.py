@@ -31,8 +31,11 @@ READS_PER_TURN: Final = 256
 SENDS_PER_TURN: Final = 64
 """Frames sent before the loop serves others."""
 
-ECHO_S: Final = 0.5
+ECHO_S: Final = 5.0
 """How long an own frame is expected to come back on buses that echo."""
+
+ECHO_LIMIT: Final = 10_000
+"""Own frames that are expected to come back at most; the oldest is given up."""
 
 BUS_OFF: Final = 0x40
 """Flag of the kernel's error frames: the controller has left the bus."""
@@ -58,7 +61,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
     def __init__(self, description: str, open_bus: OpenBus, *, echoes: bool = False) -> None:
         super().__init__(description)
         self._open_bus = open_bus
-        self._echoes: deque[tuple[float, CanFrame]] | None = deque() if echoes else None
+        self._echoes: deque[tuple[float, CanFrame]] | None = deque(maxlen=ECHO_LIMIT) if echoes else None
         self._bus: can.BusABC | None = None
         self._fd = -1
         self._thread: threading.Thread | None = None

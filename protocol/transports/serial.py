@@ -395,8 +395,8 @@ class _ConnectTransport(_TcpTransport):
         loop = asyncio.get_running_loop()
         try:
             await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
-        except OSError as error:
-            reason = os.strerror(error.errno) if error.errno else str(error)
+        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
             raise TransportError(
                 f"serial {self.description}: cannot connect: {reason}; start the peer first"
             ) from None
@@ -416,9 +416,10 @@ class _ListenTransport(_TcpTransport):
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: _StreamProtocol(self), self._host, self._port)
-        except OSError as error:
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else None
             raise TransportError(
-                f"serial {self.description}: cannot listen: {error.strerror}; choose another port"
+                f"serial {self.description}: cannot listen: {reason or error}; choose another host or port"
             ) from None
         self._port = self._server.sockets[0].getsockname()[1]
         self.description = f"socket://{self._host}:{self._port}"

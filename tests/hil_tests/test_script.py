@@ -8,7 +8,7 @@ import pytest
 
 from hil_tests.attitude import attitude_error, from_radec_roll
 from hil_tests.errors import ScriptError
-from hil_tests.expect import Variable
+from hil_tests.expect import Expectation, Variable
 from hil_tests.script import load_script
 from hil_tests.script_model import Command, Read, Sample, Send
 from hil_tests.session_run import SCRIPT_FOLDER, find_script
@@ -153,6 +153,23 @@ def test_a_full_script_is_read_as_it_stands(load):
         ("[[step]]\nset_parameter = 'xyzzy'\nvalue = 1", ["'xyzzy'", "`starhil icd list` lists all"]),
         ("[[step]]\nread = 'rates'\nexpect = { xyzzy = 1 }", ["'xyzzy'; its fields: rate_x, rate_y"]),
         ("[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'xyzzy' }", ["; one of: boot, standby,"]),
+        (
+            "[[step]]\nread = 'image_frame'\nexpect = { data = 'hello' }",
+            ["step 1", "'data' is 128 bytes in hexadecimal, not 'hello'"],
+        ),
+        (
+            "[[step]]\nread = 'hole_map_1'\nexpect = { map = { not = '00 11' } }",
+            ["'map' is 16 bytes in hexadecimal, not '00 11'"],
+        ),
+        (
+            "[[step]]\nread = 'hole_map_1'\nexpect = { map = { one_of = ['" + "00" * 16 + "', 5] } }",
+            ["'map' is 16 bytes in hexadecimal, not '5'"],
+        ),
+        ("[[step]]\nread = 'hole_map_1'\nexpect = { map = true }", ["'map' is 16 bytes", "not 'true'"]),
+        (
+            "[[step]]\nread = 'hole_map_1'\nexpect = { map = { min = 1 } }",
+            ["'map' is bytes, and 'min' is for"],
+        ),
     ],
 )
 def test_a_mistake_is_answered_with_file_step_name_and_near_matches(load, text, words):
@@ -167,6 +184,19 @@ def test_a_captured_value_may_be_used_by_later_steps_only(load):
         "[[step]]\nread = 'boot_status'\nexpect = { boot_count = { value = '$boots', plus = 1 } }"
     )
     assert script.steps[1].expect[0].equals == Variable("boots")
+
+
+def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
+    zeros, ones = bytes(16), b"\xff" * 16
+    wanted = f"value = '{zeros.hex()}', one_of = ['{zeros.hex(' ').upper()}', '$map'], not = '{ones.hex()}'"
+    script = load(
+        "[[step]]\nread = 'hole_map_1'\ncapture = { map = 'map' }\n"
+        f"[[step]]\nread = 'hole_map_1'\nexpect = {{ map = {{ {wanted} }} }}"
+    )
+    (expectation,) = script.steps[1].expect
+    assert expectation == Expectation("map", equals=zeros, one_of=(zeros, Variable("map")), differs_from=ones)
+    assert expectation.mismatch(zeros, {"map": ones}) is None
+    assert expectation.mismatch(ones, {"map": ones}) is not None
 
 
 def test_values_that_a_honest_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):

@@ -25,6 +25,8 @@ from protocol.socketcand import (
     parse_send,
 )
 
+PATIENCE_S = 20.0
+
 
 class Peer:
     """A client that speaks the text protocol by hand."""
@@ -46,7 +48,7 @@ class Peer:
         self.writer.write(text.encode() if isinstance(text, str) else text)
 
     async def read(self) -> str:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(PATIENCE_S):
             return (await self.reader.readuntil(b">")).decode()
 
     async def frame(self) -> CanFrame:
@@ -243,11 +245,11 @@ def _python_can_exchange(port: int) -> None:
         for message in sent:
             one.send(message)
         for message in sent:
-            received = two.recv(5)
+            received = two.recv(PATIENCE_S)
             assert received is not None
             assert received.equals(message, timestamp_delta=None, check_channel=False, check_direction=False)
         two.send(sent[0])
-        assert one.recv(5) is not None
+        assert one.recv(PATIENCE_S) is not None
     finally:
         for bus in buses:
             bus.shutdown()
@@ -261,10 +263,9 @@ def test_python_can_talks_over_the_hub() -> None:
 
 
 def _join_busy_bus(port: int) -> None:
-    for _ in range(5):
-        bus = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="vcan0")
-        assert bus.recv(5) is not None
-        bus.shutdown()
+    bus = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="vcan0")
+    assert bus.recv(PATIENCE_S) is not None
+    bus.shutdown()
 
 
 def test_python_can_can_join_a_busy_bus() -> None:
@@ -277,7 +278,7 @@ def test_python_can_can_join_a_busy_bus() -> None:
                 await asyncio.sleep(0.0005)
 
         task = asyncio.create_task(babble())
-        await asyncio.to_thread(_join_busy_bus, hub.port)
+        await asyncio.gather(*(asyncio.to_thread(_join_busy_bus, hub.port) for _ in range(5)))
         task.cancel()
 
     run(scenario)
@@ -326,3 +327,38 @@ def test_any_text_is_a_frame_or_a_command_error(text: bytes) -> None:
             assert str(error)  # noqa: PT017
         except ProtocolError as error:
             assert "CAN" in str(error)  # noqa: PT017
+
+
+# -- a log that cannot be written, a host that is none ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", ["write", "flush", "close"])
+def test_a_full_disk_ends_the_log_and_nothing_else(
+    at: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("protocol.hub.FLUSH_LOG_S", 0.001 if at == "flush" else 3600.0)
+
+    async def scenario(hub: CanHub) -> None:
+        one, two = await Peer.join(hub), await Peer.join(hub)
+        batch = 200 if at == "write" else 1  # more than the log holds back, or less
+        for number in range(3):
+            one.write(format_send(CanFrame(number, bytes(8))) * batch)
+            for _ in range(batch):
+                assert (await two.frame()).id == number
+            if at == "flush":
+                async with asyncio.timeout(PATIENCE_S):
+                    while not caplog.records:
+                        await asyncio.sleep(0)
+        assert hub.statistics.clients == 2
+        assert len(caplog.records) == (0 if at == "close" else 1)
+
+    run(scenario, log=Path("/dev/full"))
+    assert [record.getMessage() for record in caplog.records] == [
+        "CAN hub: log /dev/full ends here: No space left on device; the bus goes on"
+    ]
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 64])
+def test_a_host_that_cannot_be_a_name_is_told(host: str) -> None:
+    with pytest.raises(ProtocolError, match=rf"cannot listen at {host}:0: .*; choose another --host"):
+        asyncio.run(CanHub(host, 0).start())

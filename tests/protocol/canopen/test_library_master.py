@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Self
 
 import can
@@ -14,6 +15,9 @@ from protocol.can_framing import CanFrame
 from protocol.canopen import build_eds
 
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
+PATIENCE_S = 20.0
+BOOT_UP, OPERATIONAL = 0, 5
+"""States as a heartbeat tells them."""
 
 
 def test_reads_and_writes_by_name(bench, master):
@@ -123,15 +127,25 @@ class SlaveThread:
             self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
 
 
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until something is true; the deadline only ends a test that fails."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 @pytest.fixture
 def network(new_bench, tmp_path, request):
     eds = tmp_path / "node.eds"
-    bench = new_bench()
+    bench = new_bench(sdo_timeout_s=PATIENCE_S)
     bench.show(FRAME[:60_000])
     eds.write_text(build_eds(bench.dictionary), encoding="ascii")
     network = canopen.Network()
     network.connect(interface="virtual", channel=request.node.name)
+    network.lss.RESPONSE_TIMEOUT = PATIENCE_S
     node = network.add_node(canopen.RemoteNode(bench.node, str(eds)))
+    node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
     with SlaveThread(bench, request.node.name):
         yield bench, network, node
         network.disconnect()
@@ -139,31 +153,31 @@ def network(new_bench, tmp_path, request):
 
 def test_whole_session_over_a_bus(network):
     bench, _, node = network
-    node.nmt.wait_for_heartbeat(timeout=5)
+    node.nmt.wait_for_heartbeat(timeout=PATIENCE_S)
     assert node.nmt.state == "PRE-OPERATIONAL"
     node.sdo["Producer heartbeat time"].raw = 50
     received = threading.Event()
     node.tpdo.read()
     node.tpdo[3].add_callback(lambda _: received.set())
+    told: list[int] = []
+    node.nmt.add_heartbeat_callback(told.append)
     node.nmt.state = "OPERATIONAL"
-    node.nmt.wait_for_heartbeat(timeout=5)
-    assert node.nmt.state == "OPERATIONAL"
-    assert received.wait(5)
+    until(lambda: OPERATIONAL in told)
+    assert received.wait(PATIENCE_S)
     with node.sdo["Frame"]["pixels"].open("rb", block_transfer=True) as file:
         assert file.read() == FRAME[:60_000]
-    emergencies: list[int] = []
-    node.emcy.add_callback(lambda error: emergencies.append(error.code))
     node.network.send_message(0x80, b"\x01")
-    assert node.emcy.wait(0x8240, timeout=5).register == 0x11
+    until(lambda: any(error.code == 0x8240 for error in node.emcy.log))
+    assert [error.register for error in node.emcy.log if error.code == 0x8240] == [0x11]
+    assert BOOT_UP not in told
     node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(timeout=5)
+    until(lambda: BOOT_UP in told)
     assert bench.slave.node_id == 0x2C
 
 
 def test_lss_over_a_bus(network):
     bench, network_, _ = network
     lss = network_.lss
-    lss.RESPONSE_TIMEOUT = 2.0
     assert lss.send_switch_state_selective(0, 0x53544152, 0x10000, 1)
     assert lss.inquire_node_id() == bench.node
     assert lss.inquire_lss_address(
@@ -172,7 +186,4 @@ def test_lss_over_a_bus(network):
     lss.configure_node_id(0x31)
     lss.send_switch_state_global(lss.WAITING_STATE)
     network_.nmt.send_command(130)
-    deadline = time.monotonic() + 5
-    while bench.slave.node_id != 0x31 and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert bench.slave.node_id == 0x31
+    until(lambda: bench.slave.node_id == 0x31)

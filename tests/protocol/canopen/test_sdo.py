@@ -491,10 +491,37 @@ def test_deferred_segmented_and_block_download(bench, later):
     assert finish(bench, later) == [(0x5AC, "a100000000000000")]
 
 
+DEFERRED_WRITES = pytest.mark.parametrize(
+    ("requests", "answer"),
+    [
+        (["2f 00 60 00 02"], "6000600000000000"),
+        (["20 42 60 00", "0b 02 03"], "2000000000000000"),
+        (["c2 42 60 00 02", "81 02 03", "d5"], "a100000000000000"),
+    ],
+    ids=["expedited", "segmented", "block"],
+)
+
+
+@DEFERRED_WRITES
+def test_result_may_come_later_than_a_client_may_be_silent(bench, later, requests, answer):
+    for request in requests:
+        bench.sdo(request)
+    assert not [sent for sent in bench.advance(29.9) if sent[1] == 0x5AC]
+    assert finish(bench, later) == [(0x5AC, answer)]
+
+
 def test_deferred_write_times_out(bench, later):
     bench.sdo("2f 00 60 00 02")
-    assert (0x5AC, abort("006000", AbortCode.TIMEOUT)) in [(i, d.hex()) for _, i, d in bench.advance(1.0)]
+    answers = [(i, d.hex()) for _, i, d in bench.advance(30.0) if i == 0x5AC]
+    assert answers == [(0x5AC, abort("006000", AbortCode.TIMEOUT))]
     assert finish(bench, later) == []
+
+
+def test_silent_client_times_out_again_after_a_deferred_write(bench, later):
+    bench.sdo("2f 00 60 00 02")
+    finish(bench, later)
+    bench.sdo("40" + NAME)
+    assert bench.slave.next_deadline() == bench.now + 1.0
 
 
 @pytest.mark.parametrize("request_", ["40 01 10 00", "80 00 60 00"])

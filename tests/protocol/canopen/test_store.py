@@ -245,3 +245,19 @@ def test_killed_in_the_midst_of_saving_the_file_is_whole(tmp_path):
         assert len(values) == 50
         assert len(set(values.values())) == 1
         json.loads(path.read_text(encoding="ascii"))
+        assert {item.name for item in tmp_path.iterdir()} <= {"node.json", "node.json.new"}
+    FileStorage(path).save("a", {})
+    assert [item.name for item in tmp_path.iterdir()] == ["node.json"]
+
+
+def test_what_a_killed_save_left_is_used_up_by_the_next_one(tmp_path, monkeypatch):
+    storage = FileStorage(tmp_path / "node.json")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", Mock(side_effect=KeyboardInterrupt))  # no OSError: nothing is cleared away
+        for process in (1001, 1002):
+            patch.setattr(os, "getpid", Mock(return_value=process))
+            with pytest.raises(KeyboardInterrupt):
+                storage.save("a", {"x": b"\x01"})
+    assert [item.name for item in tmp_path.iterdir()] == ["node.json.new"]
+    storage.save("a", {"x": b"\x02"})
+    assert [item.name for item in tmp_path.iterdir()] == ["node.json"]

@@ -1,0 +1,59 @@
+"""Reports of the commands: refused before the run, and written whatever becomes of the emulator."""
+
+from __future__ import annotations
+
+import json
+import sys
+from xml.etree import ElementTree as ET
+
+import pytest
+from typer.testing import CliRunner
+
+from emulator.cli.app import build_app
+from hil_tests import session_run
+from hil_tests.conformance import conformance_run
+from hil_tests.emulator_process import EmulatorProcess
+from hil_tests.errors import BenchError
+from hil_tests.own_hub import OwnHub
+
+DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
+
+
+def run_command(*words: object):
+    return CliRunner().invoke(build_app(), list(map(str, words)))
+
+
+@pytest.mark.parametrize(
+    "words", [("conformance", "--junit"), ("conformance", "--html"), ("session", "first_light", "--junit")]
+)
+def test_a_report_that_cannot_be_written_is_refused_before_the_run(words, tmp_path, monkeypatch):
+    def never(*_arguments, **_options):
+        raise AssertionError("the run began")
+
+    monkeypatch.setattr(conformance_run, "_start", never)
+    monkeypatch.setattr(session_run, "Bench", never)
+    monkeypatch.chdir(tmp_path)
+    outcome = run_command(*words, ".", "--start")
+    assert isinstance(outcome.exception, BenchError), outcome.exception
+    assert "is a folder" in str(outcome.exception)
+
+
+@pytest.mark.process
+def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_report(tmp_path, monkeypatch):
+    script = tmp_path / "s.toml"
+    script.write_text("[[step]]\nwait_s = 0\n", encoding="ascii")
+    junit = tmp_path / "out" / "j.xml"
+    with OwnHub() as hub:
+        process = EmulatorProcess([sys.executable, "-c", DIES.format(hub.channel)])
+        monkeypatch.setattr(session_run, "_emulator", lambda *_arguments: process)
+        run = session_run.SessionRunner.run
+        monkeypatch.setattr(
+            session_run.SessionRunner, "run", lambda self: (process.process.wait(timeout=60), run(self))[1]
+        )
+        words = ("--start", "--can", hub.channel, "--log", tmp_path, "--junit", junit, "--json")
+        outcome = run_command("session", script, *words)
+    assert outcome.exit_code == 1, outcome.output
+    *_, end = json.loads(outcome.stdout)["results"]
+    assert (end["step"], end["status"]) == (2, "failed")
+    assert "by itself with status 7: no more sky" in end["detail"]
+    assert ET.parse(junit).getroot().get("failures") == "1"

@@ -1,0 +1,134 @@
+"""What is left of a run: reports in their folders, and the last words of an emulator that did not last."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil_tests.bench import Bench, LinkOptions
+from hil_tests.conformance import conformance_run
+from hil_tests.conformance.conformance_run import ConformanceRequest, run_conformance
+from hil_tests.conformance.report import write_html_report, write_junit_report
+from hil_tests.emulator_process import EmulatorProcess
+from hil_tests.errors import BenchError, EmulatorProcessError
+from hil_tests.results import prepare_report, write_junit, write_report
+from protocol.icd import load_icd
+
+READY = "import sys, time; print('ready serial=none', flush=True); "
+DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"
+LASTS = READY + "time.sleep(600)"
+LAST_WORDS = "by itself with status 7: Segmentation of the sky"
+
+
+def emulator(text: str) -> EmulatorProcess:
+    return EmulatorProcess([sys.executable, "-c", text])
+
+
+def bench(text: str) -> Bench:
+    return Bench(LinkOptions(serial="auto"), load_icd(), emulator=emulator(text))
+
+
+def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -> None:
+    """Wait for the end of one that ends by itself, then raise the error if there is one."""
+    if process.command[-1] == DIES:
+        process.process.wait(timeout=60)
+    if error is not None:
+        raise error
+
+
+@pytest.mark.process
+def test_an_emulator_that_ended_by_itself_is_told_of_with_its_last_words():
+    with pytest.raises(EmulatorProcessError, match=LAST_WORDS), bench(DIES) as own:
+        wait_for_its_end(own.emulator)
+    assert own.emulator.process.stdout.closed
+    assert own.emulator.process.stderr.closed
+
+
+@pytest.mark.process
+def test_it_is_the_reason_for_what_came_of_its_end():
+    with pytest.raises(EmulatorProcessError, match=LAST_WORDS), bench(DIES) as own:
+        wait_for_its_end(own.emulator, BenchError("no reply"))
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("text", [DIES, LASTS])
+def test_another_error_is_not_hidden_by_it(text):
+    with pytest.raises(ZeroDivisionError), bench(text) as own:
+        wait_for_its_end(own.emulator, ZeroDivisionError())
+    assert not own.emulator.running
+    assert own.emulator.process.stderr.closed
+
+
+@pytest.mark.process
+def test_an_end_that_a_restart_has_told_of_is_not_told_of_again():
+    with bench(DIES) as own:
+        wait_for_its_end(own.emulator)
+        with pytest.raises(EmulatorProcessError, match=LAST_WORDS):
+            own.restart("term")
+
+
+@pytest.mark.process
+def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_says_so(monkeypatch):
+    def start(_request, stack):
+        process = stack.enter_context(emulator(DIES))
+        wait_for_its_end(process)
+        return None, None
+
+    monkeypatch.setattr(conformance_run, "_start", start)
+    told = []
+    outcomes = run_conformance(ConformanceRequest(serial="auto", start=True), told.append)
+    assert [(outcome.id, outcome.status) for outcome in outcomes] == [("emulator.end", "failed")]
+    assert LAST_WORDS in outcomes[0].seen
+    assert told == outcomes
+
+
+WRITERS = pytest.mark.parametrize(
+    "write",
+    [
+        prepare_report,
+        lambda path: write_report(path, b"x"),
+        lambda path: write_junit(path, "suite", [], 0.0),
+        lambda path: write_junit_report(path, []),
+        lambda path: write_html_report(path, [], "unit"),
+    ],
+    ids=["before", "any", "junit", "conformance-junit", "html"],
+)
+
+
+@WRITERS
+def test_the_folder_of_a_report_is_made(write, tmp_path):
+    path = tmp_path / "out" / "deeper" / "report"
+    write(path)
+    assert path.parent.is_dir()
+    assert [item.name for item in path.parent.iterdir()] == ([] if write is prepare_report else ["report"])
+
+
+@WRITERS
+def test_a_folder_is_no_report(write, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in (Path(), tmp_path):
+        with pytest.raises(BenchError, match="is a folder; name the file of the report"):
+            write(path)
+
+
+@WRITERS
+def test_a_folder_that_cannot_be_made_is_told_in_one_line(write, tmp_path):
+    (tmp_path / "file").write_text("", encoding="ascii")
+    for path in (tmp_path / "file" / "report", tmp_path / "file" / "deeper" / "report"):
+        with pytest.raises(BenchError, match=r"report: its folder cannot be made: [A-Z].*"):
+            write(path)
+
+
+def test_a_report_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch):
+    path = tmp_path / "report"
+    write_report(path, b"old")
+
+    def full(_path, _data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(BenchError, match="cannot be written: No space left on device"):
+        write_report(path, b"new")
+    assert [(item.name, item.read_bytes()) for item in tmp_path.iterdir()] == [("report", b"old")]
