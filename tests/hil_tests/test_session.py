@@ -221,7 +221,7 @@ def test_samples_go_to_a_csv_file_with_all_digits(play, device, tmp_path):
     assert [item.status for item in result.results] == ["passed", "failed"]
     with (tmp_path / "a.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == result.results[0].figures["samples"] >= 5
+    assert len(rows) == result.results[0].figures["samples"] >= 1
     assert float(rows[0]["q_w"]) == pytest.approx(attitude_values(5.0)["q_w"], abs=1e-7)
     assert (rows[0]["valid"], rows[0]["mode"], float(rows[0]["time_of_exposure"])) == ("1", "tracking", 100.5)
     assert float(rows[0]["latency_ms"]) > 0.0

@@ -142,6 +142,11 @@ class CanOracle:
     address: int = 4
     _open: dict[int, tuple[int, int, bytes]] = field(default_factory=dict)
 
+    @property
+    def unfinished(self) -> list[int]:
+        """Identifiers of the segmented messages that are under way."""
+        return list(self._open)
+
     def take(
         self, identifier: int, data: bytes, *, extended: bool, remote: bool
     ) -> tuple[int, bytes, int] | None:

@@ -9,14 +9,13 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from protocol.transports.can import kernel_can_is_up
-from tests.test_docs import Exchange, blocks, dumped, exchanges, fixed
+from tests.test_docs import UNASKED, Exchange, blocks, dumped, exchanges, fixed
 
 pytestmark = [
     pytest.mark.process,
@@ -30,8 +29,6 @@ pytestmark = [
 ROOT = Path(__file__).parents[2]
 READY_WITHIN_S = 180.0
 PATIENCE_S = 30.0
-UNASKED = 0x0CE60401
-"""Unsolicited telemetry, which goes on while the next line is typed."""
 
 
 class Typed:
@@ -52,11 +49,10 @@ class Typed:
     def next_line(self, within_s: float = PATIENCE_S) -> str:
         return self._lines.get(timeout=within_s)
 
-    def forget(self) -> None:
-        """Let go of what has come, with what is under way."""
-        time.sleep(0.5)
-        while not self._lines.empty():
-            self._lines.get()
+    def skip_past(self, identifier: str) -> None:
+        """Let go of what candump has shown and will show until a frame, and of that frame."""
+        while self.next_line().split()[1] != identifier:
+            pass
 
     def end(self) -> None:
         self._process.terminate()
@@ -94,9 +90,9 @@ def emulator_and_dump(lines: list[str], environment: dict[str, str]) -> Iterator
         assert emulator.next_line(READY_WITHIN_S).startswith("ready can=socketcan:vcan0 ")
         with running(candump.removesuffix(" &"), environment) as dump:
             with running("cangen vcan0 -g 20 -I 7FE", environment):
-                while "7FE" not in dump.next_line():  # until candump listens
-                    pass
-            dump.forget()
+                dump.skip_past("7FE")  # candump listens
+            subprocess.run(["cansend", "vcan0", "7FD#"], check=True, env=environment)
+            dump.skip_past("7FD")  # nothing of cangen is under way any more
             yield dump
 
 
@@ -106,7 +102,7 @@ def check(found: list[Exchange], dump: Typed, environment: dict[str, str]) -> No
         subprocess.run(["sh", "-c", exchange.typed], check=True, env=environment)
         for shown in (exchange.sent, *exchange.answers):
             frame = dumped(dump.next_line())
-            while frame.id == UNASKED != shown.id:
+            while shown.id != frame.id in UNASKED:
                 frame = dumped(dump.next_line())
             assert (hex(frame.id), frame.extended, len(frame.data)) == (
                 hex(shown.id),
