@@ -22,6 +22,7 @@ from emulator.reproduce.experiment import (
 )
 from emulator.reproduce.lsi_trials import COLUMNS, OFF, ON, ROWS, share, solve_frames
 from emulator.reproduce.plots import colours, figure, precision_curve, save
+from starid.thesis.metrics import error_colours
 
 _PUBLISHED: Final = {0.3: 100.0, 0.2: 92.24, 0.1: 71.43, 0.013: 59.20, 0.008: 58.67, 0.002: 57.79}
 _ON_TARGET: Final = {0.3: 99.9, 0.2: 92.0, 0.1: 71.0}
@@ -83,9 +84,9 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _error_map(axes: Any, errors: NDArray[np.float64], limit: float) -> Any:
-    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.colors import ListedColormap
 
-    scheme = LinearSegmentedColormap.from_list("error", [(0.0, 0.75, 0.0), (1.0, 0.0, 0.0)])
+    scheme = ListedColormap(error_colours(np.linspace(0.0, 1.0, 256), 1.0))
     image = axes.imshow(
         errors.reshape(ROWS, COLUMNS),
         origin="lower",

@@ -24,6 +24,12 @@ def rotation_error(angle_deg: ArrayLike, true_angle_deg: ArrayLike) -> NDArray[n
     return np.asarray(np.abs(turn), dtype=np.float64)
 
 
+def error_colours(error: ArrayLike, greatest: float) -> NDArray[np.float64]:
+    """Colours of an error map, eq. 6.1: from green at 0 to red at `greatest` and beyond, RGB 0 … 1, (…, 3)."""
+    share = np.clip(np.asarray(error, dtype=np.float64) / greatest, 0.0, 1.0)
+    return np.stack([share, 1.0 - share, np.zeros_like(share)], axis=-1)
+
+
 @dataclass(frozen=True, slots=True)
 class Confusion:
     """Confusion matrix of a false-star filter, and the indicators of eq. 6.2 made of it.

@@ -9,7 +9,7 @@ import pytest
 
 from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.metrics import boresight_error, rotation_error
+from starid.thesis.metrics import boresight_error, error_colours, rotation_error
 from starid.thesis.rsi import (
     RecursiveIdentification,
     RsiError,
@@ -111,6 +111,7 @@ def test_noise_has_the_moments_asked_for():
 def test_measures():
     assert float(boresight_error(359.9, 10.0, 0.1, 10.0)) == pytest.approx(0.2)
     assert float(rotation_error(-179.0, 179.0)) == pytest.approx(2.0)
+    np.testing.assert_allclose(error_colours([0.0, 0.05, 7.0], 0.1), [[0, 1, 0], [0.5, 0.5, 0], [1, 0, 0]])
     x = np.arange(10.0)
     rho, p = correlation(x, 2.0 * x + 1.0)
     assert rho == pytest.approx(1.0)
