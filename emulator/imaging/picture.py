@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from dataclasses import replace
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from emulator.errors import EmulatorError
 from emulator.imaging.binning import mean_over_squares
 from emulator.imaging.frames import (
+    ZERO,
     Failure,
     FrameRequest,
     FrameResult,
@@ -54,6 +56,10 @@ REASONS: Final[dict[Reason, str]] = {
 """Reason of the identification → its name in telemetry."""
 
 
+_WARM_UP_RATES_RAD_S: Final = ((1e-3, 0.0, 0.0), (0.03, 0.0, 0.0))
+"""Rates at which the stars of a default exposure are round, and at which they leave trails of some pixels."""
+
+
 def make_picture(setup: PipelineSetup) -> tuple[Picture, Warm] | Failure:
     """Make the pipeline and solve a first frame with it, or say in one line why it cannot be."""
     begin = time.perf_counter()
@@ -80,7 +86,10 @@ class Picture:
         self._last: Frame | None = None
 
     def warm_up(self) -> None:
-        """Make and solve one frame of the default settings, lost in space and tracking, so that no kernel is cold."""
+        """Make and solve frames of the default settings, lost in space and tracking, so that no kernel is cold.
+
+        A kernel that is compiled in a run stops the frames for seconds, so the stars leave trails on some.
+        """
         camera = self.camera
         k1, k2, p1, p2, _ = camera.distortion
         settings = SolverSettings(
@@ -97,17 +106,18 @@ class Picture:
         request = FrameRequest(
             index=0,
             attitude_xyzw=here,
-            rate_rad_s=(1e-3, 0.0, 0.0),
+            rate_rad_s=ZERO,
             exposure_s=0.1,
             gain=self._sensor.gain,
             settings=settings,
         )
         if helper is not None:
-            frame = self._renderer.render(Attitude.identity(), request.rate_rad_s)
-            detect(frame.image, detection_settings(self._sensor, settings))
+            for rate in _WARM_UP_RATES_RAD_S:
+                frame = self._renderer.render(Attitude.identity(), rate)
+                detect(frame.image, detection_settings(self._sensor, settings))
             helper.wait()  # what it has compiled is loaded below; what it could not is compiled there
-        for predicted in (None, here):
-            self._frame(replace(request, predicted_xyzw=predicted))
+        for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, here)):
+            self._frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
         self._last = None
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
