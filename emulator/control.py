@@ -43,7 +43,7 @@ from emulator.truth.live import LiveTruth
 from emulator.truth.log import compare
 from emulator.truth.source import TruthState
 from emulator.wording import explain
-from protocol.errors import ProtocolError
+from protocol.errors import ProtocolError, reason
 from starid.errors import StaridError
 
 if TYPE_CHECKING:
@@ -100,9 +100,8 @@ class ControlServer:
         try:
             self._server = await asyncio.start_server(self._serve, host, int(port), limit=MAX_LINE)
         except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
-            reason = error.strerror if isinstance(error, OSError) else None
             raise EmulatorError(
-                f"control channel {where}: cannot listen ({reason or error}); choose another port, or auto"
+                f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"
             ) from None
         address = self._server.sockets[0].getsockname()
         return f"{address[0]}:{address[1]}"

@@ -19,7 +19,7 @@ from typing import Final, TextIO, cast
 
 from protocol.can_framing import CanFrame
 from protocol.candump import format_candump
-from protocol.errors import ProtocolError
+from protocol.errors import ProtocolError, reason
 from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
@@ -216,8 +216,7 @@ class CanHub:
         except (OSError, UnicodeError) as error:
             remedy = "--host" if isinstance(error, UnicodeError | socket.gaierror) else "--port"
             raise ProtocolError(
-                f"CAN hub: cannot listen at {self.host}:{self.port}: {getattr(error, 'strerror', None) or error}; "
-                f"choose another {remedy}"
+                f"CAN hub: cannot listen at {self.host}:{self.port}: {reason(error)}; choose another {remedy}"
             ) from None
         self.port = self._server.sockets[0].getsockname()[1]
         if self._log_path is not None:
@@ -291,9 +290,7 @@ class CanHub:
     def _give_up_log(self, error: OSError) -> None:
         """Say once that the log ends here; the bus goes on without it."""
         log, self._log = self._log, None
-        _LOGGER.warning(
-            "CAN hub: log %s ends here: %s; the bus goes on", self._log_path, error.strerror or error
-        )
+        _LOGGER.warning("CAN hub: log %s ends here: %s; the bus goes on", self._log_path, reason(error))
         if log is not None:
             with contextlib.suppress(OSError):  # what it holds back cannot be written either
                 log.close()

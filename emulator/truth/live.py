@@ -32,6 +32,7 @@ import numpy as np
 
 from emulator.errors import EmulatorError
 from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
+from protocol.errors import reason
 from starid.attitude import Attitude, interpolate, propagate, rate_between
 
 HISTORY: Final = 512
@@ -235,9 +236,8 @@ class LiveFeed:
                 self._server = await asyncio.start_server(self._serve, host, port, limit=MAX_LINE)
                 address = self._server.sockets[0].getsockname()
         except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
-            reason = error.strerror if isinstance(error, OSError) else None
             raise EmulatorError(
-                f"truth feed {protocol}:{host}:{port}: cannot listen ({reason or error}); choose another port, or 0"
+                f"truth feed {protocol}:{host}:{port}: cannot listen ({reason(error)}); choose another port, or 0"
             ) from None
         return f"{protocol}:{address[0]}:{address[1]}"
 

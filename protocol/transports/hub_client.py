@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 from collections.abc import Awaitable, Callable
 from typing import Final, cast
 
 from protocol.can_framing import CanFrame
+from protocol.errors import reason
 from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from protocol.transports.base import ReturningTransport, TransportError
@@ -119,9 +119,8 @@ class HubTransport(ReturningTransport[CanFrame]):
                 lambda: _Connection(self._take, self._ended), self._host, self._port
             )
         except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
-            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
             raise TransportError(
-                f"CAN {self.description}: cannot connect: {reason}; start `starhil hub --port {self._port}` first"
+                f"CAN {self.description}: cannot connect: {reason(error)}; start `starhil hub --port {self._port}` first"
             ) from None
         try:
             await asyncio.wait_for(self._shake_hands(connection), HANDSHAKE_S)

@@ -76,6 +76,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
         try:
             bus = await self._open_in_thread()
         except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
+            # not the system's words: those of python-can name the interface
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise TransportError(f"CAN {self.description}: cannot open: {reason}") from None
         self._bus = bus
@@ -240,7 +241,7 @@ def _shut_down(opening: asyncio.Future[can.BusABC]) -> None:
 
 
 def _descriptor(bus: can.BusABC) -> int:
-    """File descriptor that tells when the bus has frames, or -1."""
+    """File descriptor that tells when the bus has frames, or -1: an interface may have none, nor slcan on a network port."""
     try:
         return bus.fileno()
     except (NotImplementedError, OSError):

@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 
 import serial
 
+from protocol.errors import reason
 from protocol.keepalive import notice_a_lost_peer
 from protocol.serial_framing import PacingSchedule
 from protocol.transports.base import ReturningTransport, Transport, TransportError
@@ -396,9 +397,8 @@ class _ConnectTransport(_TcpTransport):
         try:
             await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
         except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
-            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
             raise TransportError(
-                f"serial {self.description}: cannot connect: {reason}; start the peer first"
+                f"serial {self.description}: cannot connect: {reason(error)}; start the peer first"
             ) from None
 
     def _peer_gone(self, why: str) -> None:
@@ -417,9 +417,8 @@ class _ListenTransport(_TcpTransport):
         try:
             self._server = await loop.create_server(lambda: _StreamProtocol(self), self._host, self._port)
         except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else None
             raise TransportError(
-                f"serial {self.description}: cannot listen: {reason or error}; choose another host or port"
+                f"serial {self.description}: cannot listen: {reason(error)}; choose another host or port"
             ) from None
         self._port = self._server.sockets[0].getsockname()[1]
         self.description = f"socket://{self._host}:{self._port}"

@@ -7,8 +7,14 @@ import pytest
 from hil_tests.client import ObcClient
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.own_hub import OwnBus
+from protocol.transports.can import kernel_can_is_up
 
 FAST_BAUD = 921600
+
+needs_vcan0 = pytest.mark.skipif(
+    not kernel_can_is_up("vcan0"),
+    reason="no vcan0 here; tools/test_on_vcan runs this in a guest that has one",
+)
 
 
 @pytest.fixture(scope="module")

@@ -18,19 +18,13 @@ from hil_tests.client import ObcClient
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.raw_exchange import format_frame
 from protocol.candump import parse_candump, read_candump
+from tests.process.conftest import needs_vcan0
 from tests.process.test_sessions import starhil
 
-pytestmark = [pytest.mark.process, pytest.mark.socketcan]
+pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
 PATIENCE_S = 30.0
 READY_WITHIN_S = 180.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def needs_vcan0():
-    """Skip, by name, where there is no vcan0."""
-    if not os.path.exists("/sys/class/net/vcan0"):  # noqa: PTH110 -- one look, no path to keep
-        pytest.skip("no vcan0 here; tools/test_on_vcan runs these tests in a guest that has one")
 
 
 @pytest.fixture(scope="module")

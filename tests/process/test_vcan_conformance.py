@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.transports.can import kernel_can_is_up
+from tests.process.conftest import needs_vcan0
 from tests.process.test_conformance import conform
 
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.socketcan,
-    pytest.mark.skipif(
-        not kernel_can_is_up("vcan0"),
-        reason="no vcan0 here; tools/test_on_vcan runs this test in a guest that has one",
-    ),
-]
+pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
 
 SPEED = 0.5

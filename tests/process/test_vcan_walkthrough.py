@@ -14,17 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from protocol.transports.can import kernel_can_is_up
+from tests.process.conftest import needs_vcan0
 from tests.test_docs import UNASKED, Exchange, blocks, dumped, exchanges, fixed
 
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.socketcan,
-    pytest.mark.skipif(
-        not kernel_can_is_up("vcan0"),
-        reason="no vcan0 here; tools/test_on_vcan runs this in a guest that has one",
-    ),
-]
+pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
 ROOT = Path(__file__).parents[2]
 READY_WITHIN_S = 180.0

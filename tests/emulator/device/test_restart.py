@@ -2,6 +2,7 @@
 
 import pytest
 
+from emulator.device.device import do_at_once
 from emulator.device.state_store import FileStore
 from emulator.errors import EmulatorError
 from protocol.messages import ErrorCode
@@ -57,12 +58,7 @@ class LaterBackground:
     def catch_up(self):
         waiting, self.waiting = self.waiting, []
         for work, done in waiting:
-            try:
-                work()
-            except EmulatorError as error:
-                done(error)
-            else:
-                done(None)
+            do_at_once(work, done)
 
 
 def test_a_reset_before_the_disk_has_parameters_keeps_them(make_bench, tmp_path):
