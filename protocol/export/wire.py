@@ -6,9 +6,9 @@ from typing import Final
 
 from protocol.can_framing import SEGMENT_DATA, MessageType
 from protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, load_layout
-from protocol.export.describe import Section
 from protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from protocol.serial_framing import Dialect, encode_reply, encode_request
+from protocol.values import Section
 
 _TELEMETRY: Final = 0x80
 _TELECOMMAND: Final = 0x60
@@ -103,7 +103,13 @@ def _content(placed: PlacedObject) -> str:
     if placed.image is not None:
         return f"image {placed.image}: pixels as DOMAIN, size, frame counter"
     if placed.packed:
-        return "in narrower types: " + ", ".join(field.name or field.source for field in placed.packed)
+        return (
+            "in narrower types: "
+            + ", ".join(
+                f"{field.name or field.source}{' (wraps)' if field.wrap else ''}" for field in placed.packed
+            )
+            + "; a number beyond its type is clipped"
+        )
     if placed.telemetry is not None:
         return f"telemetry {placed.telemetry}: a sub-index a field"
     shown = [] if placed.value is None else [f"reads {placed.value}"]

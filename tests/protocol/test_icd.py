@@ -286,6 +286,52 @@ def test_bad_values_can_be_sent_on_purpose() -> None:
         ICD.telecommands["reset"].encode({"magic": 256}, check=False)
 
 
+def test_a_field_that_wraps_keeps_its_lowest_bits() -> None:
+    row = ICD.telemetry["identification"]
+    assert row.decode(row.encode({"runtime_s": 65536 + 7}, saturate=True))["runtime_s"] == 7
+    uptime = ICD.telemetry["device_status"]
+    after_50_days = 50 * 86400.0
+    wrapped = uptime.decode(uptime.encode({"uptime": after_50_days}, saturate=True))["uptime"]
+    assert wrapped == pytest.approx(after_50_days - 2**32 / 1000.0)
+    with pytest.raises(FieldError):
+        row.encode({"runtime_s": 65536})
+
+
+def test_a_row_names_the_fields_that_it_would_clip() -> None:
+    row = ICD.telemetry["rates"]
+    assert row.clipped({"rate_x": 3.27674, "rate_y": -3.27684, "rate_z": 0.0}) == []
+    assert row.clipped({"rate_x": 3.2768, "rate_y": -3.2769, "rate_z": 0.0}) == ["rate_x", "rate_y"]
+    assert ICD.telemetry["identification"].clipped({"runtime_s": 70000}) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "said"),
+    [
+        ('type = "i16", wrap = true', "only unsigned integers wrap"),
+        ('type = "f32", wrap = true', "only unsigned integers wrap"),
+        ('type = "u16", max = 7, wrap = true', "a field that wraps has no min and max"),
+    ],
+)
+def test_wrapping_is_for_unsigned_counters(tmp_path: Path, field: str, said: str) -> None:
+    text = """[definition]
+name = "x"
+version = "1"
+doc = "x"
+
+[[telemetry]]
+id = 200
+name = "row"
+doc = "x"
+provenance = "ours"
+size = SIZE
+fields = [{ name = "n", FIELD }]
+"""
+    size = "4" if "f32" in field else "2"
+    (tmp_path / "a.toml").write_text(text.replace("FIELD", field).replace("SIZE", size))
+    with pytest.raises(IcdError, match=said):
+        load_icd(tmp_path)
+
+
 def test_telemetry_saturates_as_the_unit_does() -> None:
     rates = ICD.telemetry["rates"]
     with pytest.raises(FieldError):
