@@ -43,9 +43,15 @@ def _serial() -> Section:
         f"A request is {request}, with every byte 1F of the data doubled; 8 data bits, no parity, 1 stop bit. "
         "The form of the replies is the parameter serial_dialect; the code is a number of the enumeration error_code."
     )
+    whom = (
+        "Dialect a is for OBC software written for the CubeComputer: a reply repeats the identifier. Dialect b is for software that "
+        "talks to a stand-alone node: a reply begins with the data, and only the request says what they are. Dialect c is "
+        "generation 2. Nothing in a message names its dialect: with b in place of a, each value is read from the byte after its own and "
+        "telecommands seem unanswered."
+    )
     return Section(
         "Serial line",
-        (text,),
+        (text, whom),
         ("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
         tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
     )
