@@ -246,6 +246,7 @@ class Emulation:
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(device, transport, seed)
             self.ready_words["serial"] = await self.serial.start()
+            self.ready_words["dialect"] = str(device.parameters["serial_dialect"])
         if links.can.channel != "off":
             from protocol.transports.can import open_can
 

@@ -83,6 +83,8 @@ class Field:
     """Name of the parameter that the field sets or reports."""
     provenance: str = "ours"
     doc: str = ""
+    wrap: bool = False
+    """Beyond its range telemetry carries the lowest bits (a counter) instead of the nearest limit."""
 
     @property
     def type(self) -> str:
@@ -150,6 +152,14 @@ class Field:
                 return min(max(0.0, low), high)
             case _:
                 return min(max(0, self.raw_limits[0]), self.raw_limits[1]) * self.scale + self.bias
+
+    def clips(self, value: float) -> bool:
+        """Whether telemetry would carry the nearest limit in place of a number."""
+        if self.wrap:
+            return False
+        low, high = self.physical_limits
+        slack = self.scale / 2.0 if self.kind == "integer" else 0.0
+        return not low - slack <= value <= high + slack
 
     def to_raw(
         self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
@@ -260,7 +270,9 @@ class Field:
         raw: int | float = number
         if self.scaled:
             raw = (number - self.bias) / self.scale
-        if saturate:
+        if saturate and self.wrap and math.isfinite(raw):
+            raw = round(raw) % (high + 1)
+        elif saturate:
             raw = low if math.isnan(raw) else min(max(raw, low), high)
         if not math.isfinite(raw):
             raise self._outside(value, where, index)
@@ -323,7 +335,7 @@ class Row:
             Refuse what is outside the limits. Without it only what the type cannot hold is refused (for tests
             that send bad values on purpose).
         saturate:
-            Clip numbers to the limits instead of refusing them, as the unit does with telemetry.
+            Clip numbers to the limits, or wrap counters, instead of refusing them, as the unit does with telemetry.
 
         Raises
         ------
@@ -372,6 +384,14 @@ class Row:
                 item.check_raw(number, f"{self.name}.{name}", index)
             values[name] = item.to_physical(number)
         return values
+
+    def clipped(self, values: Mapping[str, Value]) -> list[str]:
+        """Names of the numbers among the values that telemetry carries as the nearest limit."""
+        return [
+            name
+            for name, item in self.named_fields.items()
+            if item.kind in ("integer", "float") and item.clips(float(values.get(name, item.empty)))
+        ]
 
     def example(self) -> dict[str, Value]:
         """Return values that the row accepts: defaults, else zeros moved into the limits."""

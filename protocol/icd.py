@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import chain
 from pathlib import Path
@@ -15,9 +15,17 @@ from pydantic import ValidationError
 
 from protocol.codec import Field, FieldKind, Row, RowKind, Slot
 from protocol.errors import ProtocolError
-from protocol.icd_schema import BitModel, EnumModel, FieldModel, FileModel, ParameterModel, RowModel
+from protocol.icd_schema import (
+    BitModel,
+    EnumModel,
+    FieldModel,
+    FileModel,
+    ParameterModel,
+    RowModel,
+    SectionModel,
+)
 from protocol.messages import FIRST_TELEMETRY_ID
-from protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter
+from protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
 __all__ = ["IcdError", "InterfaceDefinition", "Names", "UnknownNameError", "default_icd_path", "load_icd"]
 
@@ -76,6 +84,8 @@ class InterfaceDefinition:
     telemetry: Names[Row]
     enums: Names[EnumDefinition]
     parameters: Names[Parameter]
+    sections: tuple[Section, ...] = ()
+    """Text for people beside the rows: conventions."""
 
     @cached_property
     def telecommands_by_id(self) -> Mapping[int, Row]:
@@ -177,6 +187,7 @@ class _Builder:
         self._parameters: dict[str, Parameter] = {}
         self._row_models: dict[RowKind, list[tuple[Path, RowModel]]] = {"telecommand": [], "telemetry": []}
         self._parameter_models: list[tuple[Path, ParameterModel]] = []
+        self._sections: list[Section] = []
 
     def add(self, file: Path, model: FileModel) -> None:
         if model.definition is not None:
@@ -185,6 +196,8 @@ class _Builder:
             self._head = (model.definition.name, model.definition.version, model.definition.doc)
         for enum in model.enum:
             self._add_enum(file, enum)
+        for section in model.section:
+            self._add_section(file, section)
         self._row_models["telecommand"] += [(file, row) for row in model.telecommand]
         self._row_models["telemetry"] += [(file, row) for row in model.telemetry]
         self._parameter_models += [(file, parameter) for parameter in model.parameter]
@@ -206,7 +219,18 @@ class _Builder:
             telemetry=Names("telemetry", ((row.name, row) for row in telemetry)),
             enums=Names("enumeration", self._enums.items()),
             parameters=Names("parameter", self._parameters.items()),
+            sections=tuple(self._sections),
         )
+
+    def _add_section(self, file: Path, model: SectionModel) -> None:
+        where = f"{file}: section {model.heading}"
+        if any(other.heading == model.heading for other in self._sections):
+            raise IcdError(f"{where}: defined twice")
+        for number, row in enumerate(model.rows, 1):
+            if len(row) != len(model.columns):
+                raise IcdError(f"{where}: row {number} has {len(row)} cells, must have {len(model.columns)}")
+        rows = tuple(tuple(row) for row in model.rows)
+        self._sections.append(Section(model.heading, tuple(model.paragraphs), tuple(model.columns), rows))
 
     def _add_enum(self, file: Path, model: EnumModel) -> None:
         if model.name in self._enums:
@@ -343,13 +367,7 @@ class _Layout:
         """Append the fields of another row."""
         moved = {slot.index: self._slot(slot.type, slot.size) for slot in row.slots}
         for item in row.fields:
-            self._append(
-                Field(
-                    item.name, item.kind, moved[item.slot.index], item.shift, item.width, item.unit, item.scale,
-                    item.bias, item.minimum, item.maximum, item.enum, item.default, item.parameter,
-                    item.provenance, item.doc,
-                )
-            )  # fmt: skip
+            self._append(replace(item, slot=moved[item.slot.index]))
 
     def add(self, model: FieldModel) -> None:
         """Append a field, a run of numbered fields, or the bits of a bit field."""
@@ -403,6 +421,7 @@ class _Layout:
             parameter=self._builder.check_parameter(model.parameter, model.unit, where),
             provenance=model.provenance or self._provenance,
             doc=model.doc,
+            wrap=model.wrap,
         )
 
     def _add_bits(self, model: FieldModel, where: str) -> None:
@@ -456,6 +475,10 @@ class _Layout:
     def _check_limits(model: FieldModel, where: str) -> None:
         if model.min is not None and model.max is not None and model.min > model.max:
             raise IcdError(f"{where}: min {model.min:g} is above max {model.max:g}")
+        if model.wrap and not model.type.startswith("u"):
+            raise IcdError(f"{where}: wrap: only unsigned integers wrap")
+        if model.wrap and (model.min, model.max) != (None, None):
+            raise IcdError(f"{where}: wrap: a field that wraps has no min and max")
         limits = INTEGER_RANGES.get(model.type)
         if limits is None:
             return

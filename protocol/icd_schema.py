@@ -66,6 +66,8 @@ class FieldModel(_Model):
     bits: list[BitModel] = []
     parameter: str | None = None
     """Name of the parameter that the field sets or reports."""
+    wrap: bool = False
+    """In telemetry: beyond its range the lowest bits instead of the nearest limit."""
     provenance: Provenance | None = None
     doc: str = ""
 
@@ -100,6 +102,15 @@ class ParameterModel(_Model):
     doc: str
 
 
+class SectionModel(_Model):
+    """Text for people beside the rows: paragraphs and a table."""
+
+    heading: Annotated[str, Field(min_length=1)]
+    paragraphs: list[str] = []
+    columns: Annotated[list[str], Field(min_length=1)]
+    rows: list[list[str]]
+
+
 class FileModel(_Model):
     """One file of a definition."""
 
@@ -108,5 +119,6 @@ class FileModel(_Model):
     telecommand: list[RowModel] = []
     telemetry: list[RowModel] = []
     parameter: list[ParameterModel] = []
+    section: list[SectionModel] = []
     canopen: dict[str, object] | None = None
     """The CANopen mapping, read by `protocol.canopen`; no part of the rows."""

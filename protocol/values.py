@@ -101,6 +101,16 @@ def limits_text(minimum: float | None, maximum: float | None, unit: str) -> str:
 
 
 @dataclass(frozen=True)
+class Section:
+    """A part of a definition's text for people: heading, paragraphs, a table."""
+
+    heading: str
+    paragraphs: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A parameter of the device, the same on the bus, in the device and in the object dictionary."""
 

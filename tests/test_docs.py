@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import re
 import subprocess
@@ -15,6 +16,10 @@ from pathlib import Path
 import can
 import pytest
 
+from emulator.device.parameters import Parameters
+from emulator.errors import EmulatorError
+from emulator.imaging.sensor_model import SensorModel
+from emulator.profile import load_profile
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.own_hub import OwnBus
 from hil_tests.raw_exchange import format_frame
@@ -85,6 +90,92 @@ def table_after(name: str, heading: str) -> list[list[str]]:
         line.strip("|").split("|") for line in text.split("\n## ")[0].splitlines() if line.startswith("|")
     ]
     return [[cell.strip() for cell in row] for row in rows[2:]]
+
+
+def sensor_defaults() -> dict[str, object]:
+    """Values of the default profile by the keys that the data sheet names."""
+    profile = load_profile()
+    sections: dict[str, dict[str, object]] = {
+        "camera": {"focal_px": 1220.4842, **profile.camera.model_dump(exclude_none=True)},
+        "sensor": dataclasses.asdict(SensorModel(**profile.sensor)),
+        "timing": profile.timing.model_dump(),
+        "device": profile.device.model_dump(),
+        "catalog": profile.catalog.model_dump(),
+        "parameters": {name: item.default for name, item in load_icd().parameters.items()}
+        | profile.parameters,
+    }
+    return {f"{name}.{key}": value for name, part in sections.items() for key, value in part.items()}
+
+
+def test_sensor_gives_the_defaults_of_the_default_profile():
+    defaults, icd = sensor_defaults(), load_icd()
+    checked = 0
+    for heading in ("Optics", "Detector", "Timing"):
+        for row in table_after("sensor.md", heading):
+            if not row[1].startswith("`"):
+                continue
+            key, shown = row[1].strip("`"), row[2]
+            value = defaults[key]
+            if isinstance(value, (int, float)):
+                assert float(re.split(r"[ °]", shown)[0]) == pytest.approx(value, rel=1e-6), key
+                checked += 1
+            if key.startswith("parameters."):
+                parameter = icd.parameters[key.removeprefix("parameters.")]
+                assert f"; {parameter.minimum:g} to {parameter.maximum:g} {parameter.unit}" in shown, key
+    assert checked >= 25
+
+
+def test_sensor_gives_the_modelled_latency_and_the_highest_rates():
+    text = (DOCS / "sensor.md").read_text(encoding="utf-8")
+    timing, half_exposure_s = load_profile().timing, 0.05
+    for identify_s, name in (
+        (timing.identify_lost_s, "lost in space"),
+        (timing.identify_tracking_s, "tracking"),
+    ):
+        latency_s = half_exposure_s + timing.readout_s + timing.detect_s + identify_s
+        assert f"{1000 * latency_s:.0f} ms {name}" in text
+    pairs = re.findall(r"^\| (\d+) ms \| (\d+) Hz \|$", text, re.MULTILINE)
+    assert len(pairs) == 4
+    for exposure_ms, rate_hz in pairs:
+        Parameters(load_icd(), {"exposure": int(exposure_ms), "update_rate": float(rate_hz)})
+        with pytest.raises(EmulatorError, match="or less"):
+            Parameters(load_icd(), {"exposure": int(exposure_ms) + 1, "update_rate": float(rate_hz)})
+
+
+def test_every_link_between_documents_leads_somewhere():
+    for file in [*DOCS.glob("*.md"), DOCS.parent / "README.md"]:
+        text = re.sub(r"^```.*?^```$", "", file.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            name, _, anchor = target.partition("#")
+            if "://" in name:
+                continue
+            found = file.parent / name if name else file
+            assert found.exists(), f"{file.name}: {target}"
+            if anchor:
+                headings = re.findall(r"^#+ (.*)$", found.read_text(encoding="utf-8"), re.MULTILINE)
+                anchors = {
+                    "".join(
+                        letter for letter in heading.lower() if letter.isalnum() or letter in " -_"
+                    ).replace(" ", "-")
+                    for heading in headings
+                }
+                assert anchor in anchors, f"{file.name}: {target}"
+
+
+def test_the_glossary_is_in_alphabetical_order():
+    words = [row[0].lower() for row in table_after_title("glossary.md")]
+    assert words == sorted(words)
+    assert {"frame", "image", "truth", "dialect", "provenance", "mutant", "lost in space", "tracking"} <= set(
+        words
+    )
+
+
+def table_after_title(name: str) -> list[list[str]]:
+    """Rows of the only table of a document, without its head."""
+    lines = (DOCS / name).read_text(encoding="utf-8").splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")][
+        2:
+    ]
 
 
 def test_canopen_names_every_object_of_the_device():

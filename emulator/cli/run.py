@@ -15,6 +15,14 @@ def command(
     serial: Annotated[
         str | None, typer.Option(help="auto (a pty), a device, listen://HOST:PORT, or off.")
     ] = None,
+    dialect: Annotated[
+        str | None,
+        typer.Option(
+            help="Form of serial replies: a for OBC software written for the CubeComputer (a reply begins with the identifier), "
+            "b for a stand-alone node (it does not; the default), c for generation 2. With the wrong one values are "
+            "shifted by a byte."
+        ),
+    ] = None,
     can: Annotated[
         str | None, typer.Option(help="auto (vcan0, else the TCP hub), a channel, or off.")
     ] = None,
@@ -42,7 +50,7 @@ def command(
 ) -> None:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
-    One line on stdout, `ready serial=… can=… seed=…`, tells that it takes commands and where.
+    One line on stdout, `ready serial=… dialect=… can=… seed=…`, tells that it takes commands and where.
     """
     from emulator.imaging.worker_process import WorkerProcess
 
@@ -55,14 +63,18 @@ def command(
     from emulator.emulation import Emulation, RunOptions
     from emulator.errors import EmulatorError
     from emulator.profile import load_profile
+    from protocol.serial_framing import Dialect
 
     levels = ("debug", "info", "warning", "error")
     if log not in levels:
         raise EmulatorError(f"--log {log}: must be one of {', '.join(levels)}")
     logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
+    if dialect is not None and dialect not in list(Dialect):
+        raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
     overrides = list(settings or ())
     given = {
         "links.serial.port": serial,
+        "links.serial.dialect": dialect,
         "links.can.channel": can,
         "run.clock": clock,
         "run.state_dir": None if state_dir is None else str(state_dir.resolve()),

@@ -3,8 +3,8 @@
 A frame begins on a grid of the update period, exposes, is read out, detected and identified; the times of these steps are
 those of the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On the other clocks a
 result that the machine has not ready in time is published when it comes, and flagged. Where the machine falls behind by
-`MAX_PENDING` frames, exposures are left out: what the machine could not look at says nothing about the sky, so the last
-attitude stands until it is too old, and tracking goes on from it.
+`MAX_PENDING` frames, or at high rates by the modelled time of a frame's steps, exposures are left out: what the machine
+could not look at says nothing about the sky, so the last attitude stands until it is too old, and tracking goes on from it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from emulator.clock import NANOSECONDS, DeviceTime
 from emulator.device.modes import Mode
-from emulator.device.parameters import Parameters
+from emulator.device.parameters import Parameters, exposure_period_s
 from emulator.device.rate import RateEstimator
 from emulator.device.scheduler import Event, Scheduler
 from emulator.imaging.frames import (
@@ -36,7 +36,7 @@ from emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
 
 MAX_PENDING: Final = 2
-"""Requests in the pipeline at which the next exposure is left out."""
+"""Requests in the pipeline at which the next exposure is left out; more, where more fit into the time modelled for them."""
 
 
 @dataclass(frozen=True)
@@ -198,9 +198,18 @@ class FrameCycle:
         return float(self._parameters["exposure"]) / 1000.0
 
     def _period_ns(self) -> int:
-        """Time from exposure to exposure; no shorter than one takes."""
-        shortest = self._exposure_s() + float(self._parameters["delay_time"]) / 1000.0
-        return round(max(1.0 / float(self._parameters["update_rate"]), shortest) * NANOSECONDS)
+        """Time from exposure to exposure; a rate rounded to single precision does not make exposures overlap."""
+        period_s = 1.0 / float(self._parameters["update_rate"])
+        return round(max(period_s, exposure_period_s(self._parameters)) * NANOSECONDS)
+
+    def _identify_s(self, *, tracking: bool) -> float:
+        return self._timing.identify_tracking_s if tracking else self._timing.identify_lost_s
+
+    def _processing_ns(self, *, tracking: bool) -> int:
+        """Modelled time from the end of an exposure to a result without stars."""
+        timing = self._timing
+        seconds = timing.readout_s + timing.detect_s + self._identify_s(tracking=tracking)
+        return round(seconds * NANOSECONDS)
 
     def _begin(self, due_ns: int) -> None:
         """Open the shutter, and plan the next opening on the grid."""
@@ -210,7 +219,7 @@ class FrameCycle:
         missed = max(0, (now_ns - due_ns) // period_ns)
         self.left_out += missed
         self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._begin)
-        if self._imager.pending >= MAX_PENDING:
+        if self._imager.pending >= max(MAX_PENDING, self._processing_ns(tracking=True) / period_ns):
             self.left_out += 1
             return
         exposure_s = self._exposure_s()
@@ -234,9 +243,7 @@ class FrameCycle:
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
         request = self.request(truth, exposure_s, predicted)
         self._in_flight.append(frame)
-        timing = self._timing
-        identify_s = timing.identify_tracking_s if frame.tracking else timing.identify_lost_s
-        ready_ns = end_ns + round((timing.readout_s + timing.detect_s + identify_s) * NANOSECONDS)
+        ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
         generation = self._generation
 
         def arrived(answer: Answer) -> None:
@@ -326,7 +333,7 @@ class FrameCycle:
         result = frame.result or FrameResult(frame.index)
         timing = self._timing
         detect_s = timing.detect_s + timing.detect_per_star_s * result.detected
-        identify_s = timing.identify_tracking_s if frame.tracking else timing.identify_lost_s
+        identify_s = self._identify_s(tracking=frame.tracking)
         valid, reason, rate = self._judge(frame, result, detect_s + identify_s)
         self.published += 1
         self._publish(

@@ -15,6 +15,32 @@ ParameterValue = bool | int | float | str
 ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
 """Pairs of which the first must not exceed the second."""
 
+PERIOD_ROUNDING: Final = 1e-6
+"""Part of a period by which single precision may shorten it."""
+
+
+def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
+    """Least time from exposure to exposure, seconds: the delay before one and the exposure itself.
+
+    Read-out and processing go on while the next frame is exposed, and do not count.
+    """
+    return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
+
+
+def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...], str] | None:
+    """Names of parameters that contradict each other, with the reason; None if none do."""
+    for low, high in ORDERED:
+        if float(values[low]) > float(values[high]):
+            return (low, high), f"{low} {values[low]} is above {high} {values[high]}"
+    rate, needed_s = float(values["update_rate"]), exposure_period_s(values)
+    if needed_s * rate > 1.0 + PERIOD_ROUNDING:
+        return ("update_rate", "exposure", "delay_time"), (
+            f"{rate:g} Hz leaves {1000.0 / rate:.4g} ms a frame, exposure {values['exposure']} ms and delay_time "
+            f"{values['delay_time']} ms take {1000.0 * needed_s:g} ms; "
+            f"set update_rate to {1.0 / needed_s:.4g} Hz or less, or shorten them"
+        )
+    return None
+
 
 class Parameters(Mapping[str, ParameterValue]):
     """All parameters, always each within its limits.
@@ -127,9 +153,11 @@ class Parameters(Mapping[str, ParameterValue]):
     ) -> dict[str, ParameterValue]:
         checked = {name: self._definitions[name].check(value) for name, value in changes.items()}
         result = {**base, **checked}
-        for low, high in ORDERED:
-            if float(result[low]) > float(result[high]):
-                raise FieldError(f"{low}: {result[low]} is above {high} {result[high]}")
+        found = _contradiction(result)
+        if found is not None:
+            names, why = found
+            to_blame = next((name for name in names if base[name] != result[name]), names[0])
+            raise FieldError(f"{to_blame}: {why}")
         return checked
 
     def _take(self, values: Mapping[str, ParameterValue]) -> None:

@@ -36,7 +36,7 @@ def identification(device: Device) -> Values:
         "interface_version": unit.interface_version,
         "firmware_major": unit.firmware_major,
         "firmware_minor": unit.firmware_minor,
-        "runtime_s": run_ms // 1000 & 0xFFFF,
+        "runtime_s": run_ms // 1000,
         "runtime_ms": run_ms % 1000,
     }
 
@@ -127,7 +127,7 @@ def _star_raw(number: int) -> Callable[[Device], Values]:
         star = stars[number - 1]
         camera = device.profile.camera
         return {
-            f"star_{number}_catalogue": star.hip % 65536,
+            f"star_{number}_catalogue": star.hip,
             f"star_{number}_x": star.x - (camera.width - 1) / 2.0,
             f"star_{number}_y": star.y - (camera.height - 1) / 2.0,
         }
@@ -211,6 +211,7 @@ def precise_attitude(device: Device) -> Values:
         "rate_valid": last.rate_valid,
         "tracking": result.tracked,
         "index_pending": result.index_pending,
+        "rates_clipped": bool(device.icd.telemetry["rates"].clipped(rates(device))),
         "stars_detected": result.detected,
         "stars_matched": result.matched,
         "uncertainty_cross": result.sigma_cross_arcsec if answer.valid else 0.0,

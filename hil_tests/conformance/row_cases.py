@@ -25,7 +25,13 @@ LINK_PARAMETERS: Final = frozenset(
     {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}
 )
 """Parameters that would cut the tester off; they are only refused values, and set to what they are."""
-PARTNERS: Final = {"max_star_pixels": ("min_star_pixels", 1.0), "min_star_pixels": ("max_star_pixels", 255.0)}
+PARTNERS: Final = {
+    "max_star_pixels": ("min_star_pixels", 1.0),
+    "min_star_pixels": ("max_star_pixels", 255.0),
+    "update_rate": ("exposure", 1.0),
+    "exposure": ("update_rate", 0.01),
+    "delay_time": ("update_rate", 0.01),
+}
 """Parameters that bound each other → the other one, and the value at which it leaves all room."""
 F32_ROUNDING: Final = 1e-6
 UNSET: Final = frozenset({"unsolicited_rate"})

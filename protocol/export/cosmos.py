@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from protocol.codec import Field, Row
-from protocol.export.describe import number
+from protocol.export.describe import meaning, number
 from protocol.icd import InterfaceDefinition
 
 TARGET: Final = "STARHIL"
@@ -51,7 +51,7 @@ def _field(row: Row, field: Field, index: int) -> Iterator[str]:
         endian = " BIG_ENDIAN"
     else:
         offset = ID_BITS + 8 * field.offset
-    yield f"  {keyword} {name} {offset} {bits} {_type(field)}{limits} {_quoted(field.doc or 'Unused')}{endian}"
+    yield f"  {keyword} {name} {offset} {bits} {_type(field)}{limits} {_quoted(meaning(row, field) or 'Unused')}{endian}"
     if field.enum is not None:
         yield from (f"    STATE {label.upper()} {value}" for label, value in field.enum.values.items())
     elif field.kind == "flag":

@@ -8,12 +8,12 @@ and a counter each), as DBC files do for other transport protocols.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from protocol.can_framing import MAX_FRAME_DATA, CanIdentifier, MessageType
 from protocol.codec import Field, Row
-from protocol.export.describe import number
+from protocol.export.describe import meaning, number
 from protocol.icd import InterfaceDefinition
 
 EXTENDED: Final = 0x80000000
@@ -73,7 +73,7 @@ def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:
     to_device = (row.id, host, device)
     to_host = (row.id, device, host)
-    signals = tuple(row.named_fields.values())
+    signals = tuple(replace(field, doc=meaning(row, field)) for field in row.named_fields.values())
     error = tuple(field for field in icd.telemetry["acknowledge"].fields if field.name == "error")
     code = tuple(_at_start(field) for field in error)
     long = row.size > MAX_FRAME_DATA

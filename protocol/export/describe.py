@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 from protocol.codec import Field, Row
@@ -15,6 +14,11 @@ PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default
 
 INTRODUCTION: Final = (
     "Multi-byte fields are little-endian. Identifiers below 128 are telecommands, from 128 on telemetry.",
+    (
+        "A telecommand with a value outside its range is refused with invalid_parameter and changes nothing. A number in telemetry "
+        "that is beyond its range is carried as the nearest limit (clipped) or by its lowest bits (wraps), as the range says; a "
+        "floating-point number without a range is carried as it is."
+    ),
     (
         "Source of a row or field: confirmed (public flight software or a manual has it, named at the row), proxy (public for "
         "another unit of the same family) or ours (no public source; chosen here)."
@@ -29,16 +33,6 @@ INTRODUCTION: Final = (
     ),
 )
 """Paragraphs that stand before the tables."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the text beside the rows: heading, paragraphs, a table."""
-
-    heading: str
-    paragraphs: tuple[str, ...]
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 def number(value: float) -> str:
@@ -57,7 +51,29 @@ def facts(row: Row) -> str:
     return f"{size}, {row.provenance}{f': {row.source}' if row.source else ''}"
 
 
-def field_cells(field: Field) -> tuple[str, ...]:
+def beyond(row: Row, field: Field) -> str:
+    """What telemetry carries of a number beyond its range: clipped, wraps, or nothing to say."""
+    if row.kind != "telemetry" or field.kind not in ("integer", "float", "bits"):
+        return ""
+    if field.wrap:
+        return "wraps"
+    bounded = field.minimum is not None or field.maximum is not None
+    return "clipped" if field.kind != "float" or bounded else ""
+
+
+def meaning(row: Row, field: Field) -> str:
+    """Text of a field with what becomes of a number beyond its range, for formats without a column for it."""
+    low, high = (number(limit) for limit in field.physical_limits) if beyond(row, field) else ("", "")
+    match beyond(row, field):
+        case "wraps":
+            return f"{field.doc} Wraps beyond {high}."
+        case "clipped":
+            return f"{field.doc} Clipped to {low} to {high}."
+        case _:
+            return field.doc
+
+
+def field_cells(row: Row, field: Field) -> tuple[str, ...]:
     """Cells of a field under FIELD_COLUMNS."""
     meaning = field.doc
     if field.parameter is not None:
@@ -68,7 +84,7 @@ def field_cells(field: Field) -> tuple[str, ...]:
         _type(field),
         field.unit,
         _value(field),
-        _range(field),
+        _range(row, field),
         field.provenance if field.name else "",
         meaning if field.name else "Unused, sent as 0.",
     )
@@ -131,7 +147,11 @@ def _value(field: Field) -> str:
     return text
 
 
-def _range(field: Field) -> str:
+def _range(row: Row, field: Field) -> str:
+    fate = beyond(row, field)
+    if fate:
+        low, high = field.physical_limits
+        return f"{number(low)} to {number(high)}, {fate}"
     if field.kind not in ("integer", "float", "bits") or (field.minimum is None and field.maximum is None):
         return ""
     if field.minimum == field.maximum:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import Final
 
 from protocol.export import describe, wire
 from protocol.icd import InterfaceDefinition
+from protocol.values import Section
 
 _STYLE: Final = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 72em; padding: 0 1em; color: #1a1a1a; }
@@ -32,11 +34,15 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     yield f"<h1>{escape(heading)}</h1><p>{escape(icd.doc)}</p>"
     yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.INTRODUCTION)
     yield (
-        '<nav><a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>'
+        "<nav>"
+        + "".join(_link(section) for section in icd.sections)
+        + '<a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>'
         '<a href="#parameters">Parameters</a><a href="#enumerations">Enumerations</a>'
-        + "".join(f'<a href="#{_anchor(section)}">{section.heading}</a>' for section in wire.sections())
+        + "".join(_link(section) for section in wire.sections())
         + "</nav>"
     )
+    for section in icd.sections:
+        yield from _section(section)
     for title, rows in describe.sections(icd):
         yield f'<h2 id="{title.lower()}">{title}</h2>'
         yield "<table><tr><th>Id</th><th>Name</th><th>Bytes</th><th>Source</th><th>Meaning</th></tr>"
@@ -52,7 +58,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
             if row.fields:
                 yield from _table(
                     describe.FIELD_COLUMNS,
-                    ((field.provenance, describe.field_cells(field)) for field in row.fields),
+                    ((field.provenance, describe.field_cells(row, field)) for field in row.fields),
                 )
     yield '<h2 id="parameters">Parameters</h2>'
     yield from _table(
@@ -65,18 +71,31 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         (("confirmed", (enum.name, describe.enum_text(enum), enum.doc)) for enum in icd.enums.values()),
     )
     for section in wire.sections():
-        yield f'<h2 id="{_anchor(section)}">{section.heading}</h2>'
-        yield from (f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs)
-        yield from _table(section.columns, (("confirmed", row) for row in section.rows))
+        yield from _section(section)
     yield "</body></html>"
 
 
-def _anchor(section: describe.Section) -> str:
+def _section(section: Section) -> Iterator[str]:
+    yield f'<h2 id="{_anchor(section)}">{escape(section.heading)}</h2>'
+    yield from (f"<p>{_text(paragraph)}</p>" for paragraph in section.paragraphs)
+    yield from _table(section.columns, (("confirmed", row) for row in section.rows))
+
+
+def _link(section: Section) -> str:
+    return f'<a href="#{_anchor(section)}">{escape(section.heading)}</a>'
+
+
+def _anchor(section: Section) -> str:
     return section.heading.lower().replace(" ", "-")
+
+
+def _text(text: str) -> str:
+    """Escape a text, with what stands between backticks as code."""
+    return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
 
 
 def _table(columns: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> Iterator[str]:
     yield "<table><tr>" + "".join(f"<th>{escape(column)}</th>" for column in columns) + "</tr>"
     for kind, cells in rows:
-        yield f'<tr class="{kind}">' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
+        yield f'<tr class="{kind}">' + "".join(f"<td>{_text(cell)}</td>" for cell in cells) + "</tr>"
     yield "</table>"

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from protocol.codec import Row
 from protocol.export import describe, wire
 from protocol.icd import InterfaceDefinition
+from protocol.values import Section
 
 
 def render(icd: InterfaceDefinition) -> str:
@@ -22,7 +23,9 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         yield ""
         yield paragraph
     yield ""
-    yield from _contents()
+    yield from _contents(icd)
+    for section in icd.sections:
+        yield from _section(section)
     for heading, rows in describe.sections(icd):
         yield from ("", f"## {heading}", "")
         yield from _table(
@@ -34,7 +37,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
             if row.fields:
                 yield ""
                 yield from _table(
-                    describe.FIELD_COLUMNS, (describe.field_cells(field) for field in row.fields)
+                    describe.FIELD_COLUMNS, (describe.field_cells(row, field) for field in row.fields)
                 )
     yield from ("", "## Parameters", "")
     yield from _table(
@@ -46,17 +49,21 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         ("Name", "Numbers", "Meaning"),
         ((enum.name, describe.enum_text(enum), enum.doc) for enum in icd.enums.values()),
     )
-
     for section in wire.sections():
-        yield from ("", f"## {section.heading}")
-        for paragraph in section.paragraphs:
-            yield from ("", paragraph)
-        yield ""
-        yield from _table(section.columns, section.rows)
+        yield from _section(section)
 
 
-def _contents() -> Iterator[str]:
-    headings = ["Telecommands", "Telemetry", "Parameters", "Enumerations"]
+def _section(section: Section) -> Iterator[str]:
+    yield from ("", f"## {section.heading}")
+    for paragraph in section.paragraphs:
+        yield from ("", paragraph)
+    yield ""
+    yield from _table(section.columns, section.rows)
+
+
+def _contents(icd: InterfaceDefinition) -> Iterator[str]:
+    headings = [section.heading for section in icd.sections]
+    headings += ["Telecommands", "Telemetry", "Parameters", "Enumerations"]
     for heading in [*headings, *(section.heading for section in wire.sections())]:
         yield f"- [{heading}](#{heading.lower().replace(' ', '-')})"
 

@@ -6,9 +6,9 @@ from typing import Final
 
 from protocol.can_framing import SEGMENT_DATA, MessageType
 from protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, load_layout
-from protocol.export.describe import Section
 from protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from protocol.serial_framing import Dialect, encode_reply, encode_request
+from protocol.values import Section
 
 _TELEMETRY: Final = 0x80
 _TELECOMMAND: Final = 0x60
@@ -43,9 +43,15 @@ def _serial() -> Section:
         f"A request is {request}, with every byte 1F of the data doubled; 8 data bits, no parity, 1 stop bit. "
         "The form of the replies is the parameter serial_dialect; the code is a number of the enumeration error_code."
     )
+    whom = (
+        "Dialect a is for OBC software written for the CubeComputer: a reply repeats the identifier. Dialect b is for software that "
+        "talks to a stand-alone node: a reply begins with the data, and only the request says what they are. Dialect c is "
+        "generation 2. Nothing in a message names its dialect: with b in place of a, each value is read from the byte after its own and "
+        "telecommands seem unanswered."
+    )
     return Section(
         "Serial line",
-        (text,),
+        (text, whom),
         ("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
         tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
     )
@@ -103,7 +109,13 @@ def _content(placed: PlacedObject) -> str:
     if placed.image is not None:
         return f"image {placed.image}: pixels as DOMAIN, size, frame counter"
     if placed.packed:
-        return "in narrower types: " + ", ".join(field.name or field.source for field in placed.packed)
+        return (
+            "in narrower types: "
+            + ", ".join(
+                f"{field.name or field.source}{' (wraps)' if field.wrap else ''}" for field in placed.packed
+            )
+            + "; a number beyond its type is clipped"
+        )
     if placed.telemetry is not None:
         return f"telemetry {placed.telemetry}: a sub-index a field"
     shown = [] if placed.value is None else [f"reads {placed.value}"]

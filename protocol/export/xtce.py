@@ -10,7 +10,7 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 from protocol.codec import Field, Row
-from protocol.export.describe import number
+from protocol.export.describe import meaning, number
 from protocol.icd import InterfaceDefinition
 from protocol.values import IcdError
 
@@ -76,7 +76,7 @@ def _telemetry(parent: ET.Element, rows: list[Row]) -> None:
             names.append(name)
             _type(types, "Parameter", name, field)
             about = {"name": name, "parameterTypeRef": f"{name}_type"}
-            ET.SubElement(parameters, "Parameter", about | _short(field.doc))
+            ET.SubElement(parameters, "Parameter", about | _short(meaning(row, field)))
         container = ET.SubElement(containers, "SequenceContainer", {"name": row.name} | _short(row.doc))
         _entries(container, "Parameter", names)
         base = ET.SubElement(container, "BaseContainer", {"containerRef": PACKET})
@@ -98,7 +98,7 @@ def _commands(parent: ET.Element, rows: list[Row]) -> None:
                     about = {"name": field.name, "argumentTypeRef": f"{name}_type"}
                     if field.default is not None:
                         about["initialValue"] = _initial(field)
-                    ET.SubElement(listed, "Argument", about | _short(field.doc))
+                    ET.SubElement(listed, "Argument", about | _short(meaning(row, field)))
         container = ET.SubElement(command, "CommandContainer", {"name": f"{row.name}_packet"})
         entries = ET.SubElement(container, "EntryList")
         _fixed(entries, "identifier", row.id, 8)

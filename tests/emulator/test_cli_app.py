@@ -58,6 +58,7 @@ def test_a_folder_where_a_file_goes_is_named(
     [
         ("rum", "no such command 'rum'. Did you mean 'run'? (see starhil --help)"),
         ("run --sed 3", "run: no such option: --sed"),
+        ("run --dialect d", "--dialect d: must be a, b or c"),
         (
             "run --canopen 999",
             "run: invalid value for '--canopen': must be at most 127 (see starhil run --help)",

@@ -95,12 +95,17 @@ class Emulator:
 def stepped(tmp_path_factory):
     """One emulator on the stepped clock for several tests."""
     link = tmp_path_factory.mktemp("link") / "tty"
-    emulator = Emulator("--clock", "stepped", "--set", "links.serial.dialect=a", "--symlink", str(link))
+    emulator = Emulator("--clock", "stepped", "--dialect", "a", "--symlink", str(link))
     emulator.link = link
     emulator.do("step", seconds=1.0)
     yield emulator
     assert emulator.end() == (0, [])
     assert not link.is_symlink()
+
+
+def test_the_ready_line_names_the_dialect_that_replies_have(stepped):
+    assert stepped.ready["dialect"] == "a"
+    assert stepped.ask(128)[0][:3] == b"\x1f\x7f\x80"
 
 
 def test_a_symlink_leads_to_the_port(stepped):

@@ -353,6 +353,25 @@ def test_texts_for_people_tell_parameters_and_enumerations(name: str) -> None:
         assert word in text(name)
 
 
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "eds"])
+def test_every_export_says_what_a_number_beyond_its_range_becomes(name: str) -> None:
+    """Rates are clipped, counters wrap; a telecommand's field is refused, which needs no word a field."""
+    said = text(name)
+    assert re.search(
+        r"rate_x.*-3\.2768 to 3\.2767.*clipped|rate_x.*[Cc]lipped to -3\.2768 to 3\.2767", said, re.IGNORECASE
+    )
+    assert re.search(r"runtime_s.*0 to 65535.*wraps|runtime_s.*[Ww]raps beyond 65535", said, re.IGNORECASE)
+
+
+def test_markdown_gives_the_range_of_every_integer_in_telemetry() -> None:
+    for row in TELEMETRY:
+        section = text("markdown").split(f"### {row.id} (0x{row.id:02X}) {row.name}\n")[1].split("\n###")[0]
+        for name, field in row.named_fields.items():
+            if field.kind == "integer":
+                (line,) = [line for line in section.splitlines() if f"| {name} |" in line]
+                assert line.split(" | ")[5].endswith((", clipped", ", wraps")), line
+
+
 # -- all ---------------------------------------------------------------------------------------------------------------
 
 

@@ -246,7 +246,7 @@ REFUSED: list[tuple[str, dict[str, Value], str]] = [
     ("set_mode", {"mode": "error"}, "not one of standby"),
     ("set_mode", {"mode": 9}, "not one of standby"),
     ("set_mode", {"mood": "standby"}, "set_mode.mood: no such field"),
-    ("set_update_rate", {"rate": 0.0}, "rate: 0.0 is outside 0.1 to 20 Hz"),
+    ("set_update_rate", {"rate": 0.0}, "rate: 0.0 is outside 0.01 to 100 Hz"),
     ("set_update_rate", {"rate": "fast"}, "is not a number"),
     ("set_update_rate", {"rate": True}, "is not a number"),
     ("set_hole_map_3", {"map": b"short"}, "5 bytes, must be 16"),
@@ -275,8 +275,8 @@ def test_a_telecommand_with_a_number_that_is_none_is_refused(value: float) -> No
 
 def test_single_precision_limits_hold_after_rounding() -> None:
     row = ICD.telecommands["set_update_rate"]
-    assert row.decode(row.encode({"rate": 0.1})) == {"rate": to_f32(0.1)}
-    assert ICD.parameters["update_rate"].check(to_f32(0.1)) == to_f32(0.1)
+    assert row.decode(row.encode({"rate": 0.01})) == {"rate": to_f32(0.01)}
+    assert ICD.parameters["update_rate"].check(to_f32(0.01)) == to_f32(0.01)
 
 
 def test_bad_values_can_be_sent_on_purpose() -> None:
@@ -284,6 +284,52 @@ def test_bad_values_can_be_sent_on_purpose() -> None:
     assert ICD.telecommands["set_mode"].encode({"mode": 77}, check=False) == b"\x4d"
     with pytest.raises(FieldError):
         ICD.telecommands["reset"].encode({"magic": 256}, check=False)
+
+
+def test_a_field_that_wraps_keeps_its_lowest_bits() -> None:
+    row = ICD.telemetry["identification"]
+    assert row.decode(row.encode({"runtime_s": 65536 + 7}, saturate=True))["runtime_s"] == 7
+    uptime = ICD.telemetry["device_status"]
+    after_50_days = 50 * 86400.0
+    wrapped = uptime.decode(uptime.encode({"uptime": after_50_days}, saturate=True))["uptime"]
+    assert wrapped == pytest.approx(after_50_days - 2**32 / 1000.0)
+    with pytest.raises(FieldError):
+        row.encode({"runtime_s": 65536})
+
+
+def test_a_row_names_the_fields_that_it_would_clip() -> None:
+    row = ICD.telemetry["rates"]
+    assert row.clipped({"rate_x": 3.27674, "rate_y": -3.27684, "rate_z": 0.0}) == []
+    assert row.clipped({"rate_x": 3.2768, "rate_y": -3.2769, "rate_z": 0.0}) == ["rate_x", "rate_y"]
+    assert ICD.telemetry["identification"].clipped({"runtime_s": 70000}) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "said"),
+    [
+        ('type = "i16", wrap = true', "only unsigned integers wrap"),
+        ('type = "f32", wrap = true', "only unsigned integers wrap"),
+        ('type = "u16", max = 7, wrap = true', "a field that wraps has no min and max"),
+    ],
+)
+def test_wrapping_is_for_unsigned_counters(tmp_path: Path, field: str, said: str) -> None:
+    text = """[definition]
+name = "x"
+version = "1"
+doc = "x"
+
+[[telemetry]]
+id = 200
+name = "row"
+doc = "x"
+provenance = "ours"
+size = SIZE
+fields = [{ name = "n", FIELD }]
+"""
+    size = "4" if "f32" in field else "2"
+    (tmp_path / "a.toml").write_text(text.replace("FIELD", field).replace("SIZE", size))
+    with pytest.raises(IcdError, match=said):
+        load_icd(tmp_path)
 
 
 def test_telemetry_saturates_as_the_unit_does() -> None:
@@ -337,7 +383,7 @@ def test_parameters_take_numbers_as_the_wire_carries_them(
     [
         ("exposure", 0), ("exposure", 5001), ("exposure", 1.5), ("exposure", math.nan), ("exposure", "long"), ("exposure", True),
         ("tracking_enable", 2), ("tracking_enable", math.nan), ("serial_dialect", "d"), ("serial_dialect", 3.0), ("update_rate", math.nan),
-        ("update_rate", 20.001), ("can_address", 255),
+        ("update_rate", 100.001), ("can_address", 255),
     ],
 )  # fmt: skip
 def test_parameters_refuse_what_is_outside_and_say_why(name: str, value: Value) -> None:

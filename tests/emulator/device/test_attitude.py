@@ -45,6 +45,18 @@ def test_attitude_agrees_with_the_truth_in_every_row(make_bench):
             assert combined[name] == value, name
 
 
+@pytest.mark.parametrize(("rate_deg_s", "clipped"), [(3.2, False), (4.0, True), (-4.0, True)])
+def test_a_rate_beyond_the_published_row_is_flagged_where_it_is_whole(make_bench, rate_deg_s, clipped):
+    bench = make_bench(truth=RateTruth(ORION, np.radians([0.0, rate_deg_s, 0.0]))).start()
+    bench.command("set_update_rate", rate=5.0)
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.0)
+    precise, published = bench.read("precise_attitude"), bench.read("rates")["rate_y"]
+    assert (precise["valid"], precise["rates_clipped"]) == (True, clipped)
+    assert precise["rate_y"] == pytest.approx(rate_deg_s, abs=1e-4)
+    assert published == pytest.approx(math.copysign(3.2767, rate_deg_s) if clipped else rate_deg_s, abs=2e-4)
+
+
 def test_tracking_predicts_with_the_rate(make_bench):
     rate = np.radians([0.0, 0.5, 0.0])
     truth = RateTruth(ORION, rate)

@@ -5,6 +5,7 @@ import pytest
 from emulator.device.cycle import MAX_PENDING
 from emulator.profile import Profile
 from emulator.truth.source import FixedTruth
+from protocol.messages import ErrorCode
 from starid.attitude import Attitude
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
@@ -77,13 +78,32 @@ def test_a_new_update_rate_holds_at_once(bench):
     assert bench.read("precise_attitude")["frame_counter"] >= 18
 
 
-def test_exposure_bounds_the_update_rate(bench):
-    bench.command("set_parameter", parameter=1, value=500.0)
-    bench.command("set_update_rate", rate=10.0)
+@pytest.mark.parametrize(("exposure", "rate"), [(100, 10.0), (30, 33.333332), (20, 50.0), (10, 100.0)])
+def test_the_highest_rate_that_an_exposure_leaves_is_reached(bench, exposure, rate):
+    bench.command("set_parameter", parameter=1, value=exposure)
+    assert bench.command("set_update_rate", rate=rate) is ErrorCode.OK
     bench.command("set_mode", mode="lost_in_space")
-    bench.step(10.2)
-    assert 18 <= bench.read("precise_attitude")["frame_counter"] <= 20
-    assert bench.read("star_performance_2")["sample_period"] == 500
+    bench.step(10.0)
+    attitude = bench.read("precise_attitude")
+    assert abs(attitude["frame_counter"] - 10.0 * rate) <= 0.25 * rate
+    mid_points = [frame.index for frame in bench.picture.frames]
+    assert len(set(mid_points)) == len(mid_points)
+    assert bench.device.cycle.left_out == 0
+
+
+def test_at_a_high_rate_no_exposure_is_left_out_while_results_come_in_time(bench):
+    bench.command("set_parameter", parameter=1, value=10.0)
+    bench.command("set_update_rate", rate=50.0)
+    bench.command("set_mode", mode="lost_in_space")
+    model = Profile().timing
+    in_time = int((model.readout_s + model.detect_s + model.identify_tracking_s) * 50.0)
+    assert in_time > MAX_PENDING
+    bench.imager.pending = in_time
+    bench.step(1.0)
+    assert bench.device.cycle.left_out == 0
+    bench.imager.pending = in_time + 1
+    bench.step(1.0)
+    assert bench.device.cycle.left_out == 50
 
 
 def test_delay_time_moves_the_exposure(make_bench):

@@ -30,6 +30,60 @@ def test_contradicting_parameters_are_refused(bench):
     assert bench.command("set_star_config", **config) is ErrorCode.INVALID_PARAMETER
 
 
+def holds(bench, name):
+    """Present value of a parameter as telemetry 162 reports it."""
+    bench.command("select_parameter", parameter=bench.icd.parameters[name].id)
+    return bench.read("parameter")["value"]
+
+
+def test_a_rate_that_the_exposure_leaves_no_time_for_is_refused(bench):
+    assert bench.command("set_update_rate", rate=20.0) is ErrorCode.INVALID_PARAMETER
+    assert bench.command("set_parameter", parameter=29, value=10.1) is ErrorCode.INVALID_PARAMETER
+    assert bench.read("acknowledge")["parameter_index"] == 1
+    assert holds(bench, "update_rate") == 1.0
+    assert bench.command("set_update_rate", rate=10.0) is ErrorCode.OK
+    assert holds(bench, "update_rate") == 10.0
+
+
+@pytest.mark.parametrize(("name", "value"), [("exposure", 101), ("exposure", 500), ("delay_time", 1)])
+def test_an_exposure_or_delay_that_the_rate_leaves_no_time_for_is_refused(bench, name, value):
+    bench.command("set_update_rate", rate=10.0)
+    before = holds(bench, name)
+    identifier = bench.icd.parameters[name].id
+    assert bench.command("set_parameter", parameter=identifier, value=value) is ErrorCode.INVALID_PARAMETER
+    assert (holds(bench, name), holds(bench, "update_rate")) == (before, 10.0)
+
+
+def test_the_acknowledge_names_the_field_of_a_configuration_that_the_rate_leaves_no_time_for(bench):
+    bench.command("set_update_rate", rate=10.0)
+    config = {**bench.read("star_config"), "delay_time": 50}
+    assert bench.command("set_star_config", **config) is ErrorCode.INVALID_PARAMETER
+    fields = list(bench.icd.telecommands["set_star_config"].named_fields)
+    assert bench.read("acknowledge")["parameter_index"] == fields.index("delay_time")
+    assert bench.command("set_star_config", **{**config, "exposure": 50}) is ErrorCode.OK
+
+
+def test_every_exposure_and_delay_has_a_rate_that_leaves_it_time(bench):
+    bench.command("set_update_rate", rate=bench.icd.parameters["update_rate"].minimum)
+    for name in ("exposure", "delay_time"):
+        parameter = bench.icd.parameters[name]
+        sent = bench.command("set_parameter", parameter=parameter.id, value=parameter.maximum)
+        assert sent is ErrorCode.OK
+
+
+def test_a_profile_with_a_rate_that_its_exposure_leaves_no_time_for_is_rejected(make_bench):
+    with pytest.raises(EmulatorError) as rejection:
+        make_bench(Profile(name="bench", parameters={"update_rate": 20.0}))
+    assert str(rejection.value) == (
+        "profile bench: parameters.update_rate: 20 Hz leaves 50 ms a frame, exposure 100 ms and delay_time 0 ms take 100 ms; "
+        "set update_rate to 10 Hz or less, or shorten them"
+    )
+    assert (
+        make_bench(Profile(parameters={"update_rate": 50.0, "exposure": 20})).device.parameters["exposure"]
+        == 20
+    )
+
+
 def test_parameters_reach_the_pipeline(bench):
     config = bench.read("star_config")
     changes = {
@@ -58,9 +112,9 @@ def test_tracking_flag_keeps_the_device_lost_in_space(bench):
 def test_one_parameter_is_set_read_and_refused(bench):
     assert bench.command("set_parameter", parameter=29, value=2.5) is ErrorCode.OK
     assert bench.read("parameter") == {
-        "parameter": 29, "value": 2.5, "minimum": pytest.approx(0.1), "maximum": 20.0, "default": 1.0,
+        "parameter": 29, "value": 2.5, "minimum": pytest.approx(0.01), "maximum": 100.0, "default": 1.0,
     }  # fmt: skip
-    for identifier, value, code in ((29, 99.0, 3), (29, math.nan, 3), (1, 1.5, 3), (250, 1.0, 3)):
+    for identifier, value, code in ((29, 101.0, 3), (29, math.nan, 3), (1, 1.5, 3), (250, 1.0, 3)):
         row = bench.icd.telecommands["set_parameter"]
         data = row.encode({"parameter": identifier, "value": value}, check=False)
         assert bench.send("set_parameter", data)[0].code == code

@@ -64,7 +64,7 @@ def test_telecommand_with_one_value(bench):
     import struct
 
     assert bench.write(0x6060, 0, struct.pack("<f", 5.0)) == 0
-    assert bench.write(0x6060, 0, struct.pack("<f", 50.0)) == AbortCode.VALUE_HIGH
+    assert bench.write(0x6060, 0, struct.pack("<f", 150.0)) == AbortCode.VALUE_HIGH
     assert bench.application.commands == [("set_update_rate", {"rate": 5.0})]
 
 
