@@ -17,13 +17,15 @@ from urllib.parse import urlsplit
 import serial
 
 from protocol.errors import reason
+from protocol.flow import TURN, TurnProtocol
 from protocol.keepalive import notice_a_lost_peer
 from protocol.serial_framing import PacingSchedule
 from protocol.transports.base import ReturningTransport, Transport, TransportError
 from protocol.transports.paced_writer import PacedWriter
 from protocol.transports.pty_peers import PtyPeers
 
-READ_SIZE: Final = 65536
+STREAM_LIMIT: Final = 65536
+"""Bytes that wait in a TCP connection for a peer that does not read, above which no more are written."""
 DEFAULT_BAUD: Final = 115200
 RATE_RETRY_S: Final = 0.002
 """Time until the next look whether the kernel has sent all, before the bit rate changes."""
@@ -195,7 +197,7 @@ class PtyTransport(_PacedTransport):
         self._peers.acknowledge()
         self._lose_unread(self._peers)
         try:
-            data = os.read(self._master, READ_SIZE)
+            data = os.read(self._master, TURN)
         except BlockingIOError:
             return
         except OSError as error:
@@ -297,7 +299,7 @@ class TtyTransport(_ReturningSerial):
         if self._port is None:
             return
         try:
-            data = os.read(self._port.fileno(), READ_SIZE)
+            data = os.read(self._port.fileno(), TURN)
         except BlockingIOError:
             return
         except OSError as error:
@@ -359,10 +361,11 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
     return f"serial {path}: cannot open: {os.strerror(number) if number else error}"
 
 
-class _StreamProtocol(asyncio.Protocol):
+class _StreamProtocol(TurnProtocol):
     """Hands what a TCP connection brings to its transport."""
 
     def __init__(self, owner: _TcpTransport) -> None:
+        super().__init__()
         self._owner = owner
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -412,7 +415,7 @@ class _TcpTransport(_ReturningSerial):
     def _write(self, data: bytes) -> int:
         if self._stream is None:
             raise OSError(errno.ENOTCONN, "no peer")
-        if self._stream.get_write_buffer_size() > READ_SIZE:
+        if self._stream.get_write_buffer_size() > STREAM_LIMIT:
             return 0
         self._stream.write(data)
         return len(data)
