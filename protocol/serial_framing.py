@@ -422,6 +422,10 @@ class PacingSchedule:
         self._free_at = begin + size * self.seconds_per_byte
         return begin, self._free_at
 
+    def release(self) -> None:
+        """Free the line at once: what was reserved will not be sent."""
+        self._free_at = float("-inf")
+
     def free_at(self, now: float) -> float:
         """Return when the line is free, not before `now`."""
         return max(now, self._free_at)

@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 from emulator.device.device import Device
 from emulator.links.base import DeviceLink
+from emulator.links.bus_address import BusAddress
 from protocol.can_framing import (
     MAX_EXTENDED_ID,
     MAX_FRAME_DATA,
     CanDeviceReceiver,
     CanFrame,
+    CanIdentifier,
     encode_reply_frames,
 )
 from protocol.messages import Reply
@@ -57,13 +59,26 @@ class CanLink(DeviceLink[CanFrame, int]):
         self._gap_s = frame_gap_s
         self._waiting: deque[CanFrame] = deque()
         self._next: asyncio.TimerHandle | None = None
+        self._address = BusAddress("address", "links.can.address")
         device.parameters.observe(self._parameters_changed)
+
+    async def start(self) -> str:
+        """Join the bus; return what was taken."""
+        taken = await super().start()
+        self._address.take(taken, self._style())
+        return taken
 
     async def close(self) -> None:
         """Leave the bus."""
+        self._address.release()
         if self._next is not None:
             self._next.cancel()
         await super().close()
+
+    def _receive(self, item: CanFrame) -> None:
+        if item.extended and CanIdentifier.unpack(item.id).source == self._address.number:
+            self._address.report_elsewhere()
+        super()._receive(item)
 
     def _new_receiver(self) -> CanDeviceReceiver:
         return CanDeviceReceiver(self._style())
@@ -90,3 +105,4 @@ class CanLink(DeviceLink[CanFrame, int]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:
             self._receiver = self._new_receiver()
+            self._address.take(self._transport.description, self._style())

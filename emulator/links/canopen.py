@@ -18,11 +18,12 @@ from emulator.device.device import Device
 from emulator.device.modes import Mode, Transition
 from emulator.device.refusal import Refused
 from emulator.errors import EmulatorError
+from emulator.links.bus_address import BusAddress
 from emulator.links.wire_faults import WireFaults
 from protocol.can_framing import MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
 from protocol.canopen.abort import AbortCode, SdoAbortError
 from protocol.canopen.application import Picture, abort_of, check_status
-from protocol.canopen.context import EventKind, SlaveEvent
+from protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from protocol.canopen.device_dictionary import build_dictionary
 from protocol.canopen.dictionary import Deferred
 from protocol.canopen.emergency import ErrorCode, ErrorRegister
@@ -223,6 +224,7 @@ class CanopenLink:
         self._attitude_valid = False
         self._timer: Event | None = None
         self._reconnects = 0
+        self._node = BusAddress("node", "links.canopen.node")
         loop = asyncio.get_running_loop()
         self.wire: WireFaults[CanFrame] = WireFaults(transport.send, BaseFramePieces(), loop, seed)
         device.on_frame.append(self._frame_made)
@@ -233,11 +235,14 @@ class CanopenLink:
     async def start(self) -> str:
         """Join the bus and boot up; return what was taken."""
         await self._transport.start(self._receive, self._complain)
+        node = self.slave.node_id
+        self._node.take(self._transport.description, 0 if node == UNCONFIGURED else node)
         self._do(self.slave.start)
         return self._transport.description
 
     async def close(self) -> None:
         """Leave the bus."""
+        self._node.release()
         if self._timer is not None:
             self._timer.cancel()
         await self._transport.close()

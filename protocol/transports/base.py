@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final, Generic, TypeVar
 
 from protocol.errors import ProtocolError
+
+_LOGGER: Final = logging.getLogger("starhil.transport")
 
 Item = TypeVar("Item")
 
@@ -121,6 +124,7 @@ class ReturningTransport(Transport[Item]):
                 continue
             self.statistics.reconnects += 1
             self._comeback = None
+            _LOGGER.warning("%s %s: back", self.what, self.description)
             return
 
     async def close(self) -> None:

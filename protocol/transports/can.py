@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import fcntl
+import logging
 import socket
 import struct
 from functools import partial
@@ -19,6 +20,8 @@ from protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT, CanHub
 from protocol.transports.base import Transport, TransportError
 from protocol.transports.hub_client import HubTransport
 from protocol.transports.python_can import OpenBus, PythonCanTransport
+
+_LOGGER: Final = logging.getLogger("starhil.transport")
 
 CanTransport = Transport[CanFrame]
 
@@ -153,6 +156,8 @@ class AutoHubTransport(HubTransport):
                 raise
             return
         self._hub = hub
+        if self._comeback is not None:
+            _LOGGER.warning("CAN %s: the hub there has ended; this process serves it now", self.description)
         self._port = hub.port
         self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
 

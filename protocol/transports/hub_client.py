@@ -9,6 +9,7 @@ from typing import Final, cast
 
 from protocol.can_framing import CanFrame
 from protocol.errors import reason
+from protocol.flow import WINDOW, TurnProtocol, limit_buffers
 from protocol.keepalive import notice_a_lost_peer
 from protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from protocol.transports.base import ReturningTransport, TransportError
@@ -25,12 +26,16 @@ CLOSE_S: Final = 0.5
 EnsureServer = Callable[[], Awaitable[None]]
 
 
-class _Connection(asyncio.Protocol):
-    """One connection to a server: answers during the handshake, frames after it."""
+class _Connection(TurnProtocol):
+    """One connection to a server: answers during the handshake, frames after it.
+
+    While the server does not take what is sent, nothing is read: replies to more requests would only wait.
+    """
 
     def __init__(
         self, on_frame: Callable[[CanFrame], None], on_lost: Callable[[_Connection, str], None]
     ) -> None:
+        super().__init__()
         self._on_frame = on_frame
         self._on_lost = on_lost
         self._splitter = CommandSplitter()
@@ -45,6 +50,7 @@ class _Connection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)
         notice_a_lost_peer(transport, must_read=True)
+        limit_buffers(transport)
         self.transport.set_write_buffer_limits(high=0)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -58,8 +64,19 @@ class _Connection(asyncio.Protocol):
 
     def resume_writing(self) -> None:
         self._drained.set()
+        if self.transport is not None:
+            self.transport.resume_reading()
+
+    def write(self, text: bytes) -> None:
+        """Send frames."""
+        if self.transport is None:
+            return
+        self.transport.write(text)
+        if self.transport.get_write_buffer_size() > WINDOW:
+            self.transport.pause_reading()
 
     def data_received(self, data: bytes) -> None:
+        """Take answers or frames."""
         for command in self._splitter.feed(data):
             if command is None:
                 self.bad += 1
@@ -185,7 +202,7 @@ class HubTransport(ReturningTransport[CanFrame]):
         count = len(self._outbox)
         self._outbox.clear()
         if self._connection is not None and self._connection.transport is not None:
-            self._connection.transport.write(text)
+            self._connection.write(text)
         else:
             self.statistics.sent -= count
             self.statistics.dropped += count

@@ -88,8 +88,10 @@ class PacedWriter:
             action()
 
     def clear(self) -> None:
-        """Drop what is waiting."""
+        """Drop what is waiting; the line is free at once."""
         self._statistics.dropped += self._backlog
+        if self.schedule is not None:
+            self.schedule.release()
         self._queue.clear()
         self._backlog = self._gone = 0
         if self._timer is not None:

@@ -17,12 +17,15 @@ from urllib.parse import urlsplit
 import serial
 
 from protocol.errors import reason
+from protocol.flow import TURN, TurnProtocol
 from protocol.keepalive import notice_a_lost_peer
 from protocol.serial_framing import PacingSchedule
 from protocol.transports.base import ReturningTransport, Transport, TransportError
 from protocol.transports.paced_writer import PacedWriter
+from protocol.transports.pty_peers import PtyPeers
 
-READ_SIZE: Final = 65536
+STREAM_LIMIT: Final = 65536
+"""Bytes that wait in a TCP connection for a peer that does not read, above which no more are written."""
 DEFAULT_BAUD: Final = 115200
 RATE_RETRY_S: Final = 0.002
 """Time until the next look whether the kernel has sent all, before the bit rate changes."""
@@ -144,32 +147,39 @@ def _write_fd(fd: int, data: bytes) -> int:
 
 
 class PtyTransport(_PacedTransport):
-    """An own pseudo-terminal; the peer opens its slave side like any tty, as often as it wants."""
+    """An own pseudo-terminal; the peer opens its slave side like any tty, as often as it wants.
+
+    As on a wire, what is sent while nobody has the slave side open is lost, and so is what a peer has left unread.
+    """
 
     def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
         super().__init__("pty", schedule)
         self._symlink = symlink
-        self._master = self._slave = -1
+        self._path = ""
+        self._master = -1
+        self._peers: PtyPeers | None = None
 
     async def _open(self) -> None:
         try:
-            self._master, self._slave = os.openpty()
+            self._master, slave = os.openpty()
         except OSError as error:
             raise TransportError(
                 f"serial pty: the system gives no pseudo-terminal: {error.strerror}"
             ) from None
-        tty.setraw(self._slave)
+        tty.setraw(slave)
         os.set_blocking(self._master, False)
-        path = os.ttyname(self._slave)
+        self._path = os.ttyname(slave)
+        os.close(slave)  # the master hangs up while no peer has it open
         if self._symlink is not None:
             try:
-                self._link(self._symlink, path)
+                self._link(self._symlink, self._path)
             except TransportError:
-                self._close_ends()
+                self._close_master()
                 raise
-        self.description = str(self._symlink) if self._symlink is not None else path
+        self.description = str(self._symlink) if self._symlink is not None else self._path
         self._make_writer()
-        asyncio.get_running_loop().add_reader(self._master, self._readable)
+        self._peers = PtyPeers(self._master, self._path)
+        asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
 
     def _link(self, link: Path, path: str) -> None:
         try:
@@ -182,35 +192,64 @@ class PtyTransport(_PacedTransport):
             raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
 
     def _readable(self) -> None:
+        if self._peers is None:
+            return
+        self._peers.acknowledge()
+        self._lose_unread(self._peers)
         try:
-            data = os.read(self._master, READ_SIZE)
+            data = os.read(self._master, TURN)
         except BlockingIOError:
             return
         except OSError as error:
-            asyncio.get_running_loop().remove_reader(self._master)
-            self._complain(f"serial {self.description}: {error.strerror}")
+            if error.errno != errno.EIO:  # that is: nobody has the slave side open
+                self._complain(f"serial {self.description}: {error.strerror}")
             return
+        asyncio.get_running_loop().call_soon(self._readable)  # the wake-up came once for all there is
         self._take(data)
 
+    def _lose_unread(self, peers: PtyPeers) -> None:
+        """Drop what a peer that left has not read, and what was still to be sent to it."""
+        if peers.all_left():
+            if self._writer is not None:
+                self._writer.clear()
+            peers.discard_unread()
+
+    def send(self, item: bytes) -> bool:
+        """Queue a message, whole or not at all; without a peer it is lost."""
+        if self._peers is not None:
+            self._lose_unread(self._peers)
+            if not self._peers.present:
+                self.statistics.dropped += len(item)
+                return False
+        return super().send(item)
+
     def _write(self, data: bytes) -> int:
+        if self._peers is None:
+            raise OSError(errno.EBADF, "port is closed")
+        if self._peers.all_left():
+            self._peers.discard_unread()
+            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops what was to be sent to it
+        if not self._peers.present:
+            raise OSError(errno.ENOTCONN, "no peer")
         return _write_fd(self._master, data)
 
     async def close(self) -> None:
         """Give the pseudo-terminal back and take away the symlink, if it still leads here."""
-        if self._master < 0:
+        if self._peers is None:
             return
-        asyncio.get_running_loop().remove_reader(self._master)
+        asyncio.get_running_loop().remove_reader(self._peers.fileno())
         self._drop_writer()
         if self._symlink is not None:
             with contextlib.suppress(OSError):
-                if str(self._symlink.readlink()) == os.ttyname(self._slave):
+                if str(self._symlink.readlink()) == self._path:
                     self._symlink.unlink()
-        self._close_ends()
+        self._peers.close()
+        self._peers = None
+        self._close_master()
 
-    def _close_ends(self) -> None:
+    def _close_master(self) -> None:
         os.close(self._master)
-        os.close(self._slave)
-        self._master = self._slave = -1
+        self._master = -1
 
 
 class _ReturningSerial(_PacedTransport, ReturningTransport[bytes]):
@@ -260,7 +299,7 @@ class TtyTransport(_ReturningSerial):
         if self._port is None:
             return
         try:
-            data = os.read(self._port.fileno(), READ_SIZE)
+            data = os.read(self._port.fileno(), TURN)
         except BlockingIOError:
             return
         except OSError as error:
@@ -322,10 +361,11 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
     return f"serial {path}: cannot open: {os.strerror(number) if number else error}"
 
 
-class _StreamProtocol(asyncio.Protocol):
+class _StreamProtocol(TurnProtocol):
     """Hands what a TCP connection brings to its transport."""
 
     def __init__(self, owner: _TcpTransport) -> None:
+        super().__init__()
         self._owner = owner
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -375,7 +415,7 @@ class _TcpTransport(_ReturningSerial):
     def _write(self, data: bytes) -> int:
         if self._stream is None:
             raise OSError(errno.ENOTCONN, "no peer")
-        if self._stream.get_write_buffer_size() > READ_SIZE:
+        if self._stream.get_write_buffer_size() > STREAM_LIMIT:
             return 0
         self._stream.write(data)
         return len(data)

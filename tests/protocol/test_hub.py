@@ -195,7 +195,7 @@ def test_a_client_that_does_not_read_loses_frames_alone_and_memory_is_bounded() 
             for _ in range(1000):
                 await two.reader.readuntil(b">")
         assert hub.statistics.dropped >= 1
-        assert max(client._backlog() for client in hub._clients) < BACKLOG_LIMIT + 2 * len(batch)
+        assert max(client.backlog for client in hub._clients) < BACKLOG_LIMIT + 2 * len(batch)
 
     run(scenario)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import subprocess
+import sys
 from pathlib import Path
 
 import can
@@ -85,6 +87,50 @@ def test_auto_starts_a_hub_joins_it_and_takes_over_when_its_owner_leaves() -> No
         await three.close()
 
     asyncio.run(main())
+
+
+FOUNDER = """
+import asyncio
+from protocol.transports import open_can
+async def main():
+    await open_can("auto", hub_port={port}).start(lambda _: None)
+    print("founded", flush=True)
+    await asyncio.Event().wait()
+asyncio.run(main())
+"""
+
+
+@pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
+def test_the_bus_goes_on_when_the_process_that_founded_it_is_killed(caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            port = probe.getsockname()[1]
+        founder = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", FOUNDER.format(port=port), stdout=asyncio.subprocess.PIPE
+        )
+        try:
+            assert founder.stdout is not None
+            assert await founder.stdout.readline() == b"founded\n"
+            heirs = [open_can("auto", hub_port=port) for _ in range(3)]
+            bench = open_can(f"socketcand:127.0.0.1:{port}/vcan0")
+            got: list[CanFrame] = []
+            for transport in (*heirs, bench):
+                await transport.start(lambda frame: got.append(bare(frame)))
+            assert [heir._hub for heir in heirs] == [None] * 3  # type: ignore[attr-defined]
+        finally:
+            founder.kill()
+            await founder.wait()
+        await until(lambda: all(each.statistics.reconnects == 1 for each in (*heirs, bench)))
+        assert sum(heir._hub is not None for heir in heirs) == 1  # type: ignore[attr-defined]
+        assert heirs[0].send(FRAMES[0])
+        await until(lambda: got == [FRAMES[0]] * 3)
+        for transport in (bench, *heirs):
+            await transport.close()
+
+    asyncio.run(main())
+    texts = [record.getMessage() for record in caplog.records]
+    assert sum("the hub there has ended; this process serves it now" in text for text in texts) == 1
+    assert sum(text.endswith("/vcan0: back") for text in texts) == 4
 
 
 @pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")

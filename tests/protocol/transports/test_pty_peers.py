@@ -1,0 +1,169 @@
+"""A pseudo-terminal as a wire: what nobody reads is lost, and who opens it hears what is sent from then on."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+
+from protocol.transports import SerialTransport, open_serial, pty_peers
+from tests.protocol.transports.pairs import until
+
+MESSAGE = bytes(range(100))
+REQUEST = b"request"
+
+
+@contextlib.asynccontextmanager
+async def opened(
+    *, baud: int = 921600, paced: bool = False
+) -> AsyncIterator[tuple[SerialTransport, bytearray]]:
+    line = open_serial("pty", baud, paced=paced)
+    heard = bytearray()
+    await line.start(heard.extend)
+    try:
+        yield line, heard
+    finally:
+        await line.close()
+
+
+@contextlib.contextmanager
+def peer(line: SerialTransport) -> Iterator[int]:
+    fd = os.open(line.description, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def unread(fd: int) -> bytes:
+    """What waits for a peer now."""
+    data = b""
+    with contextlib.suppress(BlockingIOError):
+        while piece := os.read(fd, 65536):
+            data += piece
+    return data
+
+
+async def next_bytes(fd: int, count: int) -> bytes:
+    data = bytearray()
+
+    def read() -> bool:
+        data.extend(unread(fd))
+        return len(data) >= count
+
+    await until(read)
+    return bytes(data)
+
+
+def test_what_is_sent_while_nobody_has_the_line_open_is_lost() -> None:
+    async def main() -> None:
+        async with opened() as (line, _):
+            for _ in range(1000):
+                assert not line.send(MESSAGE)
+            assert line.statistics.dropped == 1000 * len(MESSAGE)
+            with peer(line) as fd:
+                assert line.send(MESSAGE)
+                assert await next_bytes(fd, len(MESSAGE)) == MESSAGE
+
+    asyncio.run(main())
+
+
+def fill(line: SerialTransport) -> None:
+    """Send until the pseudo-terminal and the queue before it take no more."""
+    while line.send(MESSAGE):
+        pass
+
+
+@pytest.mark.parametrize("watched", [True, False], ids=["inotify", "no inotify"])
+def test_what_a_peer_has_left_unread_is_gone_for_the_next(
+    watched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not watched:
+        monkeypatch.setattr(pty_peers, "_watch", lambda _: -1)
+
+    async def main() -> None:
+        async with opened() as (line, heard):
+            with peer(line) as fd:
+                fill(line)
+                os.write(fd, REQUEST)
+                await until(lambda: bytes(heard) == REQUEST)
+            await until(lambda: line._writer.backlog == 0)  # type: ignore[attr-defined]
+            with peer(line) as fd:
+                assert line.send(MESSAGE)
+                assert await next_bytes(fd, len(MESSAGE)) == MESSAGE
+                assert unread(fd) == b""
+
+    asyncio.run(main())
+
+
+def test_a_peer_that_comes_before_the_loop_knows_that_the_last_one_left_gets_its_answer_and_no_other() -> (
+    None
+):
+    async def main() -> None:
+        line = open_serial("pty", paced=False)
+        await line.start(lambda _: line.send(MESSAGE))
+        with peer(line):
+            fill(line)
+            await asyncio.sleep(0)
+        with peer(line) as fd:
+            os.write(fd, REQUEST)
+            await until(lambda: line.statistics.received > 0)
+            assert await next_bytes(fd, len(MESSAGE)) == MESSAGE
+            await asyncio.sleep(0.05)
+            assert unread(fd) == b""
+        await line.close()
+
+    asyncio.run(main())
+
+
+def test_a_peer_hears_no_rest_of_a_message_that_began_before_it_came() -> None:
+    async def main() -> None:
+        async with opened(baud=9600, paced=True) as (line, _):
+            with peer(line) as fd:
+                line.send(bytes(5000))
+                await next_bytes(fd, 10)
+            with peer(line) as fd:
+                await asyncio.sleep(0.05)
+                assert line.send(MESSAGE)
+                assert await next_bytes(fd, len(MESSAGE)) == MESSAGE
+
+    asyncio.run(main())
+
+
+def test_a_program_that_looks_in_beside_a_peer_takes_nothing_from_it() -> None:
+    async def main() -> None:
+        async with opened() as (line, _):
+            with peer(line) as fd:
+                assert line.send(MESSAGE)
+                for _ in range(3):
+                    with peer(line):
+                        pass
+                    await asyncio.sleep(0.02)
+                assert line.send(MESSAGE)
+                assert await next_bytes(fd, 2 * len(MESSAGE)) == 2 * MESSAGE
+
+    asyncio.run(main())
+
+
+def test_a_request_written_by_a_program_that_closes_at_once_is_heard() -> None:
+    async def main() -> None:
+        async with opened() as (line, heard):
+            Path(line.description).write_bytes(REQUEST)
+            await until(lambda: bytes(heard) == REQUEST)
+
+    asyncio.run(main())
+
+
+def test_no_descriptor_stays_open_after_close() -> None:
+    async def main() -> None:
+        before = len(list(Path("/proc/self/fd").iterdir()))
+        async with opened() as (line, _):
+            with peer(line):
+                line.send(MESSAGE)
+        assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+    asyncio.run(main())

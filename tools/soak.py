@@ -1,0 +1,305 @@
+"""Run the emulator for a while under load and faults, and fail if it grows: in memory, descriptors or latency.
+
+The emulator solves ten frames a second and serves a pty and a CAN hub; a session runs over both links again and again, and
+between sessions the control channel puts faults into sky, device and wires, requests meet them, and they are taken out. After
+each round, with the faults out, resident memory and open descriptors of all processes (emulator, picture worker, hub) and the
+99th percentile of the latency of each link are taken.
+
+The first quarter of the time is the warm-up: caches, the log of the last frames and the allocator's arenas fill up. The rest is
+compared with itself, its first third against its last, by medians, so that one bad round on a busy machine decides nothing:
+
+memory        may grow by 8 MB: the allocator wanders by a few. In 15 minutes some 4500 frames and 60 sessions lie between the
+              middles of the two thirds, so that 2 kB kept a frame, or 140 kB kept a session, fail.
+descriptors   may not grow at all: every round ends in the same state, with nobody connected.
+latency       p99 may grow by half of what it was and 10 ms: lists that are searched, or queues that lengthen, grow without
+              end, while other programs on the machine come and go.
+
+Prints a line a round and the figures at start and end; exit status 1 on growth or a session that fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hil_tests.bench import LinkOptions
+from hil_tests.client import ObcClient
+from hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from hil_tests.errors import BenchError, DeviceError
+from hil_tests.results import percentile
+from hil_tests.session_run import SessionRequest, run_session
+
+WARM_UP_SHARE = 0.25
+MEMORY_GROWTH_MB = 8.0
+LATENCY_FACTOR, LATENCY_GROWTH_MS = 1.5, 10.0
+LEAST_ROUNDS = 8
+"""Rounds without which no third of the rest has two."""
+
+BAUD = 921_600
+REQUESTS = 200
+"""Requests a link and round whose latency is measured."""
+FAULTY_REQUESTS = 20
+FAULTY_TIMEOUT_S = 0.1
+SETTLE_S = 10.0
+"""Longest wait until what the last client left is closed."""
+ROWS = ("identification", "quaternion", "precise_attitude", "star_tracker")
+SESSION = Path(__file__).with_name("soak_session.toml")
+
+FAULTS: tuple[dict[str, Any], ...] = (
+    {"serial": {"drop": 0.3, "corrupt": 0.2, "junk": 0.2}, "can": {"drop": 0.3, "corrupt": 0.2, "junk": 0.2}},
+    {"serial": {"split": 3, "gap_s": 0.001}, "can": {"delay_s": 0.05}},
+    {"optical": {"false_stars": 50}},
+    {"device": {"stuck": True}},
+)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What is measured after a round: elapsed time (s), memory (MB), descriptors, p99 latencies of the links (ms)."""
+
+    time_s: float
+    memory_mb: float
+    descriptors: int
+    serial_p99_ms: float
+    can_p99_ms: float
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure at the start and the end of a soak, and the most that it may be at the end."""
+
+    name: str
+    start: float
+    end: float
+    limit: float
+
+    @property
+    def grew(self) -> bool:
+        """Whether the figure is beyond its limit."""
+        return not self.end <= self.limit
+
+
+def compare(samples: Sequence[Sample]) -> list[Figure]:
+    """Figures of the first and the last third after the warm-up.
+
+    Raises
+    ------
+    ValueError
+        Too few samples to compare.
+    """
+    end_s = samples[-1].time_s if samples else 0.0
+    warm = [sample for sample in samples if sample.time_s >= WARM_UP_SHARE * end_s]
+    third = len(warm) // 3
+    if len(samples) < LEAST_ROUNDS or third < 2:
+        raise ValueError(f"{len(samples)} rounds are too few to compare: give more minutes")
+    first, last = warm[:third], warm[-third:]
+
+    def figure(name: str, value: Callable[[Sample], float], limit: Callable[[float], float]) -> Figure:
+        start, end = (median(map(value, part)) for part in (first, last))
+        return Figure(name, start, end, limit(start))
+
+    def slower(start: float) -> float:
+        return LATENCY_FACTOR * start + LATENCY_GROWTH_MS
+
+    return [
+        figure("memory, MB", lambda sample: sample.memory_mb, lambda start: start + MEMORY_GROWTH_MB),
+        figure("descriptors", lambda sample: sample.descriptors, lambda start: start),
+        figure("serial latency p99, ms", lambda sample: sample.serial_p99_ms, slower),
+        figure("CAN latency p99, ms", lambda sample: sample.can_p99_ms, slower),
+    ]
+
+
+def processes(pid: int) -> Iterator[int]:
+    """A process and all that descend from it."""
+    yield pid
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
+    for child in children.split():
+        yield from processes(int(child))
+
+
+def memory_mb(pids: Sequence[int]) -> float:
+    """Resident memory of processes, MB."""
+    pages = sum(int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) for pid in pids)
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def descriptors(pids: Sequence[int]) -> int:
+    """Open descriptors of processes."""
+    return sum(len(list(Path(f"/proc/{pid}/fd").iterdir())) for pid in pids)
+
+
+def settled_descriptors(pids: Sequence[int]) -> int:
+    """Open descriptors when the ends of closed connections have been closed too."""
+    deadline = time.monotonic() + SETTLE_S
+    count = descriptors(pids)
+    while time.monotonic() < deadline:
+        time.sleep(0.2)
+        before, count = count, descriptors(pids)
+        if count == before:
+            break
+    return count
+
+
+class Control:
+    """A client of the control channel at `HOST:PORT` or `unix:/path`."""
+
+    def __init__(self, address: str) -> None:
+        if address.startswith("unix:"):
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            self._socket.connect(address.removeprefix("unix:"))
+        else:
+            host, _, port = address.rpartition(":")
+            self._socket = socket.create_connection((host.strip("[]"), int(port)))
+        self._lines = self._socket.makefile("rw", encoding="utf-8")
+
+    def do(self, action: str, **values: Any) -> dict[str, Any]:
+        """Send a request and return its answer.
+
+        Raises
+        ------
+        BenchError
+            The emulator rejects it, or is gone.
+        """
+        self._lines.write(json.dumps({"do": action, **values}) + "\n")
+        self._lines.flush()
+        line = self._lines.readline()
+        answer: dict[str, Any] = json.loads(line) if line else {"error": "the emulator closed the channel"}
+        if not answer.get("ok"):
+            raise BenchError(f"control channel: {action}: {answer.get('error')}")
+        return answer
+
+    def close(self) -> None:
+        """Leave the channel."""
+        self._lines.close()
+        self._socket.close()
+
+
+class Soak:
+    """A running emulator with its hub, and what is done to it in a round."""
+
+    def __init__(self, emulator: EmulatorProcess, hub: EmulatorProcess, folder: Path) -> None:
+        self._emulator, self._hub, self._folder = emulator, hub, folder
+        self._links = {"serial": emulator.ready["serial"], "can": emulator.ready["can"]}
+        self._rng = random.Random(1)  # noqa: S311 (rows to ask for, not secrets)
+        self._begin = time.monotonic()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the start, seconds."""
+        return time.monotonic() - self._begin
+
+    def round(self, number: int) -> Sample:
+        """Run a session, put faults in and out, and measure.
+
+        Raises
+        ------
+        BenchError
+            A step of the session fails, or the emulator ended.
+        """
+        options = LinkOptions(serial=self._links["serial"], can=self._links["can"], baud=BAUD)
+        result = run_session(SessionRequest(SESSION, options, folder=self._folder, quiet=True))
+        for step in result.results:
+            if step.status == "failed":
+                raise BenchError(f"round {number}: {step.link} {step.name}: {step.detail}")
+        control = Control(self._emulator.ready["control"])
+        try:
+            control.do("fault", **FAULTS[number % len(FAULTS)])
+            for link in self._links:
+                self._ask_in_vain(link)
+            control.do("clear_faults")
+        finally:
+            control.close()
+        latencies = {link: self._latency_p99_ms(link) for link in self._links}
+        pids = [pid for process in (self._emulator, self._hub) for pid in processes(process.process.pid)]
+        return Sample(
+            self.elapsed_s,
+            memory_mb(pids),
+            settled_descriptors(pids),
+            latencies["serial"],
+            latencies["can"],
+        )
+
+    def _client(self, link: str, timeout_s: float) -> ObcClient:
+        if link == "serial":
+            return ObcClient.open(serial=self._links[link], baud=BAUD, timeout_s=timeout_s)
+        return ObcClient.open(can=self._links[link], timeout_s=timeout_s)
+
+    def _ask_in_vain(self, link: str) -> None:
+        """Send requests while faults are in; that some are not answered is what faults do."""
+        with self._client(link, FAULTY_TIMEOUT_S) as obc:
+            for _ in range(FAULTY_REQUESTS):
+                with contextlib.suppress(DeviceError):
+                    obc.telemetry(self._rng.choice(ROWS))
+
+    def _latency_p99_ms(self, link: str) -> float:
+        with self._client(link, SETTLE_S) as obc:
+            obc.telemetry("identification")  # the connection warms up
+            taken = []
+            for _ in range(REQUESTS):
+                begin = time.perf_counter()
+                obc.telemetry(self._rng.choice(ROWS))
+                taken.append(1e3 * (time.perf_counter() - begin))
+        return percentile(taken, 0.99)
+
+
+def soak(seconds: float) -> list[Sample]:
+    """Run rounds for some time and return their samples; prints each."""
+    samples: list[Sample] = []
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-soak-")))
+        hub = stack.enter_context(EmulatorProcess(hub_command()))
+        command = emulator_command(
+            profile="demo",
+            can=hub.ready["can"],
+            seed=1,
+            settings=[f"links.serial.baud={BAUD}"],
+            state_dir=folder / "state",
+            extra=["--control", "auto"],
+        )
+        emulator = stack.enter_context(EmulatorProcess(command))
+        running = Soak(emulator, hub, folder / "session")
+        while running.elapsed_s < seconds:
+            sample = running.round(len(samples))
+            samples.append(sample)
+            print(
+                f"round {len(samples):3d} {sample.time_s:6.0f} s  {sample.memory_mb:6.1f} MB  "
+                f"{sample.descriptors:3d} descriptors  p99 serial {sample.serial_p99_ms:6.1f} ms  "
+                f"CAN {sample.can_p99_ms:6.1f} ms",
+                flush=True,
+            )
+    return samples
+
+
+def main() -> int:
+    """Soak and print; 0 if nothing grew."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--minutes", type=float, default=15.0, help="how long")
+    minutes = parser.parse_args().minutes
+    try:
+        figures = compare(soak(60.0 * minutes))
+    except (BenchError, ValueError) as error:
+        print(f"soak: {error}", file=sys.stderr)
+        return 1
+    for figure in figures:
+        verdict = "GREW" if figure.grew else "ok"
+        print(
+            f"{figure.name:24s} start {figure.start:7.1f}  end {figure.end:7.1f}  limit {figure.limit:7.1f}  {verdict}"
+        )
+    return int(any(figure.grew for figure in figures))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
