@@ -28,7 +28,8 @@ from emulator.links.serial import SerialLink
 from emulator.profile import Profile
 from emulator.pump import ClockPump, StepPump
 from emulator.scenario import load_scenario
-from emulator.truth.config import LiveConfig, TruthConfig
+from emulator.truth.config import FileConfig, LiveConfig, TruthConfig
+from emulator.truth.file import FileTruth
 from emulator.truth.live import LiveFeed, LiveTruth
 from emulator.truth.log import TruthLog
 from emulator.truth.source import TruthSource
@@ -210,7 +211,9 @@ class Emulation:
         EmulatorError
             A file is bad or a port cannot be had; the source before it stays.
         """
-        truth = config.build(self.clock.now_ns() / 1e9, self.profile.folder)
+        truth = await asyncio.to_thread(config.build, self.clock.now_ns() / 1e9, self.profile.folder)
+        if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
+            truth.start_s = self.clock.now_ns() / 1e9  # reading has taken time
         feed: LiveFeed | None = None
         if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)

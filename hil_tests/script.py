@@ -74,6 +74,7 @@ from hil_tests.script_reader import TableReader
 from protocol.codec import Field, Row
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
+from protocol.user_file import read_user_text
 from protocol.values import Parameter, Value
 
 LISTED: Final = "; `starhil icd list` lists all"
@@ -92,7 +93,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         file, step, name and near matches.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(read_user_text(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ScriptError(f"{path}: cannot be read: {reason}") from None

@@ -17,6 +17,7 @@ from protocol.codec import Field, FieldKind, Row, RowKind, Slot
 from protocol.errors import ProtocolError
 from protocol.icd_schema import BitModel, EnumModel, FieldModel, FileModel, ParameterModel, RowModel
 from protocol.messages import FIRST_TELEMETRY_ID
+from protocol.user_file import read_user_text
 from protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter
 
 __all__ = ["IcdError", "InterfaceDefinition", "Names", "UnknownNameError", "default_icd_path", "load_icd"]
@@ -141,8 +142,7 @@ def _load(path: Path) -> InterfaceDefinition:
 
 def _read(file: Path) -> FileModel:
     try:
-        with file.open("rb") as stream:
-            document = tomllib.load(stream)
+        document = tomllib.loads(read_user_text(file))
     except OSError as error:
         raise IcdError(f"{file}: cannot read the interface definition: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

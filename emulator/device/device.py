@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
 from emulator.clock import NANOSECONDS, Clock, DeviceTime
@@ -141,8 +141,6 @@ class Device:
         self._boot_over: Event | None = None
         self._unsolicited: Event | None = None
         self._stored_parameters: dict[str, object] = {}
-        self._saving = 0
-        """Saves under way: until they are done, the store is behind what the device knows."""
         self.parameters.observe(self._parameters_changed)
         missing = missing_handlers(icd)
         if missing:
@@ -154,7 +152,7 @@ class Device:
 
     def power_on(self) -> None:
         """Start: load what is stored, count the start, boot."""
-        self._start("power_on")
+        self._start("power_on", self.store.load())
 
     def start_refused(self) -> None:
         """Take back the count of a start that came to nothing, as a port or a file could not be had."""
@@ -163,12 +161,11 @@ class Device:
 
     def reset(self, cause: str) -> None:
         """Restart, for a cause by its name in the interface definition."""
-        self._start(cause)
+        self._start(cause, self._content())
         for observer in self.on_reset:
             observer()
 
-    def _start(self, cause: str) -> None:
-        state = self._content() if self._saving else self.store.load()
+    def _start(self, cause: str, state: Mapping[str, object]) -> None:
         count, stored = state.get("boot_count"), state.get("parameters")
         self.boot_count = ((count if isinstance(count, int) else 0) + 1) & 0xFFFF
         self.reset_cause = cause
@@ -250,16 +247,10 @@ class Device:
 
     def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
         content = self._content()
-        self._saving += 1
-
-        def saved(error: EmulatorError | None) -> None:
-            self._saving -= 1
-            done(error)
-
-        self._background(lambda: self.store.save(content), saved)
+        self._background(lambda: self.store.save(content), done)
 
     def _content(self) -> dict[str, object]:
-        """What the store holds when all that is being saved has been: a restart may come before that."""
+        """What the store holds when all that is being saved has been: what a restart begins with."""
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from emulator.errors import EmulatorError
 from emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
+from protocol.user_file import read_user_text
 from starid.attitude import Attitude, interpolate, rate_between
 
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
@@ -36,6 +37,9 @@ LOG_COLUMNS: Final = {
     **{f"true_{name}": name for name in (*QUATERNION_COLUMNS, *RATE_COLUMNS)},
 }
 """Columns of a truth log → what they are here."""
+
+MAX_BYTES: Final = 256_000_000
+"""Largest truth file that is read, bytes: a day of a truth log at 5 frames a second."""
 
 NORM_TOLERANCE: Final = 0.01
 """A quaternion whose length is off by more than this is taken for a mistake, not for rounding."""
@@ -115,7 +119,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
         The file is missing, has not the columns of this module's head, or a row is not numbers, not a rotation, or not later than the row before.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_user_text(path, MAX_BYTES)
     except (OSError, ValueError) as error:  # a path that no file can have is a ValueError
         reason = str(error)
         if isinstance(error, OSError):
