@@ -57,6 +57,8 @@ class RunOptions:
     ----------
     truth_log
         CSV file of truth and measurement a frame.
+    overwrite
+        Replace a truth log that exists.
     control
         `off`, `auto` (a free port on loopback) or HOST:PORT.
     scenario
@@ -64,6 +66,7 @@ class RunOptions:
     """
 
     truth_log: Path | None = None
+    overwrite: bool = False
     control: str = "off"
     scenario: str = ""
 
@@ -153,7 +156,7 @@ class Emulation:
         device = Device(self.profile, icd, self.clock, self.imager, store, truth, background)
         self._device = device
         if self.options.truth_log is not None:
-            truth_log = TruthLog(self.options.truth_log)
+            truth_log = TruthLog(self.options.truth_log, overwrite=self.options.overwrite)
             device.on_frame.append(truth_log.write)
             self._closers.append(truth_log.close)
         device.on_frame.append(_log_frame)

@@ -37,7 +37,7 @@ def emulator_command(
     truth_log: Path | None = None,
     extra: Sequence[str] = (),
 ) -> list[str]:
-    """Return the command line that starts the emulator with this very Python."""
+    """Return the command line that starts the emulator with this very Python; a truth log is written from its beginning."""
     command = [sys.executable, "-c", STARHIL, "run"]
     if profile is not None:
         command.append(profile)
@@ -49,7 +49,7 @@ def emulator_command(
     if state_dir is not None:
         command += ["--state-dir", str(state_dir)]
     if truth_log is not None:
-        command += ["--truth-log", str(truth_log)]
+        command += ["--truth-log", str(truth_log), "--overwrite"]
     return [*command, *extra]
 
 

@@ -134,7 +134,7 @@ class _Checker:
 
     def _truth(self, reader: TableReader) -> Truth:
         attitude = read_stated_attitude(reader)
-        file = reader.text("file") if reader.has("file") else None
+        file = self._file_name(reader, "file") if reader.has("file") else None
         reader.finish()
         if attitude is not None and file is not None:
             reader.fail("give an attitude or a file, not both")
@@ -406,8 +406,8 @@ class _Checker:
     def _file_name(self, reader: TableReader, key: str, default: str | None = None) -> str:
         """Read the name of a file to write, which stays inside the log folder."""
         name = reader.text(key, default)
-        if not name or Path(name).name != name:
-            reader.fail(f"'{key}' must be a plain file name; it is written to the log folder")
+        if name in {"", ".."} or Path(name).name != name or "\0" in name:
+            reader.fail(f"'{key}' must be a plain file name; it stands in the log folder")
         return name
 
 

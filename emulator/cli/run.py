@@ -31,6 +31,7 @@ def command(
     truth_log: Annotated[
         Path | None, typer.Option(help="CSV file of truth and measurement, a row a frame.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a truth log that exists.")] = False,
     scenario: Annotated[
         str,
         typer.Option(help="Scenario file, or a name of configs/scenarios: faults and truths by run time."),
@@ -86,7 +87,7 @@ def command(
     async def run() -> None:
         import signal
 
-        emulation = Emulation(loaded, RunOptions(truth_log, control, scenario), worker=worker)
+        emulation = Emulation(loaded, RunOptions(truth_log, overwrite, control, scenario), worker=worker)
         loop = asyncio.get_running_loop()
         ends = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
