@@ -16,7 +16,7 @@ from emulator.device.parameters import Parameters, ParameterValue
 from emulator.device.refusal import Refused
 from emulator.device.scheduler import Event, Scheduler
 from emulator.device.state_store import StateStore
-from emulator.device.telecommands import TELECOMMANDS
+from emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
 from emulator.device.telemetry import TELEMETRY
 from emulator.errors import EmulatorError
 from emulator.imaging.frames import FrameRequest
@@ -235,8 +235,10 @@ class Device:
         def finish(error: EmulatorError | None) -> None:
             if error is None:
                 self.parameters.mark_stored(content)
-            elif self._stored_parameters is stored:  # neither another save nor a restart has followed
-                self._stored_parameters = before
+            else:
+                log.error("%s", error)
+                if self._stored_parameters is stored:  # neither another save nor a restart has followed
+                    self._stored_parameters = before
             done(error)
 
         self._persist(finish)
@@ -333,8 +335,16 @@ class Device:
 
     # --- requests ---
 
-    def handle(self, request: Request) -> list[Reply]:
-        """Take a request from a link; return what goes back over the same link, in order."""
+    def handle(self, request: Request, later: Callable[[Reply], None] | None = None) -> list[Reply] | None:
+        """Take a request from a link; return what goes back over the same link, in order.
+
+        Parameters
+        ----------
+        request
+            What arrived.
+        later
+            Takes the answer to a telecommand that is answered only when it is done; None is returned then.
+        """
         if self.deaf:
             return []
         if request.kind is RequestKind.TELEMETRY:
@@ -342,8 +352,11 @@ class Device:
             return [self._answer_telemetry(request)]
         self.counters.telecommands = (self.counters.telecommands + 1) & 0xFFFF
         code, replies = self._execute(request)
-        kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-        return [Reply(kind, request.id, code=code, destination=request.source), *replies]
+        if code is None:
+            if later is not None:
+                self.acknowledge.on_end = lambda code: later(_answer(request, code))
+            return None
+        return [_answer(request, code), *replies]
 
     def fault(self, fault: LinkFault) -> None:
         """Count input on a link that made no request."""
@@ -360,9 +373,9 @@ class Device:
         return TELEMETRY[name](self)
 
     def telecommand(self, name: str, values: dict[str, Value]) -> tuple[ErrorCode, int]:
-        """Do a telecommand whose values are checked; return its error code and the field it is about."""
+        """Do a telecommand whose values are checked; return its error code so far and the field it is about."""
         code, index, _ = self._do(name, values, 0)
-        return code, index
+        return code or ErrorCode.OK, index
 
     def _answer_telemetry(self, request: Request) -> Reply:
         row = self.icd.telemetry_by_id.get(request.id)
@@ -379,7 +392,7 @@ class Device:
             return Reply(ReplyKind.NACK, request.id, code=refused.code, destination=request.source)
         return Reply(ReplyKind.TELEMETRY, request.id, data, destination=request.source)
 
-    def _execute(self, request: Request) -> tuple[ErrorCode, list[Reply]]:
+    def _execute(self, request: Request) -> tuple[ErrorCode | None, list[Reply]]:
         row = self.icd.telecommands_by_id.get(request.id)
         if row is None:
             self._note(request.id, ErrorCode.INVALID_ID, 0)
@@ -392,8 +405,10 @@ class Device:
         code, _, replies = self._do(row.name, values, request.source)
         return code, replies
 
-    def _do(self, name: str, values: dict[str, Value], source: int) -> tuple[ErrorCode, int, list[Reply]]:
-        """Do a decoded telecommand, and note in the acknowledge what became of it."""
+    def _do(
+        self, name: str, values: dict[str, Value], source: int
+    ) -> tuple[ErrorCode | None, int, list[Reply]]:
+        """Do a decoded telecommand, and note in the acknowledge what became of it; no code where that is still open."""
         if not self.acknowledge.processed:
             self.counters.overrun()
         acknowledge = Acknowledge(self.icd.telecommands[name].id, processed=False)
@@ -406,8 +421,10 @@ class Device:
         except MessageError as error:
             acknowledge.end(error.code, error.index)
             return error.code, error.index, []
-        if replies is None:  # done later; the handler ends the acknowledge
-            return ErrorCode.OK, 0, []
+        if replies is None:  # the handler ends the acknowledge
+            if name not in ANSWERED_WHEN_DONE:
+                return ErrorCode.OK, 0, []
+            return acknowledge.error if acknowledge.processed else None, 0, []
         acknowledge.end()
         return (
             ErrorCode.OK,
@@ -419,6 +436,11 @@ class Device:
         if not self.acknowledge.processed:
             self.counters.overrun()
         self.acknowledge = Acknowledge(identifier, processed=True, error=code, parameter_index=index)
+
+
+def _answer(request: Request, code: ErrorCode) -> Reply:
+    kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
+    return Reply(kind, request.id, code=code, destination=request.source)
 
 
 def missing_handlers(icd: InterfaceDefinition) -> list[str]:
