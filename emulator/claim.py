@@ -1,4 +1,4 @@
-"""A symlink as the property of one running emulator.
+"""A path as the property of one running emulator.
 
 An abstract socket named after the path stands for the claim: it ends with its process, however that ends, and tells the
 number of the process to whoever asks for the same path.
@@ -31,8 +31,19 @@ def claim_symlink(path: Path) -> socket.socket:
         raise EmulatorError(
             f"symlink {path}: leads to {path.readlink()}, so no emulator made it; choose another name"
         )
+    return claim_path("symlink", path)
+
+
+def claim_path(what: str, path: Path) -> socket.socket:
+    """Claim a path for something that one emulator alone makes there; the claim holds until the socket is closed.
+
+    Raises
+    ------
+    EmulatorError
+        Another emulator has it; the message begins with `what`.
+    """
     place = path.parent.resolve() / path.name
-    name = b"\0starhil-symlink-" + hashlib.sha256(os.fsencode(place)).hexdigest().encode()
+    name = b"\0starhil-" + hashlib.sha256(what.encode() + os.fsencode(place)).hexdigest().encode()
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         claim.bind(name)
@@ -40,7 +51,7 @@ def claim_symlink(path: Path) -> socket.socket:
     except OSError:
         claim.close()
         raise EmulatorError(
-            f"symlink {path}: in use by another emulator, process {_owner(name)}; end that one, or choose another name"
+            f"{what} {path}: in use by another emulator, process {_owner(name)}; end that one, or choose another name"
         ) from None
     return claim
 

@@ -60,7 +60,9 @@ class RunOptions:
     overwrite
         Replace a truth log that exists.
     control
-        `off`, `auto` (a free port on loopback) or HOST:PORT.
+        `off`, `auto` (a Unix socket for this user alone), unix:/PATH or HOST:PORT.
+    control_token
+        What each request on the control channel has to carry; empty: nothing.
     scenario
         Name or path of a scenario; empty: none.
     """
@@ -68,6 +70,7 @@ class RunOptions:
     truth_log: Path | None = None
     overwrite: bool = False
     control: str = "off"
+    control_token: str = ""
     scenario: str = ""
 
 
@@ -166,7 +169,7 @@ class Emulation:
         try:
             await self._open_links(device)
             if self.options.control != "off":
-                self.control = ControlServer(self, self.ended.set)
+                self.control = ControlServer(self, self.ended.set, self.options.control_token)
                 self.ready_words["control"] = await self.control.start(self.options.control)
         except (EmulatorError, ProtocolError):
             device.start_refused()

@@ -40,5 +40,5 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
 
 
 def read_user_text(path: Path, limit: int = MAX_BYTES) -> str:
-    """Return the content of a regular UTF-8 file as `read_user_file` does; UnicodeDecodeError if it is not UTF-8."""
-    return read_user_file(path, limit).decode("utf-8")
+    """Return the content of a regular UTF-8 file, without a byte order mark; UnicodeDecodeError if it is not UTF-8."""
+    return read_user_file(path, limit).decode("utf-8-sig")

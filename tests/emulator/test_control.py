@@ -182,7 +182,7 @@ def test_a_fault_of_ours_is_answered_and_logged_and_the_connection_stays(run, mo
                 answer = await control.do("clear_faults", id=4)
             assert answer["id"] == 4
             assert not answer["ok"]
-            assert "KeyError: 0" in answer["error"]
+            assert "internal error: KeyError; see" in answer["error"]
             (record,) = [each for each in caplog.records if each.name == "starhil.control"]
             assert record.exc_info
             assert (await control.do("status"))["ok"]

@@ -36,6 +36,9 @@ def test_a_file_comes_whole_and_one_beyond_the_limit_not_at_all(tmp_path):
     path.write_bytes(b"12\xc3\xa4")
     assert read_user_file(path, 4) == b"12\xc3\xa4"
     assert read_user_text(path) == "12ä"
+    path.write_bytes(b"\xef\xbb\xbf12")
+    assert read_user_text(path) == "12"
+    path.write_bytes(b"1234")
     with pytest.raises(UnsuitableFileError) as refusal:
         read_user_file(path, 3)
     assert refusal.value.strerror == "larger than 3e-06 MB"
