@@ -1,7 +1,7 @@
-"""A path as the property of one running emulator.
+"""A symlink, or any name, as the property of one running emulator.
 
-An abstract socket named after the path stands for the claim: it ends with its process, however that ends, and tells the
-number of the process to whoever asks for the same path.
+An abstract socket named after it stands for the claim: it ends with its process, however that ends, and tells the
+number of the process to whoever asks for the same name.
 """
 
 from __future__ import annotations
@@ -31,28 +31,39 @@ def claim_symlink(path: Path) -> socket.socket:
         raise EmulatorError(
             f"symlink {path}: leads to {path.readlink()}, so no emulator made it; choose another name"
         )
-    return claim_path("symlink", path)
+    place = path.parent.resolve() / path.name
+    try:
+        return claim_name("symlink", os.fsencode(place))
+    except NameTakenError as error:
+        raise EmulatorError(
+            f"symlink {path}: in use by another emulator, process {error.owner}; end that one, or choose another name"
+        ) from None
 
 
-def claim_path(what: str, path: Path) -> socket.socket:
-    """Claim a path for something that one emulator alone makes there; the claim holds until the socket is closed.
+class NameTakenError(EmulatorError):
+    """Another emulator has the name; `owner` is its process."""
+
+    def __init__(self, owner: str) -> None:
+        super().__init__(f"in use by another emulator, process {owner}")
+        self.owner = owner
+
+
+def claim_name(kind: str, name: bytes) -> socket.socket:
+    """Claim a name of some kind on this machine; the claim holds until the socket is closed.
 
     Raises
     ------
-    EmulatorError
-        Another emulator has it; the message begins with `what`.
+    NameTakenError
+        Another emulator has it.
     """
-    place = path.parent.resolve() / path.name
-    name = b"\0starhil-" + hashlib.sha256(what.encode() + os.fsencode(place)).hexdigest().encode()
+    address = f"\0starhil-{kind}-{hashlib.sha256(name).hexdigest()}".encode()
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        claim.bind(name)
+        claim.bind(address)
         claim.listen()
     except OSError:
         claim.close()
-        raise EmulatorError(
-            f"{what} {path}: in use by another emulator, process {_owner(name)}; end that one, or choose another name"
-        ) from None
+        raise NameTakenError(_owner(address)) from None
     return claim
 
 

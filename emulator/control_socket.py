@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from emulator.claim import claim_path
+from emulator.claim import NameTakenError, claim_name
 from emulator.errors import EmulatorError
 from protocol.errors import reason
 
@@ -31,7 +31,10 @@ class ControlSocket:
         if not path.is_absolute() or any(character.isspace() or character == "\0" for character in str(path)):
             raise EmulatorError(f"--control unix:{path}: must be an absolute path without spaces")
         self.path = path
-        self._claim = claim_path("control channel", path)
+        try:
+            self._claim = claim_name("control", os.fsencode(path.parent.resolve() / path.name))
+        except NameTakenError as error:
+            raise EmulatorError(f"control channel unix:{path}: {error}; choose another path") from None
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._file: os.stat_result | None = None
         try:

@@ -37,7 +37,7 @@ def emulator_command(
     truth_log: Path | None = None,
     extra: Sequence[str] = (),
 ) -> list[str]:
-    """Return the command line that starts the emulator with this very Python; a truth log is written from its beginning."""
+    """Return the command line that starts the emulator with this very Python."""
     command = [sys.executable, "-c", STARHIL, "run"]
     if profile is not None:
         command.append(profile)

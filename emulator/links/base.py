@@ -63,7 +63,6 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._loop = asyncio.get_running_loop()
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
-        self._closed = False
         self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, self._loop, seed)
         device.outlets.append(self._unsolicited)
         device.on_reset.append(self._forget)
@@ -91,7 +90,6 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     async def close(self) -> None:
         """Give the transport back."""
-        self._closed = True
         if self._timer is not None:
             self._timer.cancel()
         await self._transport.close()
@@ -112,8 +110,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         style = self._style()  # the answer to a change of style still goes out in the old one
 
         def answer(reply: Reply) -> None:
-            if not self._closed:
-                self._send(reply, style)
+            self._send(reply, style)
 
         for reply in self._device.handle(event, answer) or ():
             answer(reply)

@@ -101,9 +101,9 @@ def test_a_save_is_answered_on_its_link_when_the_disk_is_done(bench, fails):
         assert (reply.id, reply.code) == (row, wanted)
         assert linked.uart.take() == []
         assert linked.over_serial(row) == []
-        await linked.serial.close()
         waiting.pop()(error)
-        assert linked.uart.take() == []
+        assert linked.uart.take()
+        assert linked.bus.take() == []
 
     in_loop(scenario())
 
