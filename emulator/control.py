@@ -1,7 +1,11 @@
 """The control channel: a way into a running emulator that is apart from the links to the OBC.
 
-TCP on loopback, one JSON object a line, one answer a line, in order. A request has `do` and what belongs to it; an `id`, if
-given, comes back in the answer. An answer has `ok`; where that is false, `error` says why in one line, and nothing was done.
+One JSON object a line, one answer a line, in order. A request has `do` and what belongs to it; an `id`, if given, comes back in
+the answer. An answer has `ok`; where that is false, `error` says why in one line, and nothing was done.
+
+`--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open. HOST:PORT listens on TCP,
+which is open to every local user, and beyond loopback to the network: whoever connects can do all that follows. With a token
+(`--control-token`, or STARHIL_CONTROL_TOKEN) each request has to carry it as `token`.
 
 ========================  =======================================================================================
 `do`                      what, and what the answer carries
@@ -25,19 +29,23 @@ restart now); `serial` and `can` (CANopen too) = drop, corrupt, junk (chances 0 
 from __future__ import annotations
 
 import asyncio
+import hmac
 import json
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from emulator.clock import NANOSECONDS
+from emulator.control_socket import ControlSocket, automatic_path
 from emulator.device.cycle import Measurement, as_quaternion
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
+from emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from emulator.truth.config import FixedConfig, TruthConfig
 from emulator.truth.live import LiveTruth
 from emulator.truth.log import compare
@@ -66,10 +74,15 @@ class ControlServer:
         What is controlled.
     quit_run
         Ends the run.
+    token
+        What each request has to carry as `token`; empty: nothing.
     """
 
-    def __init__(self, emulation: Emulation, quit_run: Callable[[], None]) -> None:
+    def __init__(self, emulation: Emulation, quit_run: Callable[[], None], token: str = "") -> None:
         self._emulation = emulation
+        self._token = token
+        self._socket: ControlSocket | None = None
+        self._opening = asyncio.Lock()
         self._quit = quit_run
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
@@ -87,16 +100,23 @@ class ControlServer:
         emulation.device.on_frame.append(self._frames.append)
 
     async def start(self, where: str) -> str:
-        """Listen at `auto` or HOST:PORT; return HOST:PORT.
+        """Listen at `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
 
         Raises
         ------
         EmulatorError
-            The port is busy, or `where` is no address.
+            The path or port is taken, or `where` is no address.
         """
-        host, _, port = ("127.0.0.1:0" if where == "auto" else where).rpartition(":")
+        if where == "auto" or where.startswith("unix:"):
+            path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
+            self._socket = ControlSocket(path)
+            self._server = await asyncio.start_unix_server(
+                self._serve, sock=self._socket.socket, limit=MAX_LINE
+            )
+            return f"unix:{path}"
+        host, _, port = where.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
-            raise EmulatorError(f"--control {where}: must be off, auto or HOST:PORT")
+            raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
         try:
             self._server = await asyncio.start_server(self._serve, host, int(port), limit=MAX_LINE)
         except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
@@ -110,21 +130,16 @@ class ControlServer:
         """Stop listening and hang up."""
         if self._server is not None:
             self._server.close()
+        if self._socket is not None:
+            self._socket.close()
         for writer in list(self._writers):
             writer.transport.abort()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         try:
-            while True:
-                try:
-                    line = await reader.readline()
-                except ValueError:
-                    writer.write(b'{"ok": false, "error": "line too long"}\n')
-                    break
-                if not line:
-                    break
-                if line.strip():
+            async for line in read_lines(reader):
+                if line is None or line.strip():
                     writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
                     await writer.drain()
         except ConnectionError as error:
@@ -133,16 +148,23 @@ class ControlServer:
             self._writers.discard(writer)
             writer.close()
 
-    async def answer(self, line: bytes | str) -> Answer:
-        """Do one request and return its answer; a bad request changes nothing."""
+    async def answer(self, line: bytes | str | None) -> Answer:
+        """Do one request and return its answer; a bad request changes nothing. None is a line that was too long."""
+        if line is None:
+            return {"ok": False, "error": f"line too long: at most {MAX_LINE} bytes"}
         try:
-            request = json.loads(line)
+            request = parse_json(line)
+        except RepeatedKeyError as error:
+            return {"ok": False, "error": str(error)}
         except (ValueError, RecursionError):
             request = None
         if not isinstance(request, dict):
             return {"ok": False, "error": "not a JSON object on one line"}
         identity = {"id": request.pop("id")} if "id" in request else {}
-        action = self._doing.get(str(request.pop("do", "")))
+        if not self._admits(request.pop("token", None)):
+            return {**identity, "ok": False, "error": "token: missing or wrong; give that of --control-token"}
+        wanted = str(request.pop("do", ""))
+        action = self._doing.get(wanted)
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._doing)}"}
         try:
@@ -150,9 +172,14 @@ class ControlServer:
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {**identity, "ok": False, "error": str(error)}
         except Exception as error:  # a fault of ours shall not end the run, nor the peer's connection
-            log.exception("control channel: %.200r", line)
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            return {**identity, "ok": False, "error": f"internal error: {text}; see the emulator's log"}
+            log.exception("control channel: %s", wanted)
+            name = type(error).__name__
+            return {**identity, "ok": False, "error": f"internal error: {name}; see the emulator's log"}
+
+    def _admits(self, token: object) -> bool:
+        if not self._token:
+            return True
+        return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
     async def _status(self, request: dict[str, Any]) -> Answer:
         _only(request)
@@ -223,7 +250,8 @@ class ControlServer:
             raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
         device = self._emulation.device
-        device.cycle.truth = await self._emulation.open_truth(config)
+        async with self._opening:  # reading a file takes time: the last request shall hold
+            device.cycle.truth = await self._emulation.open_truth(config)
         return {"kind": config.kind, "address": self._emulation.ready_words.get("truth", "")}
 
     async def _step(self, request: dict[str, Any]) -> Answer:

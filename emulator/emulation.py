@@ -28,7 +28,8 @@ from emulator.links.serial import SerialLink
 from emulator.profile import Profile
 from emulator.pump import ClockPump, StepPump
 from emulator.scenario import load_scenario
-from emulator.truth.config import LiveConfig, TruthConfig
+from emulator.truth.config import FileConfig, LiveConfig, TruthConfig
+from emulator.truth.file import FileTruth
 from emulator.truth.live import LiveFeed, LiveTruth
 from emulator.truth.log import TruthLog
 from emulator.truth.source import TruthSource
@@ -56,14 +57,20 @@ class RunOptions:
     ----------
     truth_log
         CSV file of truth and measurement a frame.
+    overwrite
+        Replace a truth log that exists.
     control
-        `off`, `auto` (a free port on loopback) or HOST:PORT.
+        `off`, `auto` (a Unix socket for this user alone), unix:/PATH or HOST:PORT.
+    control_token
+        What each request on the control channel has to carry; empty: nothing.
     scenario
         Name or path of a scenario; empty: none.
     """
 
     truth_log: Path | None = None
+    overwrite: bool = False
     control: str = "off"
+    control_token: str = ""
     scenario: str = ""
 
 
@@ -152,7 +159,7 @@ class Emulation:
         device = Device(self.profile, icd, self.clock, self.imager, store, truth, background)
         self._device = device
         if self.options.truth_log is not None:
-            truth_log = TruthLog(self.options.truth_log)
+            truth_log = TruthLog(self.options.truth_log, overwrite=self.options.overwrite)
             device.on_frame.append(truth_log.write)
             self._closers.append(truth_log.close)
         device.on_frame.append(_log_frame)
@@ -162,7 +169,7 @@ class Emulation:
         try:
             await self._open_links(device)
             if self.options.control != "off":
-                self.control = ControlServer(self, self.ended.set)
+                self.control = ControlServer(self, self.ended.set, self.options.control_token)
                 self.ready_words["control"] = await self.control.start(self.options.control)
         except (EmulatorError, ProtocolError):
             device.start_refused()
@@ -210,7 +217,9 @@ class Emulation:
         EmulatorError
             A file is bad or a port cannot be had; the source before it stays.
         """
-        truth = config.build(self.clock.now_ns() / 1e9, self.profile.folder)
+        truth = await asyncio.to_thread(config.build, self.clock.now_ns() / 1e9, self.profile.folder)
+        if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
+            truth.start_s = self.clock.now_ns() / 1e9  # reading has taken time
         feed: LiveFeed | None = None
         if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)

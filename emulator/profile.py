@@ -16,6 +16,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 from emulator.errors import EmulatorError
 from emulator.truth.config import FixedConfig, Strict, TruthConfig
 from emulator.wording import explain
+from protocol.user_file import read_user_text
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_DEPTH: Final = 8
@@ -247,7 +248,7 @@ def _culprit(path: Path, overrides: Sequence[str], why: str) -> str:
 
 def _read(path: Path, depth: int) -> dict[str, Any]:
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_user_text(path))
     except OSError as error:
         raise EmulatorError(f"profile {path}: cannot be read ({error.strerror}); give a TOML file") from None
     except UnicodeDecodeError as error:

@@ -13,13 +13,15 @@ TOML, one `[[at]]` table an event, in any order::
     clear_faults = true
 
 `fault` and `truth` take what the control channel's `fault` and `set_truth` take. Events happen in run time, so that
-they come at the same frames whatever the clock. A live feed cannot be set by a scenario: it needs a socket, which takes time.
+they come at the same frames whatever the clock. Truth files are read when the run starts. A live feed cannot be set by a
+scenario: it needs a socket, which takes time.
 """
 
 from __future__ import annotations
 
 import logging
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self
 
@@ -30,7 +32,9 @@ from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
 from emulator.profile import configs_folder
 from emulator.truth.config import LiveConfig, Strict, TruthConfig
+from emulator.truth.source import TruthSource
 from emulator.wording import explain
+from protocol.user_file import read_user_text
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation
@@ -62,10 +66,19 @@ class Scenario(Strict):
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
 
     def enter(self, emulation: Emulation) -> None:
-        """Enter all events into the run."""
+        """Enter all events into the run.
+
+        Raises
+        ------
+        EmulatorError
+            A truth file cannot be read.
+        """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             due_ns = round(event.run_time_s * NANOSECONDS)
-            emulation.device.scheduler.at(due_ns, lambda _due, event=event: _happen(emulation, event))  # type: ignore[misc]
+            truth = None
+            if event.truth is not None:
+                truth = event.truth.build(event.run_time_s, emulation.profile.folder)
+            emulation.device.scheduler.at(due_ns, partial(_happen, emulation, event, truth))
 
 
 def load_scenario(name_or_path: str) -> Scenario:
@@ -80,7 +93,7 @@ def load_scenario(name_or_path: str) -> Scenario:
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
         path = configs_folder() / "scenarios" / f"{name_or_path}.toml"
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_user_text(path))
     except FileNotFoundError:
         known = ", ".join(sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
         raise EmulatorError(
@@ -98,16 +111,15 @@ def load_scenario(name_or_path: str) -> Scenario:
         raise EmulatorError(f"scenario {path}: {explain(error, Scenario)}") from None
 
 
-def _happen(emulation: Emulation, event: ScenarioEvent) -> None:
+def _happen(emulation: Emulation, event: ScenarioEvent, truth: TruthSource | None, _due_ns: int) -> None:
     """Do an event; what this run cannot do is told in the log, and the run goes on."""
     try:
         if event.clear_faults:
             emulation.faults.clear()
         if event.fault is not None:
             emulation.faults.inject(event.fault)
-        if event.truth is not None:
-            now_s = emulation.clock.now_ns() / NANOSECONDS
-            emulation.device.cycle.truth = event.truth.build(now_s, emulation.profile.folder)
+        if truth is not None:
+            emulation.device.cycle.truth = truth
     except EmulatorError as error:
         log.warning("scenario at %g s: %s", event.run_time_s, error)
     else:

@@ -49,7 +49,7 @@ def emulator_command(
     if state_dir is not None:
         command += ["--state-dir", str(state_dir)]
     if truth_log is not None:
-        command += ["--truth-log", str(truth_log)]
+        command += ["--truth-log", str(truth_log), "--overwrite"]
     return [*command, *extra]
 
 

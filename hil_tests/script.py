@@ -74,6 +74,7 @@ from hil_tests.script_reader import TableReader
 from protocol.codec import Field, Row
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
+from protocol.user_file import read_user_text
 from protocol.values import Parameter, Value
 
 LISTED: Final = "; `starhil icd list` lists all"
@@ -92,7 +93,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         file, step, name and near matches.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(read_user_text(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ScriptError(f"{path}: cannot be read: {reason}") from None
@@ -133,7 +134,7 @@ class _Checker:
 
     def _truth(self, reader: TableReader) -> Truth:
         attitude = read_stated_attitude(reader)
-        file = reader.text("file") if reader.has("file") else None
+        file = self._file_name(reader, "file") if reader.has("file") else None
         reader.finish()
         if attitude is not None and file is not None:
             reader.fail("give an attitude or a file, not both")
@@ -405,8 +406,8 @@ class _Checker:
     def _file_name(self, reader: TableReader, key: str, default: str | None = None) -> str:
         """Read the name of a file to write, which stays inside the log folder."""
         name = reader.text(key, default)
-        if not name or Path(name).name != name:
-            reader.fail(f"'{key}' must be a plain file name; it is written to the log folder")
+        if name in {"", ".."} or Path(name).name != name or "\0" in name:
+            reader.fail(f"'{key}' must be a plain file name; it stands in the log folder")
         return name
 
 

@@ -148,7 +148,6 @@ def _emulator(
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
-        truth_log.unlink(missing_ok=True)
     return EmulatorProcess(
         emulator_command(
             profile=request.profile or wish.profile,

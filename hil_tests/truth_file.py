@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import bisect
 import csv
+import io
 from pathlib import Path
 from typing import Final
 
 from hil_tests.attitude import Quaternion, interpolate, unit
 from hil_tests.errors import BenchError
+from protocol.user_file import read_user_text
 
 TIME_COLUMN: Final = "time_of_exposure_s"
 QUATERNION_COLUMNS: Final = ("true_qx", "true_qy", "true_qz", "true_qw")
+MAX_BYTES: Final = 256_000_000
+"""Largest file of true attitudes that is read, bytes."""
 SLACK_S: Final = 0.0005
 """A time that lies this little outside the file still counts: telemetry rounds."""
 
@@ -58,10 +62,12 @@ class TruthFile:
 
     def _read(self) -> None:
         try:
-            with self._path.open(newline="", encoding="utf-8") as stream:
-                rows = list(csv.DictReader(stream))
+            text = read_user_text(self._path, MAX_BYTES)
         except OSError as error:
             raise BenchError(f"{self._path}: the truth cannot be read: {error.strerror}") from None
+        except UnicodeDecodeError as error:
+            raise BenchError(f"{self._path}: the truth cannot be read: not UTF-8, {error.reason}") from None
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
         if not rows:
             return
         missing = [name for name in (TIME_COLUMN, *QUATERNION_COLUMNS) if name not in rows[0]]

@@ -25,7 +25,8 @@ from protocol.icd_schema import (
     SectionModel,
 )
 from protocol.messages import FIRST_TELEMETRY_ID
-from protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
+from protocol.values import EnumDefinition, FieldError, INTEGER_RANGES, IcdError, Parameter, Section
+from protocol.user_file import read_user_text
 
 __all__ = ["IcdError", "InterfaceDefinition", "Names", "UnknownNameError", "default_icd_path", "load_icd"]
 
@@ -151,8 +152,7 @@ def _load(path: Path) -> InterfaceDefinition:
 
 def _read(file: Path) -> FileModel:
     try:
-        with file.open("rb") as stream:
-            document = tomllib.load(stream)
+        document = tomllib.loads(read_user_text(file))
     except OSError as error:
         raise IcdError(f"{file}: cannot read the interface definition: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

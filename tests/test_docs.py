@@ -242,8 +242,8 @@ def here(text: str, ready: dict[str, str]) -> str:
     keywords = ", ".join(f"{key}={value!r}" for key, value in python_can(ready.get("can", "")).items())
     addresses = {
         'interface="socketcan", channel="vcan0"': keywords,
+        "/tmp/startracker-control": ready["control"].removeprefix("unix:"),
         "/tmp/startracker": ready["serial"],
-        "7700": ready["control"].rpartition(":")[2],
         "5500": ready.get("truth", "").rpartition(":")[2],
     }
     for shown, actual in addresses.items():

@@ -35,10 +35,23 @@ def command(
         Path | None, typer.Option(help="Folder of what survives a restart; without it nothing does.")
     ] = None,
     symlink: Annotated[Path | None, typer.Option(help="Link to the pty, removed at the end.")] = None,
-    control: Annotated[str, typer.Option(help="Control channel: off, auto, or HOST:PORT.")] = "off",
+    control: Annotated[
+        str,
+        typer.Option(
+            help="Control channel: off, auto (a Unix socket for this user alone), unix:/PATH, "
+            "or HOST:PORT (open to every local user)."
+        ),
+    ] = "off",
+    control_token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="STARHIL_CONTROL_TOKEN", help="What each request on the control channel has to carry."
+        ),
+    ] = None,
     truth_log: Annotated[
         Path | None, typer.Option(help="CSV file of truth and measurement, a row a frame.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a truth log that exists.")] = False,
     scenario: Annotated[
         str,
         typer.Option(help="Scenario file, or a name of configs/scenarios: faults and truths by run time."),
@@ -95,10 +108,14 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
         )
 
+    if control_token is not None and not control_token:
+        raise EmulatorError("--control-token: is empty; give a text, or leave it out")
+    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario)
+
     async def run() -> None:
         import signal
 
-        emulation = Emulation(loaded, RunOptions(truth_log, control, scenario), worker=worker)
+        emulation = Emulation(loaded, options, worker=worker)
         loop = asyncio.get_running_loop()
         ends = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored

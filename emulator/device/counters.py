@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -54,6 +55,8 @@ class Acknowledge:
     processed: bool = True
     error: ErrorCode = ErrorCode.OK
     parameter_index: int = 0
+    on_end: Callable[[ErrorCode], None] | None = None
+    """Sends the answer, of a telecommand that is answered only when it is done."""
 
     def begin(self, identifier: int) -> None:
         """Note that a telecommand came in."""
@@ -67,3 +70,5 @@ class Acknowledge:
         self.processed = True
         self.error = error
         self.parameter_index = parameter_index
+        if self.on_end is not None:
+            self.on_end(error)

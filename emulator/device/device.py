@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
 from emulator.clock import NANOSECONDS, Clock, DeviceTime
@@ -16,7 +16,7 @@ from emulator.device.parameters import Parameters, ParameterValue
 from emulator.device.refusal import Refused
 from emulator.device.scheduler import Event, Scheduler
 from emulator.device.state_store import StateStore
-from emulator.device.telecommands import TELECOMMANDS
+from emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
 from emulator.device.telemetry import TELEMETRY
 from emulator.errors import EmulatorError
 from emulator.imaging.frames import FrameRequest
@@ -141,8 +141,6 @@ class Device:
         self._boot_over: Event | None = None
         self._unsolicited: Event | None = None
         self._stored_parameters: dict[str, object] = {}
-        self._saving = 0
-        """Saves under way: until they are done, the store is behind what the device knows."""
         self.parameters.observe(self._parameters_changed)
         missing = missing_handlers(icd)
         if missing:
@@ -154,7 +152,7 @@ class Device:
 
     def power_on(self) -> None:
         """Start: load what is stored, count the start, boot."""
-        self._start("power_on")
+        self._start("power_on", self.store.load())
 
     def start_refused(self) -> None:
         """Take back the count of a start that came to nothing, as a port or a file could not be had."""
@@ -163,12 +161,11 @@ class Device:
 
     def reset(self, cause: str) -> None:
         """Restart, for a cause by its name in the interface definition."""
-        self._start(cause)
+        self._start(cause, self._content())
         for observer in self.on_reset:
             observer()
 
-    def _start(self, cause: str) -> None:
-        state = self._content() if self._saving else self.store.load()
+    def _start(self, cause: str, state: Mapping[str, object]) -> None:
         count, stored = state.get("boot_count"), state.get("parameters")
         self.boot_count = ((count if isinstance(count, int) else 0) + 1) & 0xFFFF
         self.reset_cause = cause
@@ -238,8 +235,10 @@ class Device:
         def finish(error: EmulatorError | None) -> None:
             if error is None:
                 self.parameters.mark_stored(content)
-            elif self._stored_parameters is stored:  # neither another save nor a restart has followed
-                self._stored_parameters = before
+            else:
+                log.error("%s", error)
+                if self._stored_parameters is stored:  # neither another save nor a restart has followed
+                    self._stored_parameters = before
             done(error)
 
         self._persist(finish)
@@ -250,16 +249,10 @@ class Device:
 
     def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
         content = self._content()
-        self._saving += 1
-
-        def saved(error: EmulatorError | None) -> None:
-            self._saving -= 1
-            done(error)
-
-        self._background(lambda: self.store.save(content), saved)
+        self._background(lambda: self.store.save(content), done)
 
     def _content(self) -> dict[str, object]:
-        """What the store holds when all that is being saved has been: a restart may come before that."""
+        """What the store holds when all that is being saved has been: what a restart begins with."""
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---
@@ -342,8 +335,16 @@ class Device:
 
     # --- requests ---
 
-    def handle(self, request: Request) -> list[Reply]:
-        """Take a request from a link; return what goes back over the same link, in order."""
+    def handle(self, request: Request, later: Callable[[Reply], None] | None = None) -> list[Reply] | None:
+        """Take a request from a link; return what goes back over the same link, in order.
+
+        Parameters
+        ----------
+        request
+            What arrived.
+        later
+            Takes the answer to a telecommand that is answered only when it is done; None is returned then.
+        """
         if self.deaf:
             return []
         if request.kind is RequestKind.TELEMETRY:
@@ -351,8 +352,11 @@ class Device:
             return [self._answer_telemetry(request)]
         self.counters.telecommands = (self.counters.telecommands + 1) & 0xFFFF
         code, replies = self._execute(request)
-        kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-        return [Reply(kind, request.id, code=code, destination=request.source), *replies]
+        if code is None:
+            if later is not None:
+                self.acknowledge.on_end = lambda code: later(_answer(request, code))
+            return None
+        return [_answer(request, code), *replies]
 
     def fault(self, fault: LinkFault) -> None:
         """Count input on a link that made no request."""
@@ -369,9 +373,9 @@ class Device:
         return TELEMETRY[name](self)
 
     def telecommand(self, name: str, values: dict[str, Value]) -> tuple[ErrorCode, int]:
-        """Do a telecommand whose values are checked; return its error code and the field it is about."""
+        """Do a telecommand whose values are checked; return its error code so far and the field it is about."""
         code, index, _ = self._do(name, values, 0)
-        return code, index
+        return code or ErrorCode.OK, index
 
     def _answer_telemetry(self, request: Request) -> Reply:
         row = self.icd.telemetry_by_id.get(request.id)
@@ -388,7 +392,7 @@ class Device:
             return Reply(ReplyKind.NACK, request.id, code=refused.code, destination=request.source)
         return Reply(ReplyKind.TELEMETRY, request.id, data, destination=request.source)
 
-    def _execute(self, request: Request) -> tuple[ErrorCode, list[Reply]]:
+    def _execute(self, request: Request) -> tuple[ErrorCode | None, list[Reply]]:
         row = self.icd.telecommands_by_id.get(request.id)
         if row is None:
             self._note(request.id, ErrorCode.INVALID_ID, 0)
@@ -401,8 +405,10 @@ class Device:
         code, _, replies = self._do(row.name, values, request.source)
         return code, replies
 
-    def _do(self, name: str, values: dict[str, Value], source: int) -> tuple[ErrorCode, int, list[Reply]]:
-        """Do a decoded telecommand, and note in the acknowledge what became of it."""
+    def _do(
+        self, name: str, values: dict[str, Value], source: int
+    ) -> tuple[ErrorCode | None, int, list[Reply]]:
+        """Do a decoded telecommand, and note in the acknowledge what became of it; no code where that is still open."""
         if not self.acknowledge.processed:
             self.counters.overrun()
         acknowledge = Acknowledge(self.icd.telecommands[name].id, processed=False)
@@ -415,8 +421,10 @@ class Device:
         except MessageError as error:
             acknowledge.end(error.code, error.index)
             return error.code, error.index, []
-        if replies is None:  # done later; the handler ends the acknowledge
-            return ErrorCode.OK, 0, []
+        if replies is None:  # the handler ends the acknowledge
+            if name not in ANSWERED_WHEN_DONE:
+                return ErrorCode.OK, 0, []
+            return acknowledge.error if acknowledge.processed else None, 0, []
         acknowledge.end()
         return (
             ErrorCode.OK,
@@ -428,6 +436,11 @@ class Device:
         if not self.acknowledge.processed:
             self.counters.overrun()
         self.acknowledge = Acknowledge(identifier, processed=True, error=code, parameter_index=index)
+
+
+def _answer(request: Request, code: ErrorCode) -> Reply:
+    kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
+    return Reply(kind, request.id, code=code, destination=request.source)
 
 
 def missing_handlers(icd: InterfaceDefinition) -> list[str]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from emulator.errors import EmulatorError
+from protocol.user_file import UnsuitableFileError, read_user_file
 
 FORMAT: Final = 1
 STATE_FILE: Final = "device.json"
@@ -89,13 +90,16 @@ class FileStore:
     def load(self) -> dict[str, Any]:
         """What was saved last; a corrupt file is set aside as `device.json.corrupt`."""
         try:
-            with self.path.open("rb") as file:
-                data = file.read(MAX_BYTES + 1)
+            content = _decode(read_user_file(self.path, MAX_BYTES))
         except FileNotFoundError:
             return {}
+        except UnsuitableFileError:
+            content = None
         except OSError as error:
-            raise EmulatorError(f"state file {self.path}: cannot be read ({error.strerror})") from None
-        content = _decode(data)
+            raise EmulatorError(
+                f"state file {self.path}: cannot be read ({error.strerror}); "
+                "make it readable, or choose another folder with --state-dir"
+            ) from None
         if content is None:
             self.corrupt = True
             os.replace(self.path, self.path.with_name(STATE_FILE + ".corrupt"))  # noqa: PTH105 (pairs with save)

@@ -1,7 +1,8 @@
 """Telecommands: for each row of the interface definition, by its name, what it does.
 
 A handler gets the decoded, range-checked values. It returns messages that follow the acknowledge (mostly none), or None if it
-goes on after the answer and ends the acknowledge itself, and raises `Refused` to answer with an error code.
+goes on and ends the acknowledge itself, and raises `Refused` to answer with an error code. What goes on is answered at once,
+except for the rows in `ANSWERED_WHEN_DONE`.
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ def select_parameter(device: Device, values: Values, _acknowledge: Acknowledge) 
 
 
 def save_parameters(device: Device, _values: Values, acknowledge: Acknowledge) -> None:
-    """100: store all parameters; done when they are on the disk."""
+    """100: store all parameters; answered when they are on the disk, or when they could not be stored."""
 
     def done(error: EmulatorError | None) -> None:
         acknowledge.end(ErrorCode.OK if error is None else ErrorCode.INTERNAL)
@@ -222,3 +223,6 @@ TELECOMMANDS: Final[dict[str, Handler]] = {
     **{f"set_hole_map_{part}": _set_hole_map(part) for part in range(1, 9)},
 }
 """Row name → what it does."""
+
+ANSWERED_WHEN_DONE: Final = frozenset({"save_parameters"})
+"""Rows whose answer says what became of them, not only that they were accepted."""

@@ -108,8 +108,12 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._device.fault(event)
             return
         style = self._style()  # the answer to a change of style still goes out in the old one
-        for reply in self._device.handle(event):
+
+        def answer(reply: Reply) -> None:
             self._send(reply, style)
+
+        for reply in self._device.handle(event, answer) or ():
+            answer(reply)
 
     def _watch(self) -> None:
         """Look again at a message that was begun."""

@@ -30,7 +30,7 @@ from protocol.canopen.emergency import ErrorCode, ErrorRegister
 from protocol.canopen.slave import CanopenSlave
 from protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from protocol.codec import Row
-from protocol.messages import Request, RequestKind
+from protocol.messages import Reply, Request, RequestKind
 from protocol.transports.base import Transport
 from protocol.values import MessageError, Value
 
@@ -119,10 +119,24 @@ class DeviceApplication:
             check_status(refused.code, row.name)
             raise
 
-    def telecommand(self, row: Row, payload: bytes) -> None:
+    def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
         """Execute a telecommand; it counts and is acknowledged as on the other links."""
-        for reply in self._device.handle(Request(RequestKind.TELECOMMAND, row.id, payload))[:1]:
+        deferred = Deferred()
+
+        def done(reply: Reply) -> None:
+            refusal: SdoAbortError | None = None
+            try:
+                check_status(reply.code, row.name)
+            except SdoAbortError as abort:
+                refusal = abort
+            self._finish(deferred, refusal)
+
+        replies = self._device.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
+        if replies is None:
+            return deferred
+        for reply in replies[:1]:
             check_status(reply.code, row.name)
+        return None
 
     def parameter(self, name: str) -> Value:
         """Return a parameter's value in its unit."""

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from emulator.errors import EmulatorError
 from emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
+from protocol.user_file import read_user_text
 from starid.attitude import Attitude, interpolate, rate_between
 
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
@@ -36,6 +37,9 @@ LOG_COLUMNS: Final = {
     **{f"true_{name}": name for name in (*QUATERNION_COLUMNS, *RATE_COLUMNS)},
 }
 """Columns of a truth log → what they are here."""
+
+MAX_BYTES: Final = 256_000_000
+"""Largest truth file that is read, bytes: a day of a truth log at 5 frames a second."""
 
 NORM_TOLERANCE: Final = 0.01
 """A quaternion whose length is off by more than this is taken for a mistake, not for rounding."""
@@ -109,13 +113,15 @@ class FileTruth:
 def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -> FileTruth:
     """Read a truth file; the first bad row is named by its line.
 
+    No message quotes the file: whoever may name one on the control channel need not be allowed to read it.
+
     Raises
     ------
     EmulatorError
         The file is missing, has not the columns of this module's head, or a row is not numbers, not a rotation, or not later than the row before.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_user_text(path, MAX_BYTES)
     except (OSError, ValueError) as error:  # a path that no file can have is a ValueError
         reason = str(error)
         if isinstance(error, OSError):
@@ -142,7 +148,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
         where = f"truth file {path} line {number}"
         row = _row(where, columns, line)
         if times and row["t"] <= times[-1]:
-            raise EmulatorError(f"{where}: t = {row['t']:g} is not later than the row before ({times[-1]:g})")
+            raise EmulatorError(f"{where}: t is not later than in the row before")
         times.append(row["t"])
         attitudes.append(_attitude(where, needed, row))
         if has_rates:
@@ -164,7 +170,8 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS}
     unknown = [name for name in columns if name not in known | {""}]
     if unknown:
-        raise EmulatorError(f"{where}: unknown column {unknown[0]!r}; known: {', '.join(sorted(known))}")
+        number = columns.index(unknown[0]) + 1
+        raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(known))}")
     twice = [name for name in columns if name and columns.count(name) > 1]
     if twice:
         raise EmulatorError(f"{where}: column {twice[0]} stands there twice; leave one out")
@@ -190,9 +197,9 @@ def _row(where: str, columns: list[str], line: str) -> dict[str, float]:
         try:
             row[name] = float(cell)
         except ValueError:
-            raise EmulatorError(f"{where}: {name} = {cell.strip()!r} is not a number") from None
+            raise EmulatorError(f"{where}: {name} is not a number") from None
         if not math.isfinite(row[name]):
-            raise EmulatorError(f"{where}: {name} = {cell.strip()} is not finite")
+            raise EmulatorError(f"{where}: {name} is not finite")
     return row
 
 
@@ -200,9 +207,9 @@ def _attitude(where: str, needed: tuple[str, ...], row: dict[str, float]) -> Att
     values = [row[name] for name in needed]
     if needed is ANGLE_COLUMNS:
         if abs(row["dec_deg"]) > 90.0:
-            raise EmulatorError(f"{where}: dec_deg = {row['dec_deg']:g} is outside ±90")
+            raise EmulatorError(f"{where}: dec_deg is outside ±90")
         return Attitude.from_radec_roll(*values)
     norm = math.sqrt(sum(v * v for v in values))
     if abs(norm - 1.0) > NORM_TOLERANCE:
-        raise EmulatorError(f"{where}: quaternion of length {norm:.3f}; a rotation has length 1")
+        raise EmulatorError(f"{where}: the quaternion is not of length 1")
     return Attitude(np.array(values))

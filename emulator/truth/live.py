@@ -9,20 +9,24 @@ One message a line (TCP) or one or more lines a datagram (UDP)::
 ``q``
     Quaternion ICRS→sensor, scalar last (x, y, z, w), of length 1 within 1 %.
 ``rate``
-    Body rate in the sensor frame, degrees a second, at most `MAX_RATE_DEG_S` an axis. May be left out: then it is taken from the last two messages.
+    Body rate in the sensor frame, degrees a second, at most `MAX_RATE_DEG_S` an axis. May be left out: then it is taken from the
+    last two messages, without ``t`` from messages at least `RECEIPT_BASELINE_S` apart. One that contradicts the attitudes makes
+    a bad message (`emulator.truth.feed_rates`).
 
-The sender's time line is tied to run time by its first message: what came first is taken to hold at its receipt. With
-``timeline = "run"`` in the profile, ``t`` is run time as it stands. Between two messages the attitude is interpolated, after
-the last one it is carried on at the last rate; when the feed has been silent for ``stale_s`` the attitude stands still and is
-flagged ``stale``. A bad message is counted, the last one's fault is kept, and nothing else happens. A ``t`` that does not
-rise is a bad message, except that a jump back by more than `RESTART_S` begins a new time line.
+The sender's clock is tied to run time by its first message, what came first is taken to hold at its receipt, and followed where
+it slips (`emulator.truth.sender_clock`); rates are those of run time. With ``timeline = "run"`` in the profile, ``t`` is run time
+as it stands. Between two messages the attitude is interpolated, after the last one it is carried on at the last rate, for at
+most ``stale_s``; when the feed has been silent for that long the attitude stands still and is flagged ``stale``. On
+``timeline = "run"`` it is so too when the last ``t`` is older than that. A bad message is counted, logged (the 1st, 10th, 100th …),
+the last one's fault is kept, and nothing else happens. A ``t`` that does not rise is a bad message, except that a jump back by
+more than `RESTART_S` begins a new time line.
 """
 
 from __future__ import annotations
 
 import asyncio
 import bisect
-import json
+import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,9 +35,14 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from emulator.errors import EmulatorError
+from emulator.json_lines import RepeatedKeyError, parse_json, read_lines
+from emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
+from emulator.truth.sender_clock import SenderClock
 from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
 from protocol.errors import reason
-from starid.attitude import Attitude, interpolate, propagate, rate_between
+from starid.attitude import Attitude, interpolate, propagate
+
+log = logging.getLogger("starhil.truth")
 
 HISTORY: Final = 512
 """Messages kept for exposures whose middle has passed already."""
@@ -41,16 +50,9 @@ HISTORY: Final = 512
 RESTART_S: Final = 1.0
 """A sender's time that falls back by more than this begins a new time line, seconds."""
 
-SHORTEST_S: Final = 1e-9
-"""Least time between two messages, seconds: what run time tells apart."""
-
 NORM_TOLERANCE: Final = 0.01
 MAX_LINE: Final = 4096
 """A line longer than this is refused, bytes."""
-
-
-class FeedError(EmulatorError):
-    """A live message that is refused; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,9 @@ def parse_message(line: bytes | str) -> FeedMessage:
         The line is not the documented message; the text names the key.
     """
     try:
-        message: Any = json.loads(line)
+        message: Any = parse_json(line)
+    except RepeatedKeyError as error:
+        raise FeedError(str(error)) from None
     except (ValueError, RecursionError):
         raise FeedError("not a JSON line") from None
     if not isinstance(message, dict):
@@ -126,7 +130,12 @@ class LiveTruth:
         self.refused = 0
         self.last_fault = ""
         self._start = attitude
-        self._offset_s: float | None = 0.0 if timeline == "run" else None
+        self._clock = SenderClock()
+        self._rates = FeedRates(timed=True)
+        self._last_t: float | None = None
+        """The sender's time in the last message that had one."""
+        self._received_s = 0.0
+        """Run time at which the last message was accepted."""
         self._times: deque[float] = deque(maxlen=HISTORY)
         self._states: deque[tuple[Attitude, Vector]] = deque(maxlen=HISTORY)
 
@@ -144,30 +153,49 @@ class LiveTruth:
         """Count a bad message."""
         self.refused += 1
         self.last_fault = fault
+        if str(self.refused).rstrip("0") == "1":
+            log.warning("truth feed: message refused (%d so far): %s", self.refused, fault)
 
     def _push(self, message: FeedMessage, received_s: float) -> None:
-        if message.t is None:
-            t = received_s
-        else:
-            if self._offset_s is None:
-                self._offset_s = received_s - message.t
-            t = message.t + self._offset_s
-        if self._times and t < self._times[-1] + SHORTEST_S:
-            if self._times[-1] - t <= RESTART_S:
-                raise FeedError(f"t = {message.t} is not later than the message before")
-            self._times.clear()
-            self._states.clear()
-            if message.t is not None and self.timeline == "anchor":
-                self._offset_s = received_s - message.t
-                t = received_s
-        if message.rate_rad_s is not None:
-            rate = message.rate_rad_s
-        elif self._times:
-            rate = rate_between(self._states[-1][0], message.attitude, t - self._times[-1])
-        else:
-            rate = ZERO_RATE
+        timed = message.t is not None
+        if message.t is not None:
+            self._check_time(message.t)
+            self._last_t = message.t
+        if self._rates.timed != timed:
+            self._rates = FeedRates(timed=timed)
+        at_s = received_s if message.t is None else message.t
+        rate = self._rates.take(at_s, message.attitude, message.rate_rad_s)
+        t = at_s
+        if timed and self.timeline == "anchor":
+            t = self._clock.run_time(at_s, received_s, self.stale_s)
+            rate = rate * (1.0 - self._clock.slope)
+        self._keep_rising(t, timed=timed)
+        self._received_s = received_s
         self._times.append(t)
         self._states.append((message.attitude, rate))
+
+    def _check_time(self, t: float) -> None:
+        """Reject a time of the sender that does not rise; one that falls far begins a new time line."""
+        if self._last_t is None or t >= self._last_t + SHORTEST_S:
+            return
+        if self._last_t - t <= RESTART_S:
+            raise FeedError(f"t = {t} is not later than the message before")
+        self._times.clear()
+        self._states.clear()
+        self._clock, self._rates = SenderClock(), FeedRates(timed=True)
+
+    def _keep_rising(self, t: float, *, timed: bool) -> None:
+        """Forget what a message takes the place of: one received at the same time, or a time line that has been left."""
+        if not self._times or t >= self._times[-1] + SHORTEST_S:
+            return
+        if not timed and t >= self._times[-1]:
+            self._times.pop()
+            self._states.pop()
+        elif self._times[-1] - t > RESTART_S:
+            self._times.clear()
+            self._states.clear()
+        else:
+            raise FeedError(f"its time is {self._times[-1] - t:.3g} s before that of the message before")
 
     def state(self, t_s: float) -> TruthState:
         """Truth at a run time in seconds."""
@@ -175,11 +203,12 @@ class LiveTruth:
             return TruthState(self._start, ZERO_RATE, TruthStatus.WAITING)
         age = t_s - self._times[-1]
         attitude, rate = self._states[-1]
-        if age > self.stale_s:
+        silence = age if self.timeline == "run" else min(age, t_s - self._received_s)
+        if silence > self.stale_s:
             return TruthState(propagate(attitude, rate, self.stale_s), ZERO_RATE, TruthStatus.STALE)
         if age >= 0.0:
             status = TruthStatus.EXTRAPOLATED if age > 0.0 else TruthStatus.OK
-            return TruthState(propagate(attitude, rate, age), rate, status)
+            return TruthState(propagate(attitude, rate, min(age, self.stale_s)), rate, status)
         if t_s <= self._times[0]:
             attitude, rate = self._states[0]
             return TruthState(attitude, rate, TruthStatus.BEFORE_START)
@@ -248,15 +277,10 @@ class LiveFeed:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         try:
-            while True:
-                try:
-                    line = await reader.readline()
-                except ValueError:
+            async for line in read_lines(reader):
+                if line is None:
                     self.truth.refuse(f"line longer than {MAX_LINE} bytes")
-                    break
-                if not line:
-                    break
-                if line.strip():
+                elif line.strip():
                     self.receive(line)
         except ConnectionError:
             self.truth.refuse("connection broken")

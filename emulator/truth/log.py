@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import errno
+import fcntl
 import io
 import logging
 import os
@@ -80,22 +82,31 @@ def compare(measurement: Measurement) -> dict[str, Any]:
 class TruthLog:
     """A CSV file that gets a row a frame, each in the file before the next, and never half a row.
 
-    When no more can be written, a full disk say, the log is told so once, the file ends with the last whole row and the
+    One emulator at a time writes to a file. When no more can be written, a full disk say, the log is told so once, the file ends with the last whole row and the
     run goes on.
+
+    Parameters
+    ----------
+    path
+        The file; made if it is not there.
+    overwrite
+        Replace what a file of that name holds.
 
     Raises
     ------
     EmulatorError
-        The file cannot be made.
+        The file cannot be made, holds something, or another emulator writes to it; it is as it was.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._path = path
         self._whole = 0
+        self._file: io.FileIO | None = None
         try:
-            self._file: io.FileIO | None = path.open("wb", buffering=0)
+            self._file = _open(path, overwrite=overwrite)
             self._add(COLUMNS)
         except OSError as error:
+            self.close()
             raise EmulatorError(
                 f"truth log {path}: cannot be written ({error.strerror}); choose another file"
             ) from None
@@ -125,7 +136,10 @@ class TruthLog:
         size = len(row)
         try:
             while row:
-                row = row[self._file.write(row) :]
+                written: int | None = self._file.write(row)
+                if written is None:  # a device that would make the writer wait
+                    raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+                row = row[written:]
         except OSError:
             if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
                 self._file.truncate(self._whole)
@@ -137,6 +151,38 @@ class TruthLog:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+
+def _open(path: Path, *, overwrite: bool) -> io.FileIO:
+    """Open a file for one writer, empty; a pipe, whose reader could hold up the writer, is rejected."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+    file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
+    try:
+        _claim(path, file, overwrite=overwrite)
+    except (EmulatorError, OSError):
+        file.close()
+        raise
+    return file
+
+
+def _claim(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
+    """Lock a file for this process and empty it; a character device such as /dev/null is everybody's."""
+    mode = os.fstat(file.fileno()).st_mode
+    if stat.S_ISCHR(mode):
+        return
+    if not stat.S_ISREG(mode):
+        raise EmulatorError(f"truth log {path}: not a regular file; choose another file")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise EmulatorError(
+            f"truth log {path}: in use by another emulator; end that one, or choose another file"
+        ) from None
+    if os.fstat(file.fileno()).st_size and not overwrite:
+        raise EmulatorError(
+            f"truth log {path}: exists and is not empty; choose another file, or replace it with --overwrite"
+        )
+    file.truncate()
 
 
 def _cell(name: str, value: Any) -> str:

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from protocol.icd import default_icd_path
+from protocol.user_file import read_user_text
 from protocol.values import IcdError
 
 Index = Annotated[int, Field(ge=0x2000, le=0xFFFF)]
@@ -121,7 +122,7 @@ def _load_default() -> CanopenModel:
 
 def _load(path: Path) -> CanopenModel:
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(read_user_text(path))
         return _FileModel.model_validate(document).canopen
     except OSError as error:
         raise IcdError(f"{path}: cannot read the CANopen layout: {error.strerror}") from None

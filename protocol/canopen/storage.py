@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from protocol.errors import ProtocolError
+from protocol.user_file import read_user_file
 
 COMMUNICATION: Final = "communication"
 APPLICATION: Final = "application"
@@ -98,7 +99,7 @@ class FileStorage:
 
     def _read(self) -> dict[str, dict[str, str]]:
         try:
-            document = json.loads(self._path.read_text(encoding="ascii"))
+            document = json.loads(read_user_file(self._path))
             groups: dict[str, dict[str, str]] = document["groups"]
             if not isinstance(groups, dict) or document["crc32"] != _checksum(groups):
                 raise StorageError(f"{self._path}: wrong checksum; store the parameters again")

@@ -76,7 +76,7 @@ def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]
 
     def damage(unit: SimulatedUnit) -> None:
         device, handle = unit.device, unit.device.handle
-        device.handle = lambda request: change(device, request, handle)
+        device.handle = lambda request, later=None: change(device, request, lambda r: handle(r, later))
 
     return damage
 

@@ -92,6 +92,8 @@ class Bench:
         self.picture = FakePicture()
         self.icd = load_icd()
         self.store = store or MemoryStore()
+        self.later: list[Reply] = []
+        """Answers that came when a telecommand was done."""
         self.imager = DirectImager(self.picture.handle)
         self.device = Device(
             profile or Profile(),
@@ -120,7 +122,8 @@ class Bench:
     def send(self, name: str, data: bytes | None = None, **values: object) -> list[Reply]:
         """Send a telecommand; return all replies."""
         row = self.icd.telecommands[name]
-        return self.device.handle(Request.of(row.id, row.encode(values) if data is None else data))
+        request = Request.of(row.id, row.encode(values) if data is None else data)
+        return self.device.handle(request, self.later.append) or []
 
     def command(self, name: str, **values: object) -> ErrorCode:
         """Send a telecommand; return what it was answered with."""

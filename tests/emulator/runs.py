@@ -25,10 +25,14 @@ class Control:
     """A peer on the control channel."""
 
     def __init__(self, emulation) -> None:
-        self.address = emulation.ready_words["control"].rsplit(":", 1)
+        self.address = emulation.ready_words["control"]
 
     async def __aenter__(self):
-        self.reader, self.writer = await asyncio.open_connection(*self.address)
+        path = self.address.removeprefix("unix:")
+        if path != self.address:
+            self.reader, self.writer = await asyncio.open_unix_connection(path)
+        else:
+            self.reader, self.writer = await asyncio.open_connection(*self.address.rsplit(":", 1))
         return self
 
     async def __aexit__(self, *_exc):

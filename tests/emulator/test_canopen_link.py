@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.clock import NANOSECONDS
+from emulator.errors import EmulatorError
 from emulator.links.canopen import (
     FRAME_ROWS,
     STATUS_ROW,
@@ -255,6 +256,20 @@ def test_store_keeps_the_devices_parameters(linked, make_bench):
         assert link.device.parameters["exposure"] == 200
         link.frame(0, f"81{NODE:02x}")
         assert link.device.parameters["exposure"] == 100
+
+    linked(test)
+
+
+@pytest.mark.parametrize(("error", "answer"), [(None, "6000206400000000"), ("full", "80002064")])
+def test_save_parameters_is_answered_when_the_disk_is_done(linked, error, answer):
+    def test(link):
+        waiting = []
+        link.device._background = lambda _work, done: waiting.append(done)
+        assert link.sdo("2f 00 20 64 01") == ""
+        waiting.pop()(error and EmulatorError(error))
+        ((identifier, data),) = link.take()
+        assert identifier == 0x580 + NODE
+        assert data.startswith(answer)
 
     linked(test)
 

@@ -2,10 +2,13 @@
 
 import asyncio
 import json
+import os
+import threading
 
 import pytest
 
 import protocol.transports.can
+from emulator.truth.file import read_truth_file
 from emulator.truth.log import COLUMNS
 from tests.emulator.runs import Control
 
@@ -65,6 +68,45 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             assert bad == {"ok": False, "error": "truth.rate_deg_s: missing; give it"}
             assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
             assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
+
+    run(scenario)
+
+
+def test_a_slow_truth_file_holds_up_nothing_else(run, tmp_path, monkeypatch):
+    path = tmp_path / "truth.csv"
+    path.write_text("t,ra_deg,dec_deg,roll_deg\n0,10,20,0\n100,10,20,50\n")
+    go = threading.Event()
+
+    def slowly(*arguments, **options):
+        assert go.wait(60.0)
+        return read_truth_file(*arguments, **options)
+
+    monkeypatch.setattr("emulator.truth.config.read_truth_file", slowly)
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control, Control(emulation) as other:
+            await control.do("step", seconds=1.0)
+            swap = asyncio.create_task(
+                control.do("set_truth", truth={"kind": "file", "path": str(path), "start": "now"})
+            )
+            await asyncio.sleep(0)
+            assert (await other.do("status"))["truth_kind"] == "fixed"
+            await other.do("step", seconds=2.0)
+            go.set()
+            assert (await swap)["ok"]
+            assert (await control.do("truth", run_time_s=13.0))["roll_deg"] == pytest.approx(5.0)
+
+    run(scenario)
+
+
+def test_a_truth_file_that_is_a_pipe_is_rejected_at_once(run, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await control.do("set_truth", truth={"kind": "file", "path": str(tmp_path / "pipe")})
+            assert "not a regular file" in answer["error"]
+            assert (await control.do("status"))["truth_kind"] == "fixed"
 
     run(scenario)
 
@@ -140,7 +182,7 @@ def test_a_fault_of_ours_is_answered_and_logged_and_the_connection_stays(run, mo
                 answer = await control.do("clear_faults", id=4)
             assert answer["id"] == 4
             assert not answer["ok"]
-            assert "KeyError: 0" in answer["error"]
+            assert "internal error: KeyError; see" in answer["error"]
             (record,) = [each for each in caplog.records if each.name == "starhil.control"]
             assert record.exc_info
             assert (await control.do("status"))["ok"]

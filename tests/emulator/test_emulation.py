@@ -20,6 +20,24 @@ from protocol.errors import ProtocolError
 from tests.emulator.runs import CAMERA, Control, FakeImager
 
 
+def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
+    truth, path = tmp_path / "truth.csv", tmp_path / "day.toml"
+    path.write_text(
+        f'[[at]]\nrun_time_s = 2.0\ntruth = {{ kind = "file", path = "{truth}", start = "now" }}\n'
+    )
+
+    async def scenario(emulation, _line):
+        truth.unlink()
+        await emulation.stepper.step(7.0)
+        return emulation.device.cycle.truth.state(7.0).attitude
+
+    options = RunOptions(scenario=str(path))
+    with pytest.raises(EmulatorError, match="truth file"):
+        run(scenario, options=options)
+    truth.write_text("t,ra_deg,dec_deg,roll_deg\n0,10,20,0\n10,10,20,50\n")
+    assert run(scenario, options=options).roll_deg == pytest.approx(25.0)
+
+
 def test_the_ready_line_tells_what_was_taken(run):
     async def scenario(emulation, line):
         words = dict(word.split("=", 1) for word in line.removeprefix("ready ").split())
@@ -27,7 +45,7 @@ def test_the_ready_line_tells_what_was_taken(run):
         assert words["dialect"] == "b"
         assert words["seed"] == "1"
         assert words["clock"] == "stepped"
-        assert words["control"].startswith("127.0.0.1:")
+        assert words["control"].startswith("unix:/")
 
     run(scenario)
 

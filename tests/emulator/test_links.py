@@ -5,6 +5,7 @@ import random
 
 import pytest
 
+from emulator.errors import EmulatorError
 from emulator.links.can import CanLink
 from emulator.links.serial import SerialLink, SerialPieces
 from emulator.links.wire_faults import WireFaults, WireFaultSettings
@@ -82,6 +83,29 @@ class Linked:
 
 def in_loop(scenario):
     asyncio.run(scenario)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_save_is_answered_on_its_link_when_the_disk_is_done(bench, fails):
+    async def scenario():
+        linked = await Linked(bench).start()
+        waiting = []
+        bench.device._background = lambda _work, done: waiting.append(done)
+        row = bench.icd.telecommands["save_parameters"].id
+        error = EmulatorError("state file: cannot be written") if fails else None
+        wanted = ErrorCode.INTERNAL if fails else ErrorCode.OK
+        assert linked.over_can(row) == []
+        waiting.pop()(error)
+        host = CanHostReceiver(1, 4)
+        (reply,) = [event for frame in linked.bus.take() for event in host.feed(frame, 0.0)]
+        assert (reply.id, reply.code) == (row, wanted)
+        assert linked.uart.take() == []
+        assert linked.over_serial(row) == []
+        waiting.pop()(error)
+        assert linked.uart.take()
+        assert linked.bus.take() == []
+
+    in_loop(scenario())
 
 
 @pytest.mark.parametrize("dialect", ["a", "b", "c"])
@@ -222,10 +246,10 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
         counted = 0
         handle = bench.device.handle
 
-        def watched(request):
+        def watched(request, later):
             nonlocal counted
             counted += 1
-            replies = handle(request)
+            replies = handle(request, later)
             row = bench.icd.row_by_id(request.id)
             if row is None:
                 assert replies[0].code is ErrorCode.INVALID_ID
@@ -258,10 +282,10 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
         requests = 0
         handle = bench.device.handle
 
-        def watched(request):
+        def watched(request, later):
             nonlocal requests
             requests += 1
-            return handle(request)
+            return handle(request, later)
 
         bench.device.handle = watched
         for _ in range(JUNK):

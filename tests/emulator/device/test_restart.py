@@ -5,7 +5,7 @@ import pytest
 from emulator.device.device import do_at_once
 from emulator.device.state_store import FileStore
 from emulator.errors import EmulatorError
-from protocol.messages import ErrorCode
+from protocol.messages import ErrorCode, ReplyKind
 
 
 def test_reset_is_acknowledged_then_done(bench):
@@ -65,7 +65,7 @@ def test_a_reset_before_the_disk_has_parameters_keeps_them(make_bench, tmp_path)
     bench = make_bench(store=FileStore(tmp_path)).start()
     bench.device._background = disk = LaterBackground()
     bench.command("set_parameter", parameter=1, value=55.0)
-    bench.command("save_parameters")
+    bench.send("save_parameters")
     bench.command("reset")
     bench.step(1.0)
     assert bench.device.parameters["exposure"] == 55
@@ -95,7 +95,7 @@ def test_a_save_that_fails_after_a_reset_takes_back_nothing_that_the_next_one_wr
     bench = make_bench().start()
     bench.device._background = disk = LaterBackground()
     bench.command("set_parameter", parameter=1, value=55.0)
-    bench.command("save_parameters")
+    bench.send("save_parameters")
     bench.command("reset")
     bench.step(1.0)
     really, failed = bench.store.save, []
@@ -206,7 +206,7 @@ def test_stored_values_that_are_no_longer_allowed_are_passed_over(make_bench, tm
     store.close()
 
 
-def test_a_store_that_cannot_write_is_told_in_the_acknowledge(make_bench, tmp_path, monkeypatch):
+def test_a_store_that_cannot_write_refuses_and_is_logged(make_bench, tmp_path, monkeypatch, caplog):
     bench = make_bench(store=FileStore(tmp_path)).start()
 
     def fail(_content):
@@ -214,17 +214,40 @@ def test_a_store_that_cannot_write_is_told_in_the_acknowledge(make_bench, tmp_pa
 
     monkeypatch.setattr(bench.store, "save", fail)
     bench.command("set_parameter", parameter=1, value=55.0)
-    bench.command("save_parameters")
+    assert bench.command("save_parameters") is ErrorCode.INTERNAL
     assert bench.read("acknowledge")["error"] == "internal"
     assert bench.read("device_status")["parameters_changed"]
+    assert [each.getMessage() for each in caplog.records] == ["state file: cannot be written"]
     bench.store.close()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_save_is_answered_when_the_disk_has_it_or_has_not(make_bench, monkeypatch, fails):
+    bench = make_bench().start()
+    bench.device._background = disk = LaterBackground()
+
+    def fail(_content):
+        raise EmulatorError("state file: cannot be written")
+
+    if fails:
+        monkeypatch.setattr(bench.store, "save", fail)
+    assert bench.send("save_parameters") == []
+    assert bench.read("acknowledge")["processed"] is False
+    assert bench.later == []
+    disk.catch_up()
+    (reply,) = bench.later
+    assert (reply.kind, reply.code) == (
+        (ReplyKind.NACK, ErrorCode.INTERNAL) if fails else (ReplyKind.ACK, ErrorCode.OK)
+    )
+    assert reply.id == bench.icd.telecommands["save_parameters"].id
+    assert bench.read("acknowledge")["processed"]
 
 
 def test_a_telecommand_before_the_last_one_is_done_is_an_overrun(make_bench):
     bench = make_bench().start()
     later = []
     bench.device._background = lambda work, done: later.append((work, done))
-    bench.command("save_parameters")
+    bench.send("save_parameters")
     assert not bench.read("acknowledge")["processed"]
     bench.command("set_mode", mode="standby")
     assert bench.read("communication_status")["telecommand_overrun"]
