@@ -8,6 +8,7 @@ from typing import Final
 from emulator.clock import NANOSECONDS, Clock, SteppedClock
 from emulator.device.scheduler import Scheduler
 from emulator.errors import EmulatorError
+from emulator.guard import call_guarded
 from emulator.imaging.imager import Imager
 
 MAX_STEP_S: Final = 86_400.0
@@ -60,7 +61,7 @@ class ClockPump:
         event = self._scheduler.pop_due(self._clock.now_ns())
         try:
             if event is not None:  # one at a time, so that the links get their turn between two
-                event.action(event.due_ns)
+                call_guarded("event", event.action, event.due_ns)
         finally:
             if self._running:
                 self._plan()
@@ -90,6 +91,6 @@ class StepPump:
             await self._imager.settle()
             while (event := self._scheduler.pop_due(end_ns)) is not None:
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
-                event.action(event.due_ns)
+                call_guarded("event", event.action, event.due_ns)
                 await self._imager.settle()
             self._clock.set_ns(end_ns)

@@ -108,6 +108,7 @@ def _happen(emulation: Emulation, event: ScenarioEvent) -> None:
         if event.truth is not None:
             now_s = emulation.clock.now_ns() / NANOSECONDS
             emulation.device.cycle.truth = event.truth.build(now_s, emulation.profile.folder)
+            emulation.close_feed()
     except EmulatorError as error:
         log.warning("scenario at %g s: %s", event.run_time_s, error)
     else:
