@@ -168,7 +168,8 @@ class Emulation:
             device.start_refused()
             raise
         if isinstance(self.clock, SteppedClock):
-            self.stepper = StepPump(device.scheduler, self.clock, self.imager)
+            transports = [link.transport for link in self._links()]
+            self.stepper = StepPump(device.scheduler, self.clock, self.imager, transports)
         else:
             self._pump = ClockPump(device.scheduler, self.clock)
             self._pump.start()
@@ -234,6 +235,7 @@ class Emulation:
 
     async def _open_links(self, device: Device) -> None:
         links, seed = self.profile.links, self.profile.run.seed
+        stepped = isinstance(self.clock, SteppedClock)  # what leaves at one run time leaves at once
         if links.serial.port != "off":
             from protocol.transports.serial import open_serial
 
@@ -241,14 +243,16 @@ class Emulation:
             symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
             if symlink is not None:
                 self._closers.append(claim_symlink(symlink).close)
-            paced = None if links.serial.pace and not isinstance(self.clock, SteppedClock) else False
+            paced = None if links.serial.pace and not stepped else False
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(device, transport, seed)
             self.ready_words["serial"] = await self.serial.start()
         if links.can.channel != "off":
             from protocol.transports.can import open_can
 
-            self.can = CanLink(device, open_can(links.can.channel), links.can.frame_gap_s, seed)
+            self.can = CanLink(
+                device, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
+            )
             self.ready_words["can"] = await self.can.start()
         if links.canopen.node:
             await self._open_canopen(device)
@@ -265,6 +269,10 @@ class Emulation:
         taken = await self.canopen.start()
         self.ready_words.setdefault("can", taken)
         self.ready_words["canopen"] = str(device.parameters["canopen_node"])
+
+    def _links(self) -> list[SerialLink | CanopenLink | CanLink]:
+        """Return the links of the run in the order in which they are closed: the CAN link may hold the hub of the bus."""
+        return [link for link in (self.serial, self.canopen, self.can) if link is not None]
 
     async def _warm_up(self) -> None:
         """Wait for the pipeline, then for boot to end."""
@@ -312,8 +320,6 @@ class Emulation:
 
         A part that does not close is logged, and keeps no other one open.
         """
-        # the bus may be a hub that the CAN link holds
-        links = [link for link in (self.serial, self.canopen, self.can) if link is not None]
         async with AsyncExitStack() as stack:
             for close in self._closers:  # entered in the reverse order: the last one is closed first
                 stack.push_async_callback(_close_guarded, close)
@@ -323,7 +329,7 @@ class Emulation:
             stack.push_async_callback(_close_guarded, self.close_feed)
             if self.control is not None:
                 stack.push_async_callback(_close_guarded, self.control.close)
-            for link in reversed(links):
+            for link in reversed(self._links()):
                 stack.push_async_callback(_close_guarded, link.close)
             if self._revival is not None:
                 stack.push_async_callback(_close_guarded, self._revival.close)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import random
 from collections import deque
@@ -207,7 +206,7 @@ class CanopenLink:
         seed: int = 0,
     ) -> None:
         self._device = device
-        self._transport = transport
+        self.transport: Final = transport
         dictionary = build_dictionary(device.icd)
         self.application = DeviceApplication(device, self._finish)
         dictionary.application = self.application
@@ -223,8 +222,9 @@ class CanopenLink:
         self._attitude_valid = False
         self._timer: Event | None = None
         self._reconnects = 0
-        loop = asyncio.get_running_loop()
-        self.wire: WireFaults[CanFrame] = WireFaults(transport.send, BaseFramePieces(), loop, seed)
+        self.wire: WireFaults[CanFrame] = WireFaults(
+            transport.send, BaseFramePieces(), device.clock, device.scheduler, seed
+        )
         device.on_frame.append(self._frame_made)
         device.on_mode.append(self._mode_changed)
         device.on_reset.append(self._device_reset)
@@ -232,15 +232,15 @@ class CanopenLink:
 
     async def start(self) -> str:
         """Join the bus and boot up; return what was taken."""
-        await self._transport.start(self._receive, self._complain)
+        await self.transport.start(self._receive, self._complain)
         self._do(self.slave.start)
-        return self._transport.description
+        return self.transport.description
 
     async def close(self) -> None:
         """Leave the bus."""
         if self._timer is not None:
             self._timer.cancel()
-        await self._transport.close()
+        await self.transport.close()
 
     @property
     def _wanted_node(self) -> int:
@@ -285,7 +285,7 @@ class CanopenLink:
 
     def _tick(self, _due_ns: int) -> None:
         self._timer = None
-        reconnects = self._transport.statistics.reconnects
+        reconnects = self.transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
             self._do(partial(self._raise, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION))
