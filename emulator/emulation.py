@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import inspect
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -15,11 +17,12 @@ from emulator.claim import claim_symlink
 from emulator.clock import Clock, SteppedClock, make_clock
 from emulator.control import ControlServer
 from emulator.device.cycle import Measurement
-from emulator.device.device import Background, Device, do_at_once
+from emulator.device.device import Background, Device, do_at_once, outcome
 from emulator.device.modes import Mode
 from emulator.device.state_store import FileStore, MemoryStore, StateStore
 from emulator.errors import EmulatorError
 from emulator.faults import Faults
+from emulator.guard import one_line
 from emulator.imaging.frames import PipelineSetup, Warm
 from emulator.imaging.imager import ProcessImager, ThreadImager
 from emulator.imaging.worker_process import WorkerProcess
@@ -27,6 +30,7 @@ from emulator.links.can import CanLink
 from emulator.links.serial import SerialLink
 from emulator.profile import Profile
 from emulator.pump import ClockPump, StepPump
+from emulator.revival import PipelineRevival
 from emulator.scenario import load_scenario
 from emulator.truth.config import FileConfig, LiveConfig, TruthConfig
 from emulator.truth.file import FileTruth
@@ -41,9 +45,6 @@ if TYPE_CHECKING:
     from emulator.links.canopen import CanopenLink
 
 log = logging.getLogger("starhil.run")
-
-PIPELINE_RESTART_S: Final = 0.5
-"""Pause before a pipeline that ended by itself is started again, seconds."""
 
 PATIENCE_S: Final = 8.0
 """Time after which a start that takes long is explained, seconds."""
@@ -118,9 +119,8 @@ class Emulation:
         self.control: ControlServer | None = None
         self.ended = asyncio.Event()
         self._warming: asyncio.Task[None] | None = None
-        self._reviving: asyncio.Task[None] | None = None
+        self._revival: PipelineRevival | None = None
         self._awake = asyncio.Event()
-        self._closing = False
 
     @property
     def device(self) -> Device:
@@ -175,10 +175,14 @@ class Emulation:
             device.start_refused()
             raise
         if isinstance(self.clock, SteppedClock):
-            self.stepper = StepPump(device.scheduler, self.clock, self.imager)
+            transports = [link.transport for link in self._links()]
+            self.stepper = StepPump(device.scheduler, self.clock, self.imager, transports)
         else:
             self._pump = ClockPump(device.scheduler, self.clock)
             self._pump.start()
+        self._revival = PipelineRevival(
+            self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
+        )
         self._warming = asyncio.create_task(self._warm_up())
 
     @property
@@ -198,12 +202,7 @@ class Emulation:
 
         def background(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
             def run() -> None:
-                error: EmulatorError | None = None
-                try:
-                    work()
-                except EmulatorError as caught:
-                    error = caught
-                loop.call_soon_threadsafe(done, error)
+                loop.call_soon_threadsafe(done, outcome(work))
 
             self._writer.submit(run)
 
@@ -225,17 +224,18 @@ class Emulation:
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
             wanted = f"{config.protocol}:{config.host}:{config.port}"
             if config.port != 0 and wanted in (self.ready_words.get("truth"), self._feed_wanted):
-                self._close_feed()  # the same port: it has to be free first
+                self.close_feed()  # the same port: it has to be free first
                 await asyncio.sleep(0)  # … and is so when the loop has come around
             where = await feed.start(config.protocol, config.host, config.port)
-            self._close_feed()
+            self.close_feed()
             self.ready_words["truth"], self._feed_wanted = where, wanted
         else:
-            self._close_feed()
+            self.close_feed()
         self.feed = feed
         return truth
 
-    def _close_feed(self) -> None:
+    def close_feed(self) -> None:
+        """Close the socket of the live feed, if there is one: another truth has taken its place."""
         if self.feed is not None:
             self.feed.close()
             self.feed = None
@@ -244,6 +244,7 @@ class Emulation:
 
     async def _open_links(self, device: Device) -> None:
         links, seed = self.profile.links, self.profile.run.seed
+        stepped = isinstance(self.clock, SteppedClock)  # what leaves at one run time leaves at once
         if links.serial.port != "off":
             from protocol.transports.serial import open_serial
 
@@ -251,7 +252,7 @@ class Emulation:
             symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
             if symlink is not None:
                 self._closers.append(claim_symlink(symlink).close)
-            paced = None if links.serial.pace and not isinstance(self.clock, SteppedClock) else False
+            paced = None if links.serial.pace and not stepped else False
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(device, transport, seed)
             self.ready_words["serial"] = await self.serial.start()
@@ -259,7 +260,9 @@ class Emulation:
         if links.can.channel != "off":
             from protocol.transports.can import open_can
 
-            self.can = CanLink(device, open_can(links.can.channel), links.can.frame_gap_s, seed)
+            self.can = CanLink(
+                device, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
+            )
             self.ready_words["can"] = await self.can.start()
         if links.canopen.node:
             await self._open_canopen(device)
@@ -277,13 +280,16 @@ class Emulation:
         self.ready_words.setdefault("can", taken)
         self.ready_words["canopen"] = str(device.parameters["canopen_node"])
 
+    def _links(self) -> list[SerialLink | CanopenLink | CanLink]:
+        """Return the links of the run in the order in which they are closed: the CAN link may hold the hub of the bus."""
+        return [link for link in (self.serial, self.canopen, self.can) if link is not None]
+
     async def _warm_up(self) -> None:
-        """Wait for the pipeline, then wait for boot to end; start the pipeline anew when it ends by itself."""
+        """Wait for the pipeline, then for boot to end."""
         device = self.device
         try:
             self.warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
-            self.imager.on_failure = self._pipeline_failed
             device.on_mode.append(
                 lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
             )
@@ -296,23 +302,6 @@ class Emulation:
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
-
-    def _pipeline_failed(self, text: str) -> None:
-        if self._closing:
-            return
-        log.error("%s; starting another", text)
-        self.device.pipeline_lost()
-        self._reviving = asyncio.create_task(self._revive())
-
-    async def _revive(self) -> None:
-        """Start the pipeline anew; the device stays in its error mode until it is commanded out of it."""
-        await asyncio.sleep(PIPELINE_RESTART_S)
-        try:
-            warm = await self.imager.restart()
-        except EmulatorError as error:
-            log.warning("%s; no mode can be commanded any more: start the emulator anew", error)
-            return
-        self.device.pipeline_ready(camera_constants(warm))
 
     async def ready(self) -> str:
         """Wait until the device takes commands; return the ready line.
@@ -337,27 +326,47 @@ class Emulation:
         return "ready " + " ".join(f"{key}={value}" for key, value in words.items())
 
     async def close(self) -> None:
-        """End everything: links first, so that nothing new comes in, then the pipeline and the files."""
-        self._closing = True
-        if self._pump is not None:
-            self._pump.stop()
-        for task in (self._warming, self._reviving):
-            if task is not None:
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError, EmulatorError, ProtocolError):
-                    await task
-        for link in (self.serial, self.canopen, self.can):  # the bus may be a hub that the CAN link holds
-            if link is not None:
-                await link.close()
-        if self.control is not None:
-            self.control.close()
-        if self.feed is not None:
-            self.feed.close()
-        await self.imager.close()
-        self._writer.shutdown(wait=True)
-        for close in reversed(self._closers):
-            close()
-        self._closers.clear()
+        """End everything: links first, so that nothing new comes in, then the pipeline and the files.
+
+        A part that does not close is logged, and keeps no other one open.
+        """
+        async with AsyncExitStack() as stack:
+            for close in self._closers:  # entered in the reverse order: the last one is closed first
+                stack.push_async_callback(_close_guarded, close)
+            self._closers.clear()
+            stack.push_async_callback(_close_guarded, partial(self._writer.shutdown, wait=True))
+            stack.push_async_callback(_close_guarded, self.imager.close)
+            stack.push_async_callback(_close_guarded, self.close_feed)
+            if self.control is not None:
+                stack.push_async_callback(_close_guarded, self.control.close)
+            for link in reversed(self._links()):
+                stack.push_async_callback(_close_guarded, link.close)
+            if self._revival is not None:
+                stack.push_async_callback(_close_guarded, self._revival.close)
+            if self._warming is not None:
+                stack.push_async_callback(_close_guarded, partial(_cancel, self._warming))
+            if self._pump is not None:
+                stack.push_async_callback(_close_guarded, self._pump.stop)
+
+
+async def _close_guarded(close: Callable[[], object]) -> None:
+    """Close one part; what that raises is logged."""
+    try:
+        closing = close()
+        if inspect.isawaitable(closing):
+            await closing
+    except Exception as error:  # the other parts are to be closed still
+        what = str(error) if isinstance(error, (EmulatorError, ProtocolError)) else one_line(error)
+        log.error("closing: %s", what)  # noqa: TRY400 (one line)
+        log.debug("closing", exc_info=True)
+
+
+async def _cancel(task: asyncio.Task[None]) -> None:
+    """End a task; what it has raised was reported by `ready`."""
+    task.cancel()
+    await asyncio.wait({task})
+    if not task.cancelled():
+        task.exception()
 
 
 def pipeline_setup(profile: Profile) -> PipelineSetup:

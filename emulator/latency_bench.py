@@ -43,7 +43,7 @@ ECHO: Final = (
 )
 """Program of the process that sends everything back."""
 
-STARHIL: Final = "from emulator.cli.app import main; main()"
+STARHIL: Final = "from emulator.cli import main; main()"
 
 
 @dataclass(frozen=True)

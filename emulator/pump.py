@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Final
+import logging
+from collections.abc import Sequence
+from typing import Any, Final
 
 from emulator.clock import NANOSECONDS, Clock, SteppedClock
 from emulator.device.scheduler import Scheduler
 from emulator.errors import EmulatorError
+from emulator.guard import call_guarded
 from emulator.imaging.imager import Imager
+from protocol.transports.base import Transport
+
+log = logging.getLogger("starhil.run")
 
 MAX_STEP_S: Final = 86_400.0
 LONGEST_SLEEP_S: Final = 3600.0
+PEER_PATIENCE_S: Final = 1.0
+"""Wall time for which a step waits for a peer that takes nothing of what was sent to it, seconds."""
 
 
 class ClockPump:
@@ -60,19 +68,34 @@ class ClockPump:
         event = self._scheduler.pop_due(self._clock.now_ns())
         try:
             if event is not None:  # one at a time, so that the links get their turn between two
-                event.action(event.due_ns)
+                call_guarded("event", event.action, event.due_ns)
         finally:
             if self._running:
                 self._plan()
 
 
 class StepPump:
-    """Goes from event to event when it is told to, and waits for the pipeline before each."""
+    """Goes from event to event when it is told to, and waits before each for the pipeline and for what the links send.
 
-    def __init__(self, scheduler: Scheduler, clock: SteppedClock, imager: Imager) -> None:
+    Parameters
+    ----------
+    transports
+        Where the links send; one whose peer takes nothing for `PEER_PATIENCE_S` is not waited for until the peer reads again.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        clock: SteppedClock,
+        imager: Imager,
+        transports: Sequence[Transport[Any]] = (),
+    ) -> None:
         self._scheduler = scheduler
         self._clock = clock
         self._imager = imager
+        self._transports = transports
+        self._stalled: dict[Transport[Any], int] = {}
+        """Transports that are not waited for, with what they had sent when their peers stopped reading."""
         self._lock = asyncio.Lock()
 
     async def step(self, seconds: float) -> None:
@@ -87,9 +110,38 @@ class StepPump:
             raise EmulatorError(f"step: {seconds} given, seconds in (0, {MAX_STEP_S:g}] needed")
         async with self._lock:
             end_ns = self._clock.now_ns() + round(seconds * NANOSECONDS)
-            await self._imager.settle()
+            await self._settle()
             while (event := self._scheduler.pop_due(end_ns)) is not None:
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
-                event.action(event.due_ns)
-                await self._imager.settle()
+                call_guarded("event", event.action, event.due_ns)
+                await self._settle()
             self._clock.set_ns(end_ns)
+
+    async def _settle(self) -> None:
+        """Wait for the pipeline and the links, and give whatever else is in the loop its turn."""
+        await self._imager.settle()
+        await asyncio.sleep(0)
+        for transport in self._transports:
+            await self._drain(transport)
+
+    async def _drain(self, transport: Transport[Any]) -> None:
+        """Wait until a transport has sent all, as long as its peer takes something."""
+        sent = transport.statistics.sent
+        if self._stalled.get(transport) == sent:
+            return
+        while True:
+            try:
+                async with asyncio.timeout(PEER_PATIENCE_S):
+                    await transport.drain()
+            except TimeoutError:
+                if transport.statistics.sent != sent:
+                    sent = transport.statistics.sent
+                    continue
+                self._stalled[transport] = sent
+                log.warning(
+                    "step: the peer of %s does not read; what it leaves unread is dropped",
+                    transport.description,
+                )
+            else:
+                self._stalled.pop(transport, None)
+            return

@@ -120,6 +120,7 @@ def _happen(emulation: Emulation, event: ScenarioEvent, truth: TruthSource | Non
             emulation.faults.inject(event.fault)
         if truth is not None:
             emulation.device.cycle.truth = truth
+            emulation.close_feed()
     except EmulatorError as error:
         log.warning("scenario at %g s: %s", event.run_time_s, error)
     else:

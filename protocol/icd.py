@@ -25,8 +25,8 @@ from protocol.icd_schema import (
     SectionModel,
 )
 from protocol.messages import FIRST_TELEMETRY_ID
-from protocol.values import EnumDefinition, FieldError, INTEGER_RANGES, IcdError, Parameter, Section
 from protocol.user_file import read_user_text
+from protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
 __all__ = ["IcdError", "InterfaceDefinition", "Names", "UnknownNameError", "default_icd_path", "load_icd"]
 

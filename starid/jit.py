@@ -8,6 +8,7 @@ contents of all modules of the project that the function's module imports, direc
 from __future__ import annotations
 
 import hashlib
+import importlib
 import re
 import sys
 from collections.abc import Callable
@@ -20,6 +21,24 @@ from numba import njit
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 _IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
+
+
+def _import_numba_arrays() -> None:
+    """Import what numba needs for arrays, without the whole of ``scipy.linalg``.
+
+    numba imports that only to see that it is there, which takes a fifth of the time until a first kernel runs, and 12 MB.
+    scipy is a requirement of this package; a kernel that multiplies matrices imports what it needs when it is called.
+    """
+    linalg: Any = importlib.import_module("numba.np.linalg")
+    looks_for_scipy = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = looks_for_scipy
+
+
+_import_numba_arrays()
 
 
 def compiled(function: Kernel) -> Kernel:

@@ -65,9 +65,9 @@ def command(
 
     One line on stdout, `ready serial=… dialect=… can=… seed=…`, tells that it takes commands and where.
     """
-    from emulator.imaging.worker_process import WorkerProcess
+    from emulator.imaging.worker_process import take_worker
 
-    worker = WorkerProcess()  # first of all: it imports and warms up while this process does the rest
+    worker = take_worker()  # first of all: it imports and warms up while this process does the rest
 
     import asyncio
     import gc

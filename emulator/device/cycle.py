@@ -9,6 +9,7 @@ could not look at says nothing about the sky, so the last attitude stands until 
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ from emulator.imaging.imager import Answer, Imager
 from emulator.profile import TimingConfig
 from emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
+
+log = logging.getLogger("starhil.device")
 
 MAX_PENDING: Final = 2
 """Requests in the pipeline at which the next exposure is left out; more, where more fit into the time modelled for them."""
@@ -105,7 +108,6 @@ class _Frame:
     period_s: float
     tracking: bool
     result: FrameResult | None = None
-    failure: str = ""
     waiting_since_ns: int | None = None
     """When a result without stars would have been known, if none had come by then."""
     late: bool = False
@@ -146,6 +148,8 @@ class FrameCycle:
         self._generation = 0
         self._in_flight: deque[_Frame] = deque()
         self._grid_ns = 0
+        self._failure = ""
+        """What the pipeline said of the last frame if it could not do it."""
         self.truth: TruthSource = FixedTruth(Attitude.identity())
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
         self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
@@ -294,9 +298,12 @@ class FrameCycle:
 
     def _arrived(self, frame: _Frame, answer: Answer) -> None:
         if isinstance(answer, FrameResult):
-            frame.result = answer
+            frame.result, self._failure = answer, ""
         else:
-            frame.failure = answer.text if isinstance(answer, Failure) else "unexpected answer"
+            text = answer.text if isinstance(answer, Failure) else "unexpected answer"
+            if text != self._failure:  # once, not with every frame
+                log.warning("frame %d: %s", frame.index, text)
+            self._failure = text
             frame.result = FrameResult(frame.index, reason="processing_error")
         if frame.waiting_since_ns is not None:
             self._ready(frame, frame.waiting_since_ns)

@@ -19,6 +19,7 @@ from emulator.device.state_store import StateStore
 from emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
 from emulator.device.telemetry import TELEMETRY
 from emulator.errors import EmulatorError
+from emulator.guard import call_guarded, one_line
 from emulator.imaging.frames import FrameRequest
 from emulator.imaging.imager import Imager
 from emulator.profile import LINK_PARAMETERS, Profile
@@ -41,15 +42,25 @@ STALE_PERIODS: Final = 3
 
 PROCESSING_ALLOWANCE_S: Final = 2.0
 
+PIPELINE_ENDED: Final = "pipeline_ended"
+"""Error of a device whose picture pipeline has ended and is not started again, a name of the enumeration `device_error`."""
 
-def do_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
-    """Background that is none: for the stepped clock, where nothing may depend on how fast a disk is."""
+
+def outcome(work: Callable[[], None]) -> EmulatorError | None:
+    """Do some work and return what went wrong, whatever it was, or None."""
     try:
         work()
     except EmulatorError as error:
-        done(error)
-    else:
-        done(None)
+        return error
+    except Exception as error:  # noqa: BLE001 (whoever waits for the work has to hear of its end)
+        log.error("background: internal error: %s", one_line(error))  # noqa: TRY400 (one line)
+        return EmulatorError(f"internal error: {one_line(error)}")
+    return None
+
+
+def do_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
+    """Background that is none: for the stepped clock, where nothing may depend on how fast a disk is."""
+    done(outcome(work))
 
 
 class Device:
@@ -163,7 +174,7 @@ class Device:
         """Restart, for a cause by its name in the interface definition."""
         self._start(cause, self._content())
         for observer in self.on_reset:
-            observer()
+            call_guarded("reset", observer)
 
     def _start(self, cause: str, state: Mapping[str, object]) -> None:
         count, stored = state.get("boot_count"), state.get("parameters")
@@ -205,6 +216,10 @@ class Device:
         """Take note that the pipeline has ended: the error mode, until it is back and a mode is commanded."""
         self.warm = False
         self.modes.fail("processing")
+
+    def pipeline_given_up(self) -> None:
+        """Take note that the pipeline does not come back by itself: the error mode, until a reset."""
+        self.modes.fail(PIPELINE_ENDED)
 
     def _boot_ends(self, _due_ns: int) -> None:
         self._boot_over = None
@@ -281,11 +296,11 @@ class Device:
             tracking_enabled=bool(self.parameters["tracking_enable"]),
         )
         for observer in self.on_frame:
-            observer(measurement)
+            call_guarded("frame", observer, measurement)
 
     def _mode_changed(self, transition: Transition) -> None:
         log.info("mode %s -> %s (%s)", transition.before, transition.after, transition.cause)
-        self.mode_changes = (self.mode_changes + 1) & 0xFF
+        self.mode_changes = (self.mode_changes + (transition.before is not transition.after)) & 0xFF
         if transition.after.makes_frames:
             self.cycle.start()
         else:
@@ -293,7 +308,7 @@ class Device:
             self.images.cycle_stopped()
             self.latest = None
         for observer in self.on_mode:
-            observer(transition)
+            call_guarded("mode", observer, transition)
 
     def command_mode(self, wanted: Mode) -> bool:
         """Command a mode; False if it is refused."""
@@ -331,7 +346,7 @@ class Device:
         destination = int(self.parameters["host_address"])
         reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=destination)
         for outlet in self.outlets:
-            outlet(reply)
+            call_guarded("unsolicited telemetry", outlet, reply)
 
     # --- requests ---
 

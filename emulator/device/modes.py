@@ -61,7 +61,7 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class Transition:
-    """One change of mode."""
+    """One change of mode; from error to error where only the cause of the error changes."""
 
     before: Mode
     after: Mode
@@ -135,7 +135,7 @@ class Modes:
             self._enter(Mode.LOST_IN_SPACE, Cause.TRACKING_DISABLED)
 
     def _enter(self, after: Mode, cause: Cause, error: str = "") -> None:
-        before, self.mode = self.mode, after
-        self.error = error
-        if self._on_change is not None and before is not after:
+        changed = (self.mode, self.error) != (after, error)
+        before, self.mode, self.error = self.mode, after, error
+        if self._on_change is not None and changed:
             self._on_change(Transition(before, after, cause))

@@ -7,6 +7,8 @@ goes on only when all that was asked for has come.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import pickle
 import queue
 import threading
@@ -15,6 +17,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias
 
 from emulator.errors import EmulatorError
+from emulator.guard import call_guarded, one_line
 from emulator.imaging.frames import (
     LENGTH,
     Failure,
@@ -26,6 +29,8 @@ from emulator.imaging.frames import (
     Warm,
 )
 from emulator.imaging.worker_process import EXIT_GRACE_S, WorkerProcess
+
+log = logging.getLogger("starhil.picture")
 
 Asked: TypeAlias = FrameRequest | ImageRequest
 Answer: TypeAlias = FrameResult | ImageResult | Failure
@@ -66,14 +71,15 @@ class DirectImager:
 
 
 class _Queue:
-    """Callbacks that wait for their answers, in order."""
+    """Callbacks that wait for their answers, in order, and the start that they need."""
 
     def __init__(self) -> None:
         self._waiting: deque[Done] = deque()
         self._idle = asyncio.Event()
         self._idle.set()
+        self._warm: asyncio.Future[Warm] = asyncio.get_running_loop().create_future()
         self.on_failure: Callable[[str], None] | None = None
-        """Called when the worker is lost."""
+        """Called when the pipeline is lost after it was ready; a start that fails raises instead."""
 
     @property
     def pending(self) -> int:
@@ -89,21 +95,38 @@ class _Queue:
 
     def _answer(self, answer: Answer) -> None:
         done = self._waiting.popleft()
-        try:
-            done(answer)
-        finally:
-            if not self._waiting:
-                self._idle.set()
+        call_guarded("answer of the picture pipeline", done, answer)
+        if not self._waiting:
+            self._idle.set()
 
-    def _fail_all(self, text: str) -> None:
+    def _ready(self, warm: Warm) -> None:
+        if not self._warm.done():
+            self._warm.set_result(warm)
+
+    def _start_failed(self, text: str) -> None:
+        if not self._warm.done():
+            self._warm.set_exception(EmulatorError(text))
+
+    def _lost(self, text: str) -> None:
+        """Fail all that is pending, and report the loss to whoever waits for the start, or else to `on_failure`."""
+        warm = self._warm
+        was_ready = warm.done() and not warm.cancelled() and warm.exception() is None
+        self._start_failed(text)
         while self._waiting:
             self._answer(Failure(text, fatal=True))
-        if self.on_failure is not None:
-            self.on_failure(text)
+        if was_ready:
+            log.error("%s", text)
+            if self.on_failure is not None:
+                call_guarded("loss of the picture pipeline", self.on_failure, text)
+
+    def _forget_start(self) -> None:
+        """Take note of a failed start that was reported already, so that it is not reported again at exit."""
+        if self._warm.done() and not self._warm.cancelled():
+            self._warm.exception()
 
 
 class ProcessImager(_Queue):
-    """A worker process of one's own, reached over a socket pair.
+    """A worker process of its own, reached over a socket pair.
 
     The emulator's process needs no numerics then, and its answers on the bus do not wait for the interpreter's lock.
     """
@@ -112,7 +135,6 @@ class ProcessImager(_Queue):
         super().__init__()
         self._setup = setup
         self._worker = worker
-        self._warm: asyncio.Future[Warm] = asyncio.get_running_loop().create_future()
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
         self._closing = False
@@ -132,7 +154,7 @@ class ProcessImager(_Queue):
         """
         self._warm = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
-        self._write(self._setup)
+        self._writer.write(_packed(self._setup))
         self._task = asyncio.create_task(self._read(reader))
         return await self._warm
 
@@ -143,11 +165,11 @@ class ProcessImager(_Queue):
         ------
         EmulatorError
             That one cannot be either.
+        OSError
+            The system starts no process.
         """
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None  # what is asked for until the other one is reached is refused
-        self._worker.end()
+        self._disconnect()
+        await asyncio.get_running_loop().run_in_executor(None, self._worker.end)
         self._worker = WorkerProcess()
         return await self.start()
 
@@ -156,13 +178,15 @@ class ProcessImager(_Queue):
         if not self._worker.running or self._writer is None:
             done(Failure("picture worker: not running", fatal=True))
             return
+        data = _packed(request)
         self._enqueue(done)
-        self._write(request)
+        self._writer.write(data)
 
-    def _write(self, message: object) -> None:
-        data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    def _disconnect(self) -> None:
+        """Close the connection: what is asked for until another worker is reached is refused."""
         if self._writer is not None:
-            self._writer.write(LENGTH.pack(len(data)) + data)
+            self._writer.close()
+            self._writer = None
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         try:
@@ -171,31 +195,29 @@ class ProcessImager(_Queue):
                 message: Any = pickle.loads(await reader.readexactly(length))  # noqa: S301 (our own child process)
                 self._take(message)
         except (asyncio.IncompleteReadError, ConnectionError):
-            if self._closing:
-                return
-            text = "picture worker: ended by itself; see its last words on stderr"
-            if not self._warm.done():
-                self._warm.set_exception(EmulatorError(text))
-            self._fail_all(text)
+            text = "picture worker: ended by itself; see the last lines of stderr"
+        except Exception as error:  # noqa: BLE001 (no answer: nothing that follows can be trusted)
+            text = f"picture worker: its answer cannot be read: {one_line(error)}"
+        if not self._closing:
+            self._disconnect()
+            self._lost(text)
 
     def _take(self, message: Warm | Answer) -> None:
         if isinstance(message, Warm):
-            self._warm.set_result(message)
+            self._ready(message)
         elif isinstance(message, Failure) and not self._warm.done():
-            self._warm.set_exception(EmulatorError(message.text))
+            self._start_failed(message.text)
         else:
             self._answer(message)
 
     async def close(self) -> None:
         """End the worker and wait for it."""
         self._closing = True
-        if self._writer is not None:
-            self._writer.close()
+        self._disconnect()
         if self._task is not None:
             self._task.cancel()
         await asyncio.get_running_loop().run_in_executor(None, self._worker.end)
-        if self._warm.done() and not self._warm.cancelled():
-            self._warm.exception()  # so that a failure already told is not told again at exit
+        self._forget_start()
 
 
 class ThreadImager(_Queue):
@@ -206,43 +228,77 @@ class ThreadImager(_Queue):
         self._setup = setup
         self._loop = asyncio.get_running_loop()
         self._requests: queue.SimpleQueue[Asked | None] = queue.SimpleQueue()
-        self._warm: asyncio.Future[Warm] = self._loop.create_future()
-        self._thread = threading.Thread(target=self._work, name="picture", daemon=True)
+        self._thread: threading.Thread | None = None
+        """The thread; None before the start and after a loss."""
 
     async def start(self) -> Warm:
-        """Wait until the pipeline is ready."""
-        self._thread.start()
-        return await self._warm
-
-    def submit(self, request: Asked, done: Done) -> None:
-        """Hand a request to the thread."""
-        self._enqueue(done)
-        self._requests.put(request)
-
-    def _work(self) -> None:
-        from emulator.imaging.picture import make_picture
-
-        made = make_picture(self._setup)
-        if isinstance(made, Failure):
-            self._loop.call_soon_threadsafe(self._warm.set_exception, EmulatorError(made.text))
-            return
-        picture, warm = made
-        self._loop.call_soon_threadsafe(self._warm.set_result, warm)
-        while (request := self._requests.get()) is not None:
-            self._loop.call_soon_threadsafe(self._answer, picture.handle(request))
-
-    async def restart(self) -> Warm:
-        """Refuse: a thread does not end by itself.
+        """Wait until the pipeline is ready.
 
         Raises
         ------
         EmulatorError
-            Always.
+            It cannot be; one line.
         """
-        raise EmulatorError("picture thread: cannot be started again; start the emulator anew")
+        self._warm = self._loop.create_future()
+        self._requests = queue.SimpleQueue()
+        self._thread = threading.Thread(
+            target=self._work, args=(self._requests,), name="picture", daemon=True
+        )
+        self._thread.start()
+        return await self._warm
+
+    async def restart(self) -> Warm:
+        """Start another thread in place of one that has ended, and wait until it is ready.
+
+        Raises
+        ------
+        EmulatorError
+            That one cannot be either.
+        """
+        return await self.start()
+
+    def submit(self, request: Asked, done: Done) -> None:
+        """Hand a request to the thread."""
+        if self._thread is None:
+            done(Failure("picture thread: not running", fatal=True))
+            return
+        self._enqueue(done)
+        self._requests.put(request)
+
+    def _lost(self, text: str) -> None:
+        self._thread = None
+        super()._lost(text)
+
+    def _work(self, requests: queue.SimpleQueue[Asked | None]) -> None:
+        try:
+            self._serve(requests)
+        except BaseException as error:  # noqa: BLE001 (whatever ends the thread, its requests are failed)
+            self._in_loop(self._lost, f"picture thread: ended: {one_line(error)}")
+
+    def _serve(self, requests: queue.SimpleQueue[Asked | None]) -> None:
+        from emulator.imaging.picture import make_picture
+
+        made = make_picture(self._setup)
+        if isinstance(made, Failure):
+            self._in_loop(self._start_failed, made.text)
+            return
+        picture, warm = made
+        self._in_loop(self._ready, warm)
+        while (request := requests.get()) is not None:
+            self._in_loop(self._answer, picture.handle(request))
+
+    def _in_loop(self, callback: Callable[..., None], *args: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop may have ended while a frame was being made
+            self._loop.call_soon_threadsafe(callback, *args)
 
     async def close(self) -> None:
         """End the thread and wait for it."""
         self._requests.put(None)
-        if self._thread.is_alive():
+        if self._thread is not None:
             await self._loop.run_in_executor(None, self._thread.join, EXIT_GRACE_S)
+        self._forget_start()
+
+
+def _packed(message: object) -> bytes:
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return LENGTH.pack(len(data)) + data

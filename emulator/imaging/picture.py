@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.errors import EmulatorError
+from emulator.guard import one_line
 from emulator.imaging.binning import mean_over_squares
 from emulator.imaging.frames import (
     ZERO,
@@ -68,6 +69,8 @@ def make_picture(setup: PipelineSetup) -> tuple[Picture, Warm] | Failure:
         picture.warm_up()
     except (EmulatorError, StaridError) as error:
         return Failure(str(error), fatal=True)
+    except Exception as error:  # noqa: BLE001 (in one line, instead of a traceback of a process that is gone)
+        return Failure(f"picture pipeline: internal error: {one_line(error)}", fatal=True)
     warm = Warm(picture.camera.to_dict(), len(picture.catalog), time.perf_counter() - begin)
     return picture, warm
 
@@ -128,6 +131,8 @@ class Picture:
             return self._frame(request)
         except (EmulatorError, StaridError) as error:
             return Failure(str(error), fatal=False)
+        except Exception as error:  # noqa: BLE001 (one frame that fails must not end those after it)
+            return Failure(f"picture pipeline: internal error: {one_line(error)}", fatal=False)
 
     def _frame(self, request: FrameRequest) -> FrameResult:
         begin = time.perf_counter()

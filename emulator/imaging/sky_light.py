@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -131,6 +130,8 @@ class AreaPainter:
 
     def _moon(self, light: AreaLight, moon: Moon, attitude: Attitude) -> None:
         """Glare over the field, and the disc with its terminator."""
+        import cv2
+
         centre = icrs_vector(moon.ra_deg, moon.dec_deg)
         source = attitude.to_sensor(centre)
         radius = math.radians(moon.diameter_deg) / 2.0
@@ -183,6 +184,8 @@ class AreaPainter:
 
     def _earth(self, light: AreaLight, earth: EarthLimb, attitude: Attitude) -> None:
         """The Earth's face, fading over the atmosphere; nothing behind it is seen."""
+        import cv2
+
         source = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg)).astype(np.float32)
         cosine = np.clip(np.tensordot(source, self._directions, axes=1), -1.0, 1.0)
         above_deg = np.degrees(np.arccos(cosine)) - np.float32(earth.radius_deg)
@@ -196,6 +199,8 @@ class AreaPainter:
 
     def _cover(self, obstruction: Obstruction) -> Image:
         """Transmission (h, w) of an obstruction."""
+        import cv2
+
         height, width = self._camera.height, self._camera.width
         if obstruction.polygon_px:
             cover = np.ones((height, width), dtype=np.float32)

@@ -32,3 +32,16 @@ class WorkerProcess:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+
+_ahead: Final[list[WorkerProcess]] = []
+
+
+def start_ahead() -> None:
+    """Start the worker of the run that this process is about to assemble, before anything else is imported."""
+    _ahead.append(WorkerProcess())
+
+
+def take_worker() -> WorkerProcess:
+    """Return the worker that was started ahead, or a new one."""
+    return _ahead.pop() if _ahead else WorkerProcess()

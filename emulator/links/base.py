@@ -59,11 +59,11 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     def __init__(self, device: Device, transport: Transport[Item], pieces: Pieces[Item], seed: int) -> None:
         self._device = device
-        self._transport = transport
         self._loop = asyncio.get_running_loop()
+        self.transport: Final = transport
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
-        self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, self._loop, seed)
+        self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, device.clock, device.scheduler, seed)
         device.outlets.append(self._unsolicited)
         device.on_reset.append(self._forget)
 
@@ -85,14 +85,14 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     async def start(self) -> str:
         """Open the transport; return what was taken."""
-        await self._transport.start(self._receive, self._complain)
-        return self._transport.description
+        await self.transport.start(self._receive, self._complain)
+        return self.transport.description
 
     async def close(self) -> None:
         """Give the transport back."""
         if self._timer is not None:
             self._timer.cancel()
-        await self._transport.close()
+        await self.transport.close()
 
     def _now(self) -> float:
         """Run time, s: a message that does not end is given up in the device's own time."""

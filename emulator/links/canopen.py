@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import random
 from collections import deque
@@ -222,7 +221,7 @@ class CanopenLink:
         seed: int = 0,
     ) -> None:
         self._device = device
-        self._transport = transport
+        self.transport: Final = transport
         dictionary = build_dictionary(device.icd)
         self.application = DeviceApplication(device, self._finish)
         dictionary.application = self.application
@@ -239,8 +238,9 @@ class CanopenLink:
         self._timer: Event | None = None
         self._reconnects = 0
         self._node = BusAddress("node", "links.canopen.node")
-        loop = asyncio.get_running_loop()
-        self.wire: WireFaults[CanFrame] = WireFaults(transport.send, BaseFramePieces(), loop, seed)
+        self.wire: WireFaults[CanFrame] = WireFaults(
+            transport.send, BaseFramePieces(), device.clock, device.scheduler, seed
+        )
         device.on_frame.append(self._frame_made)
         device.on_mode.append(self._mode_changed)
         device.on_reset.append(self._device_reset)
@@ -248,18 +248,18 @@ class CanopenLink:
 
     async def start(self) -> str:
         """Join the bus and boot up; return what was taken."""
-        await self._transport.start(self._receive, self._complain)
+        await self.transport.start(self._receive, self._complain)
         node = self.slave.node_id
-        self._node.take(self._transport.description, 0 if node == UNCONFIGURED else node)
+        self._node.take(self.transport.description, 0 if node == UNCONFIGURED else node)
         self._do(self.slave.start)
-        return self._transport.description
+        return self.transport.description
 
     async def close(self) -> None:
         """Leave the bus."""
         self._node.release()
         if self._timer is not None:
             self._timer.cancel()
-        await self._transport.close()
+        await self.transport.close()
 
     @property
     def _wanted_node(self) -> int:
@@ -304,7 +304,7 @@ class CanopenLink:
 
     def _tick(self, _due_ns: int) -> None:
         self._timer = None
-        reconnects = self._transport.statistics.reconnects
+        reconnects = self.transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
             self._do(partial(self._raise, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION))

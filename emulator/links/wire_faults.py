@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+from emulator.clock import NANOSECONDS, Clock
+from emulator.device.scheduler import Scheduler
+
 Item = TypeVar("Item")
 
 
@@ -55,16 +58,6 @@ class Pieces(Protocol[Item]):
         """Cut into pieces."""
 
 
-class Timer(Protocol):
-    """What tells the time and wakes up: an event loop."""
-
-    def time(self) -> float:
-        """Time, seconds."""
-
-    def call_later(self, delay: float, callback: Callable[[], None], /) -> object:
-        """Run a function after some seconds."""
-
-
 class WireFaults(Generic[Item]):
     """The outgoing side of a wire, as bad as it is told to be. What is held back leaves in the order in which it came.
 
@@ -74,8 +67,8 @@ class WireFaults(Generic[Item]):
         Where undamaged pieces go.
     pieces
         How pieces of this wire are damaged.
-    timer
-        Tells when what is held back leaves.
+    clock, scheduler
+        The device's: what is held back leaves in run time, so that it does at the same frames whatever the clock.
     seed
         Seed of what goes wrong.
     """
@@ -84,17 +77,20 @@ class WireFaults(Generic[Item]):
         self,
         send: Callable[[Item], object],
         pieces: Pieces[Item],
-        timer: Timer,
+        clock: Clock,
+        scheduler: Scheduler,
         seed: int,
     ) -> None:
         self.settings = WireFaultSettings()
         self.dropped = self.corrupted = 0
         self._send = send
         self._pieces = pieces
-        self._timer = timer
+        self._clock = clock
+        self._scheduler = scheduler
         self._rng = random.Random(seed)  # noqa: S311 (faults, not secrets)
-        self._waiting: deque[tuple[float, Item]] = deque()
-        self._free_at = 0.0
+        self._waiting: deque[tuple[int, Item]] = deque()
+        """What is held back, with the run time at which it leaves, nanoseconds."""
+        self._free_ns = 0
         self._awaited = False
 
     def send(self, item: Item) -> None:
@@ -118,26 +114,26 @@ class WireFaults(Generic[Item]):
 
     def _leave(self, parts: Sequence[Item], settings: WireFaultSettings) -> None:
         """Let the parts of one piece go, behind all that was sent before."""
-        now = self._timer.time()
-        at = max(now + settings.delay_s, self._free_at)
-        gap_s = settings.gap_s if len(parts) > 1 else 0.0
+        now_ns = self._clock.now_ns()
+        at_ns = max(now_ns + round(settings.delay_s * NANOSECONDS), self._free_ns)
+        gap_ns = round(settings.gap_s * NANOSECONDS) if len(parts) > 1 else 0
         for part in parts:
-            if at > now or self._waiting:
-                self._waiting.append((at, part))
+            if at_ns > now_ns or self._waiting:
+                self._waiting.append((at_ns, part))
             else:
                 self._send(part)
-            at += gap_s
-        self._free_at = at
+            at_ns += gap_ns
+        self._free_ns = at_ns
         self._await()
 
     def _await(self) -> None:
         if self._waiting and not self._awaited:
             self._awaited = True
-            self._timer.call_later(max(0.0, self._waiting[0][0] - self._timer.time()), self._send_due)
+            self._scheduler.at(self._waiting[0][0], self._send_due)
 
-    def _send_due(self) -> None:
+    def _send_due(self, _due_ns: int) -> None:
         self._awaited = False
-        now = self._timer.time()
-        while self._waiting and self._waiting[0][0] <= now:
+        now_ns = self._clock.now_ns()
+        while self._waiting and self._waiting[0][0] <= now_ns:
             self._send(self._waiting.popleft()[1])
         self._await()

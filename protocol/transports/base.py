@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final, Generic, TypeVar
 
-from protocol.errors import ProtocolError
+from protocol.errors import ProtocolError, reason
 
 _LOGGER: Final = logging.getLogger("starhil.transport")
 
@@ -110,17 +110,34 @@ class ReturningTransport(Transport[Item]):
         """Note that the port is gone."""
         if self._closing or self._comeback is not None:
             return
-        self._disconnect()
+        self._release()
         self._complain(f"{self.what} {self.description}: lost: {why}; waiting for it to come back")
         self._comeback = asyncio.get_running_loop().create_task(self._come_back())
 
+    def _release(self) -> None:
+        """Disconnect; a port that is half gone may resist, which is reported."""
+        try:
+            self._disconnect()
+        except Exception as error:  # noqa: BLE001 (it is to be opened again, or left, all the same)
+            self._complain(
+                f"{self.what} {self.description}: closing: {type(error).__name__}: {reason(error)}"
+            )
+
     async def _come_back(self) -> None:
         pause = Backoff()
+        reported = ""
         while True:
             await asyncio.sleep(pause.next())
             try:
                 await self._connect()
             except ProtocolError:
+                continue
+            except Exception as error:  # noqa: BLE001 (whatever it is, the port may come back)
+                self._release()
+                text = f"{type(error).__name__}: {reason(error)}"
+                if text != reported:  # once, not with every try
+                    reported = text
+                    self._complain(f"{self.what} {self.description}: not back: {text}; still trying")
                 continue
             self.statistics.reconnects += 1
             self._comeback = None
@@ -135,7 +152,7 @@ class ReturningTransport(Transport[Item]):
             with contextlib.suppress(asyncio.CancelledError):
                 await self._comeback
             self._comeback = None
-        self._disconnect()
+        self._release()
 
 
 class Backoff:

@@ -7,8 +7,10 @@ import contextlib
 import errno
 import os
 import select
+import termios
 import tty
 from abc import abstractmethod
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -166,16 +168,21 @@ class PtyTransport(_PacedTransport):
             raise TransportError(
                 f"serial pty: the system gives no pseudo-terminal: {error.strerror}"
             ) from None
-        tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        self._path = os.ttyname(slave)
-        os.close(slave)  # the master hangs up while no peer has it open
-        if self._symlink is not None:
-            try:
+        try:
+            with _termios_as_os_error():
+                tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            self._path = os.ttyname(slave)
+            if self._symlink is not None:
                 self._link(self._symlink, self._path)
-            except TransportError:
-                self._close_master()
-                raise
+        except OSError as error:
+            self._close_master()
+            raise TransportError(f"serial pty: cannot be set up: {error.strerror}; try again") from None
+        except TransportError:
+            self._close_master()
+            raise
+        finally:
+            os.close(slave)  # the master hangs up while no peer has it open
         self.description = str(self._symlink) if self._symlink is not None else self._path
         self._make_writer()
         self._peers = PtyPeers(self._master, self._path)
@@ -290,10 +297,12 @@ class TtyTransport(_ReturningSerial):
                 f"serial {self._path}: is no tty; name a serial port such as /dev/ttyUSB0, or auto for a pseudo-terminal"
             )
         try:
-            self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
+            with _termios_as_os_error():
+                self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
+            asyncio.get_running_loop().add_reader(self._port.fileno(), self._readable)
         except (OSError, ValueError) as error:
+            self._detach()
             raise TransportError(_tty_problem(self._path, self._baud, error)) from None
-        asyncio.get_running_loop().add_reader(self._port.fileno(), self._readable)
 
     def _readable(self) -> None:
         if self._port is None:
@@ -311,19 +320,25 @@ class TtyTransport(_ReturningSerial):
             self._lost("hung up")
 
     def _change_rate(self, baud: int) -> None:
+        lost = ""
         if self._port is not None:
-            if self._port.out_waiting:  # the kernel's buffer still leaves at the old rate
-                asyncio.get_running_loop().call_later(RATE_RETRY_S, self.set_baud, baud)
-                return
             try:
-                self._port.baudrate = baud
-            except (OSError, ValueError):
-                self._complain(
-                    f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} is kept"
-                )
-                return
+                with _termios_as_os_error():
+                    if self._port.out_waiting:  # the kernel's buffer still leaves at the old rate
+                        asyncio.get_running_loop().call_later(RATE_RETRY_S, self.set_baud, baud)
+                        return
+                    self._port.baudrate = baud
+            except (OSError, ValueError) as error:
+                if isinstance(error, ValueError) or error.errno == errno.EINVAL:
+                    self._complain(
+                        f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} is kept"
+                    )
+                    return
+                lost = error.strerror or str(error)
         self._baud = baud
         super()._change_rate(baud)
+        if lost:  # the port comes back at the new rate
+            self._lost(lost)
 
     def _write(self, data: bytes) -> int:
         if self._port is None:
@@ -340,6 +355,15 @@ class TtyTransport(_ReturningSerial):
             with contextlib.suppress(OSError):
                 self._port.close()
             self._port = None
+
+
+@contextlib.contextmanager
+def _termios_as_os_error() -> Iterator[None]:
+    """Raise what the terminal settings refuse as the OSError that it is, which `termios.error` does not derive from."""
+    try:
+        yield
+    except termios.error as error:
+        raise OSError(*error.args) from None
 
 
 def _hung_up(fd: int) -> bool:

@@ -13,8 +13,10 @@ from emulator.clock import SteppedClock
 from emulator.device.device import Device
 from emulator.device.state_store import MemoryStore, StateStore
 from emulator.emulation import Emulation, RunOptions
+from emulator.imaging import worker_process
 from emulator.imaging.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
 from emulator.imaging.imager import Answer, Asked, DirectImager
+from emulator.imaging.worker_process import WorkerProcess
 from emulator.profile import Profile
 from emulator.truth.source import FixedTruth, TruthSource
 from protocol.icd import load_icd
@@ -184,3 +186,25 @@ def run(monkeypatch, make_bench):
 
     run.picture = picture
     return run
+
+
+@pytest.fixture
+def worker(monkeypatch):
+    """Make picture workers that run the given programs, one after the other; the last one from then on."""
+
+    def make(*programs):
+        waiting = list(programs)
+        real = worker_process.subprocess.Popen
+        started = []
+
+        def start(command, **options):
+            program = waiting.pop(0) if len(waiting) > 1 else waiting[0]
+            started.append(real([command[0], "-c", program, command[-1]], **options))
+            return started[-1]
+
+        monkeypatch.setattr(worker_process.subprocess, "Popen", start)
+        process = WorkerProcess()
+        process.started = started
+        return process
+
+    return make

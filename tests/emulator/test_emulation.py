@@ -7,7 +7,6 @@ import resource
 import pytest
 
 from emulator.clock import SteppedClock
-from emulator.device.modes import Mode
 from emulator.emulation import Emulation, RunOptions
 from emulator.errors import EmulatorError
 from emulator.imaging.frames import Warm
@@ -260,23 +259,6 @@ def test_a_camera_beyond_its_parameters_is_refused_and_all_is_given_back(run, tm
     assert run(scenario, run=state, links=links) == 1
 
 
-def test_a_pipeline_that_cannot_come_back_is_told_with_the_remedy(run, monkeypatch, caplog):
-    async def restart(_imager) -> Warm:
-        raise EmulatorError("no memory")
-
-    monkeypatch.setattr(FakeImager, "restart", restart, raising=False)
-    monkeypatch.setattr("emulator.emulation.PIPELINE_RESTART_S", 0.0)
-
-    async def scenario(emulation, _line):
-        emulation.imager.on_failure("gone")
-        await emulation._reviving
-        assert "no memory" in caplog.text
-        assert "start the emulator anew" in caplog.text
-        assert emulation.device.command_mode(Mode.STANDBY) is False
-
-    run(scenario)
-
-
 def test_a_symlink_in_use_is_refused_and_stays(run, tmp_path):
     link = tmp_path / "tty"
     links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
@@ -334,3 +316,104 @@ def test_a_pipeline_that_dies_is_told_and_comes_back():
             await emulation.close()
 
     asyncio.run(scenario())
+
+
+class Unclosable:
+    """A part of a run that does not close."""
+
+    def __init__(self, part) -> None:
+        self._part = part
+
+    def __getattr__(self, name):
+        return getattr(self._part, name)
+
+    def close(self):
+        self._part.close()
+        raise RuntimeError("does\nnot close")
+
+
+def test_a_part_that_fails_to_close_keeps_no_other_open(run, tmp_path, caplog):
+    link, log = tmp_path / "tty", tmp_path / "truth.csv"
+    links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
+
+    async def scenario(emulation, _line):
+        closed = []
+        emulation.control = Unclosable(emulation.control)
+        emulation.imager.close = lambda: closed.append("imager") or 1 / 0
+        emulation._closers.append(lambda: 1 / 0)
+        return closed
+
+    closed = run(scenario, links=links, options=RunOptions(truth_log=log, control="auto"))
+    assert closed == ["imager"]
+    assert not link.is_symlink()
+    said = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert len(said) == 3
+    assert all(line.startswith("closing: ") and "\n" not in line for line in said)
+
+
+def test_a_save_that_fails_in_an_unforeseen_way_ends_the_acknowledge(run, monkeypatch):
+    async def scenario(emulation, _line):
+        device = emulation.device
+        monkeypatch.setattr(device.store, "save", lambda _content: {}["no such key"])
+        device.telecommand("save_parameters", {})
+        while not device.acknowledge.processed:
+            await asyncio.sleep(0.01)
+        assert device.acknowledge.error.name == "INTERNAL"
+        assert device._saving == 0
+
+    run(scenario, clock="real", device={"boot_s": 0.1})
+
+
+def test_a_scenario_that_replaces_a_live_truth_closes_its_port(run, tmp_path):
+    path = tmp_path / "day.toml"
+    path.write_text(
+        """
+        [[at]]
+        run_time_s = 2.0
+        truth = { kind = "fixed", attitude = { ra_deg = 10.0, dec_deg = 20.0 } }
+        """
+    )
+
+    async def scenario(emulation, _line):
+        protocol, host, port = emulation.ready_words["truth"].split(":")
+        assert protocol == "tcp"
+        _, writer = await asyncio.open_connection(host, int(port))
+        writer.close()
+        await emulation.stepper.step(3.0)
+        with pytest.raises(ConnectionRefusedError):
+            await asyncio.open_connection(host, int(port))
+        assert emulation.feed is None
+
+    live = {"kind": "live", "protocol": "tcp", "port": 0}
+    run(scenario, options=RunOptions(scenario=str(path)), truth=live)
+
+
+@pytest.mark.parametrize("clock", ["stepped", "scaled:20"])
+def test_an_observer_that_fails_stops_neither_the_frames_nor_the_other_observers(run, caplog, clock):
+    async def scenario(emulation, _line):
+        device = emulation.device
+        seen = []
+        device.on_frame[:0] = [lambda _measurement: 1 / 0]
+        device.on_frame.append(seen.append)
+        device.telecommand("set_mode", {"mode": "lost_in_space"})
+        while len(seen) < 3:
+            await (emulation.stepper.step(1.0) if emulation.stepper else asyncio.sleep(0.01))
+
+    run(scenario, clock=clock, device={"boot_s": 0.1})
+    assert "frame: internal error: ZeroDivisionError" in caplog.text
+    assert caplog.text.count("Traceback") == 0
+
+
+@pytest.mark.parametrize("clock", ["stepped", "scaled:20"])
+def test_an_event_that_fails_is_logged_and_time_goes_on(run, caplog, clock):
+    async def scenario(emulation, _line):
+        done = []
+        now_ns = emulation.clock.now_ns()
+        emulation.device.scheduler.at(now_ns + 1, lambda _due: 1 / 0)
+        emulation.device.scheduler.at(now_ns + 2, done.append)
+        while not done:
+            await (emulation.stepper.step(1.0) if emulation.stepper else asyncio.sleep(0.01))
+
+    run(scenario, clock=clock, device={"boot_s": 0.1})
+    assert "ZeroDivisionError" in caplog.text
+    assert caplog.text.count("Traceback") == 0

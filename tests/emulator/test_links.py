@@ -5,6 +5,8 @@ import random
 
 import pytest
 
+from emulator.clock import SteppedClock
+from emulator.device.scheduler import Scheduler
 from emulator.errors import EmulatorError
 from emulator.links.can import CanLink
 from emulator.links.serial import SerialLink, SerialPieces
@@ -351,7 +353,9 @@ def test_wire_faults_damage_what_goes_out(bench, settings, expected):
         if settings.split:
             assert b"".join(sent) == good
         if settings.delay_s:
-            await asyncio.sleep(0.05)
+            bench.step(settings.delay_s / 2)
+            assert linked.uart.take() == []
+            bench.step(settings.delay_s / 2)
             assert linked.uart.take() == [good]
         linked.serial.wire.settings = WireFaultSettings()
         assert linked.over_serial(128)[0].kind is ReplyKind.TELEMETRY
@@ -359,29 +363,11 @@ def test_wire_faults_damage_what_goes_out(bench, settings, expected):
     in_loop(scenario())
 
 
-class HandTimer:
-    """Time that a test lets pass."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.calls: list = []
-
-    def time(self) -> float:
-        return self.now
-
-    def call_later(self, delay, callback) -> None:
-        self.calls.append((self.now + delay, callback))
-
-    def run(self) -> None:
-        """Let time pass until nothing waits any more."""
-        while self.calls:
-            self.now, callback = self.calls.pop(self.calls.index(min(self.calls, key=lambda call: call[0])))
-            callback()
-
-
 def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
-    timer, sent = HandTimer(), []
-    wire = WireFaults(lambda item: sent.append((round(timer.now - 100.0, 6), item)), SerialPieces(), timer, 1)
+    clock, scheduler, sent = SteppedClock(), Scheduler(), []
+    wire = WireFaults(
+        lambda item: sent.append((clock.now_ns() / 1e9, item)), SerialPieces(), clock, scheduler, 1
+    )
     wire.settings = WireFaultSettings(split=2, gap_s=0.5)
     wire.send(b"abcd")
     wire.send(b"efg")
@@ -389,7 +375,9 @@ def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
     wire.send(b"hi")
     wire.settings = WireFaultSettings()
     wire.send(b"jk")
-    timer.run()
+    while (event := scheduler.pop_due(10**10)) is not None:
+        clock.set_ns(event.due_ns)
+        event.action(event.due_ns)
     assert sent == [
         (0.0, b"ab"), (0.5, b"cd"), (1.0, b"ef"), (1.5, b"g"), (2.0, b"hi"), (2.0, b"jk"),
     ]  # fmt: skip

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
+import termios
 import tty
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 import serial
@@ -288,5 +291,65 @@ def test_a_bit_rate_that_a_tty_cannot_have_is_told_and_the_old_one_kept(tmp_path
             assert "bit rate -1 is not possible here; 19200 is kept" in str(pair.errors[0])
             pair.two.send(b"alive")
             await until(lambda: bytes(pair.got_one) == b"alive")
+
+    asyncio.run(main())
+
+
+def no_terminal(*_args: object, **_options: object) -> NoReturn:
+    raise termios.error(errno.EIO, "Input/output error")
+
+
+def test_a_tty_whose_settings_are_refused_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        master, slave = os.openpty()
+        monkeypatch.setattr(serial, "Serial", no_terminal)
+        with pytest.raises(TransportError, match="cannot open: Input/output error"):
+            await open_serial(os.ttyname(slave)).start(lambda _: None)
+        monkeypatch.setattr(tty, "setraw", no_terminal)
+        with pytest.raises(TransportError, match=r"serial pty: .*Input/output error"):
+            await open_serial("pty").start(lambda _: None)
+        os.close(slave)
+        os.close(master)
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("error", [termios.error(errno.EIO, "Input/output error"), RuntimeError("odd")])
+def test_a_port_comes_back_whatever_its_opening_raised_before(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception
+) -> None:
+    real, raised = serial.Serial, []
+
+    def refuse_twice(*args: object, **options: object) -> serial.Serial:
+        if len(raised) < 2:
+            raised.append(error)
+            raise error
+        return real(*args, **options)
+
+    async def main() -> None:
+        async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
+            monkeypatch.setattr(serial, "Serial", refuse_twice)
+            pair.two._lost("pulled")  # type: ignore[attr-defined]
+            await until(lambda: pair.two.statistics.reconnects == 1)
+            assert len(raised) == 2
+            assert len(pair.errors) == 1 + isinstance(error, RuntimeError)
+            pair.two.send(b"alive")
+            await until(lambda: bytes(pair.got_one) == b"alive")
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("name", ["out_waiting", "baudrate"])
+def test_a_port_that_goes_while_its_bit_rate_changes_comes_back_at_the_new_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    async def main() -> None:
+        async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
+            with monkeypatch.context() as patch:
+                patch.setattr(type(pair.two._port), name, property(no_terminal, no_terminal))  # type: ignore[attr-defined]
+                pair.two.set_baud(38400)
+            await until(lambda: pair.two.statistics.reconnects == 1)
+            assert pair.two._port.baudrate == 38400  # type: ignore[attr-defined]
+            assert "lost: Input/output error" in str(pair.errors[0])
 
     asyncio.run(main())

@@ -1,0 +1,107 @@
+"""What happens when the picture pipeline has ended by itself: it is started again, a bounded number of times.
+
+The pauses grow. A pipeline that has run for `STEADY_S` counts as sound, and a later loss begins with the first pause again.
+When no attempt is left, the device stays in its error mode with the error `pipeline_ended` until it is reset, which tries again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Final
+
+from emulator.device.device import PIPELINE_ENDED, Device
+from emulator.errors import EmulatorError
+from emulator.guard import one_line
+from emulator.imaging.frames import Warm
+from emulator.imaging.imager import ProcessImager, ThreadImager
+
+log = logging.getLogger("starhil.run")
+
+PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Pauses before the attempts to start the pipeline again, seconds."""
+
+STEADY_S: Final = 60.0
+
+
+class PipelineRevival:
+    """Starts the pipeline of a device again.
+
+    Parameters
+    ----------
+    ready
+        Called when the pipeline is ready again.
+    """
+
+    def __init__(
+        self, imager: ProcessImager | ThreadImager, device: Device, ready: Callable[[Warm], None]
+    ) -> None:
+        self._imager = imager
+        self._device = device
+        self._ready = ready
+        self._attempts = 0
+        self._ready_at_s = 0.0
+        self._lost = False
+        self._task: asyncio.Task[None] | None = None
+        imager.on_failure = self._pipeline_lost
+        device.on_reset.append(self._device_reset)
+
+    def _pipeline_lost(self, _text: str) -> None:
+        if asyncio.get_running_loop().time() - self._ready_at_s > STEADY_S:
+            self._attempts = 0
+        self._lost = True
+        self._device.pipeline_lost()
+        self._begin()
+
+    def _device_reset(self) -> None:
+        if self._lost and self._attempts == len(PAUSES_S):
+            self._attempts = 0
+            self._begin()
+
+    def _begin(self) -> None:
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._revive())
+
+    async def _revive(self) -> None:
+        while self._lost and self._attempts < len(PAUSES_S):
+            pause_s = PAUSES_S[self._attempts]
+            self._attempts += 1
+            log.warning(
+                "picture pipeline: starting it again in %g s (attempt %d of %d)",
+                pause_s,
+                self._attempts,
+                len(PAUSES_S),
+            )
+            await asyncio.sleep(pause_s)
+            await self._restart()
+        if self._lost:
+            log.error(
+                "picture pipeline: ended %d times, not started again; error %s: "
+                "reset the device to try again, or restart the emulator",
+                len(PAUSES_S) + 1,
+                PIPELINE_ENDED,
+            )
+            self._device.pipeline_given_up()
+
+    async def _restart(self) -> None:
+        self._lost = False
+        try:
+            warm = await self._imager.restart()
+        except Exception as error:  # noqa: BLE001 (whatever it is, the next attempt may succeed)
+            self._lost = True
+            what = str(error) if isinstance(error, EmulatorError) else one_line(error)
+            log.warning("picture pipeline: not started: %s", what)
+            return
+        if self._lost:  # it has ended again already
+            return
+        self._ready_at_s = asyncio.get_running_loop().time()
+        log.info("pipeline ready again: %.2f s", warm.seconds)
+        self._ready(warm)
+
+    async def close(self) -> None:
+        """Give up an attempt under way."""
+        self._imager.on_failure = None
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait({self._task})

@@ -1,0 +1,61 @@
+"""The picture worker is started before anything else is imported, and a kernel needs no whole `scipy.linalg`."""
+
+import subprocess
+import sys
+
+import pytest
+
+AHEAD = """
+import sys
+from emulator.imaging import worker_process
+class Worker:
+    def __init__(self):
+        print("worker", "typer" in sys.modules, "pydantic" in sys.modules)
+        raise KeyboardInterrupt
+worker_process.WorkerProcess = Worker
+from emulator.cli import main
+sys.argv[1:] = {arguments}
+main()
+"""
+
+BLAS = """
+import sys
+import numpy as np
+import starid.jit
+from numba import njit
+print("scipy.linalg" in sys.modules)
+@njit
+def product(a, b):
+    return a @ b
+print(np.array_equal(product(np.eye(3), np.eye(3)), np.eye(3)))
+"""
+
+
+def python(program):
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["run", "demo"], "worker False False"), (["run", "--help"], "Usage"), ([], "Usage")],
+)
+def test_only_a_run_starts_its_worker_before_anything_else_is_imported(arguments, said):
+    ended = python(AHEAD.format(arguments=arguments))
+    assert said in ended.stdout + ended.stderr
+    assert ("worker" in ended.stdout.split()) == (said.startswith("worker"))
+
+
+def test_a_worker_that_was_started_ahead_is_taken_once(monkeypatch):
+    from emulator.imaging import worker_process
+
+    monkeypatch.setattr(worker_process, "WorkerProcess", object)
+    worker_process.start_ahead()
+    first, second = worker_process.take_worker(), worker_process.take_worker()
+    assert first is not second
+    assert worker_process._ahead == []
+
+
+def test_a_kernel_that_multiplies_matrices_finds_what_it_needs_when_it_is_called():
+    ended = python(BLAS)
+    assert ended.stdout.split() == ["False", "True"], ended.stderr

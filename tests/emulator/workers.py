@@ -1,0 +1,23 @@
+"""Programs that stand in for the picture worker: they make no pictures, and fail where a test wants them to."""
+
+from tests.emulator.runs import CAMERA
+
+WORKER = """
+import pickle, socket, sys
+from emulator.imaging.frames import LENGTH, Failure, FrameResult, Warm
+link = socket.socket(fileno=int(sys.argv[1]))
+stream = link.makefile("rwb")
+def receive():
+    head = stream.read(LENGTH.size)
+    return pickle.loads(stream.read(LENGTH.unpack(head)[0])) if head else None
+def send(message):
+    data = pickle.dumps(message)
+    stream.write(LENGTH.pack(len(data)) + data)
+    stream.flush()
+receive()
+"""
+"""The beginning of a worker that makes no pictures: what it does then is the test's."""
+
+ANSWERING = (
+    WORKER + f"send(Warm({CAMERA}, 5, 0.0))\nn = 0\nwhile receive():\n n += 1\n send(FrameResult(n))\n"
+)
