@@ -13,6 +13,7 @@ from hil_tests.bench import Bench
 from hil_tests.client import ObcClient
 from hil_tests.errors import BenchError, NackError
 from hil_tests.expect import resolve, show
+from hil_tests.interruption import Interrupted
 from hil_tests.png import write_png
 from hil_tests.raw_exchange import matches, pattern, send_and_listen
 from hil_tests.readings import Reading
@@ -103,17 +104,24 @@ class SessionRunner:
         """Run all steps; after a failed one the rest is skipped unless the script says `keep_going`."""
         begin = time.monotonic()
         results: list[StepResult] = []
-        failed = False
+        reason = ""
+        interruption = None
         for step in self._script.steps:
             for link in self._links_of(step):
-                if failed and not self._script.keep_going:
-                    result = StepResult(step.number, step.name, link, SKIPPED, "an earlier step failed", 0.0)
+                if reason:
+                    result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
                 else:
-                    result = self._step(step, link)
-                failed = failed or result.status == FAILED
+                    try:
+                        result = self._step(step, link)
+                    except Interrupted as signalled:
+                        interruption = signalled
+                        reason = f"not run: {signalled.reason}"
+                        result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
+                if result.status == FAILED and not self._script.keep_going:
+                    reason = "an earlier step failed"
                 results.append(result)
                 self._on_result(result)
-        return SessionResult(self._script.title, tuple(results), time.monotonic() - begin)
+        return SessionResult(self._script.title, tuple(results), time.monotonic() - begin, interruption)
 
     def _links_of(self, step: Step) -> tuple[str, ...]:
         if isinstance(step.action, Wait | Restart):

@@ -6,6 +6,7 @@ from typing import Final
 
 from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
 from hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
+from hil_tests.conformance.unit_settings import save_parameters
 
 ACKNOWLEDGE: Final = "CubeComputer TLM 240: last telecommand, processed, error, index (AlbertaSat, CTS)"
 COUNTERS: Final = "CubeComputer TLM 144: counts of telecommands and telemetry (AlbertaSat, CTS)"
@@ -286,9 +287,10 @@ def standby(probe: LinkProbe) -> None:
     intrusive=True,
 )
 def frames(probe: LinkProbe) -> None:
-    """Two seconds at 5 Hz, with or without stars."""
+    """Two seconds at 5 Hz, with or without stars; the exposure must leave room for that rate."""
     probe.standby()
-    with probe.kept("update_rate"):
+    with probe.kept("update_rate", "exposure"):
+        probe.set_parameter("exposure", 50.0)
         probe.set_parameter("update_rate", 5.0)
         probe.command("set_mode", mode="lost_in_space")
         probe.sleep(0.6)
@@ -417,28 +419,21 @@ def store_reset(probe: LinkProbe) -> None:
     before = float(probe.parameter("exposure")["value"])
     probe.set_parameter("exposure", TEST_VALUE)
     probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
-    _save(probe)
+    save_parameters(probe)
     probe.set_parameter("exposure", TEST_VALUE + 1)
     probe.reset()
     try:
         check_equal(float(probe.parameter("exposure")["value"]), TEST_VALUE, "saved exposure")
     finally:
         probe.set_parameter("exposure", before)
-        _save(probe)
-
-
-def _save(probe: LinkProbe) -> None:
-    probe.command("save_parameters")
-    seen = probe.wait_for("acknowledge", {"processed": True}, 5.0)
-    check_equal(seen["error"], "ok", "result of save_parameters")
-    probe.wait_for("device_status", {"parameters_changed": False}, 2.0)
+        save_parameters(probe)
 
 
 @case(_CASES, "store.restore", "restore_parameters brings back what is stored", OURS, intrusive=True)
 def store_restore(probe: LinkProbe) -> None:
     """Without a reset."""
     before = float(probe.parameter("exposure")["value"])
-    _save(probe)
+    save_parameters(probe)
     probe.set_parameter("exposure", TEST_VALUE)
     probe.command("restore_parameters")
     check_equal(float(probe.parameter("exposure")["value"]), before, "exposure")
@@ -453,17 +448,17 @@ def store_restore(probe: LinkProbe) -> None:
 )
 def store_defaults(probe: LinkProbe) -> None:
     """Restored afterwards."""
-    _save(probe)
+    save_parameters(probe)
     stored = float(probe.parameter("limiting_magnitude")["value"])
     probe.set_parameter("limiting_magnitude", 4.25)
-    _save(probe)
+    save_parameters(probe)
     probe.command("default_parameters")
     seen = probe.parameter("limiting_magnitude")
     check_equal(seen["value"], seen["default"], "limiting_magnitude")
     probe.command("restore_parameters")
     check_equal(float(probe.parameter("limiting_magnitude")["value"]), 4.25, "stored limiting_magnitude")
     probe.set_parameter("limiting_magnitude", stored)
-    _save(probe)
+    save_parameters(probe)
 
 
 @case(

@@ -15,16 +15,13 @@ from hil_tests.conformance.link_probe import (
     LinkProbe,
     checked_values,
 )
+from hil_tests.conformance.unit_settings import LINK_PARAMETERS
 from protocol.codec import Field, Row
 from protocol.icd import InterfaceDefinition
 from protocol.values import Parameter
 
 CODES: Final = "published error codes 0 to 4 (AlbertaSat, CTS)"
 IDENTIFIERS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
-LINK_PARAMETERS: Final = frozenset(
-    {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}
-)
-"""Parameters that would cut the tester off; they are only refused values, and set to what they are."""
 PARTNERS: Final = {"max_star_pixels": ("min_star_pixels", 1.0), "min_star_pixels": ("max_star_pixels", 255.0)}
 """Parameters that bound each other → the other one, and the value at which it leaves all room."""
 F32_ROUNDING: Final = 1e-6
