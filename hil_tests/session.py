@@ -37,6 +37,7 @@ from protocol.errors import ProtocolError
 from protocol.values import Value
 
 MS_PER_S: Final = 1e3
+CLOCK_GRAIN_S: Final = 1e-6
 
 
 @dataclass
@@ -182,8 +183,7 @@ class SessionRunner:
             return Outcome(problem=str(error))
         limit = step.max_latency_s
         if outcome.problem is None and limit is not None and (outcome.latency_s or 0.0) > limit:
-            seen = (outcome.latency_s or 0.0) * MS_PER_S
-            outcome.problem = f"latency {seen:.1f} ms, expected at most {limit * MS_PER_S:g} ms"
+            outcome.problem = f"latency {outcome.latency_s or 0.0:.4f} s, expected at most {limit:g} s"
         if outcome.problem is None:
             self._captured.update({name: outcome.values[key] for name, key in step.capture.items()})
         return outcome
@@ -237,21 +237,14 @@ class SessionRunner:
     def _set_parameter(self, step: Step, action: SetParameter, client: ObcClient) -> Outcome:
         parameter = action.parameter
         value = resolve(action.value, self._variables())
-        number = (
-            float(value)
-            if action.refused is not None and not isinstance(value, str)
-            else parameter.to_number(value)
+        request = client.core.set_parameter(
+            parameter.name,
+            value,
+            timeout_s=step.timeout_s,
+            retries=step.retries,
+            checked=action.refused is None,
         )
-        row = client.icd.telecommands["set_parameter"]
-        data = row.encode({"parameter": parameter.id, "value": number}, check=False)
-        outcome = self._refusable(
-            lambda: (
-                client.run(
-                    client.core.command_raw(row.name, data, timeout_s=step.timeout_s, retries=step.retries)
-                ).latency_s
-            ),
-            action.refused,
-        )
+        outcome = self._refusable(lambda: client.run(request).latency_s, action.refused)
         if outcome.problem is None and action.refused is None:
             seen = client.get_parameter(parameter.name)
             wanted = parameter.check(value)
@@ -292,16 +285,18 @@ class SessionRunner:
 
     def _listen(self, step: Step, action: Listen, client: ObcClient) -> Outcome:
         outcome = Outcome()
-        begin = time.monotonic()
+        times = [time.monotonic()]
         for _ in range(action.count):
             reading = client.wait_unsolicited(
-                action.row.name, timeout_s=step.timeout_s or self._script.timeout_s
+                action.row.name, timeout_s=step.timeout_s or self._script.timeout_s, since_s=times[0]
             )
+            times.append(reading.received_s)
             outcome = self._judge(step, reading)
             if outcome.problem is not None:
                 return outcome
         outcome.latency_s = None
-        outcome.figures["rate_hz"] = action.count / max(time.monotonic() - begin, 1e-9)
+        if action.count > 1:  # between the readings themselves; the wait for the first one is of no meaning
+            outcome.figures["rate_hz"] = (action.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
         return outcome
 
     def _sample(self, step: Step, action: Sample, client: ObcClient) -> Outcome:

@@ -29,7 +29,7 @@ from hil_tests.results import (
 from hil_tests.scratch import scratch_folder
 from hil_tests.script import load_script
 from hil_tests.script_model import Script
-from hil_tests.session import MS_PER_S, SessionRunner
+from hil_tests.session import SessionRunner
 from protocol.icd import load_icd
 from protocol.serial_framing import Dialect
 
@@ -178,7 +178,7 @@ def _printer(*, quiet: bool) -> Callable[[StepResult], None]:
         if result.link:
             line.append(f"  [{result.link}]", style="dim")
         if result.latency_s is not None:
-            line.append(f"  {result.latency_s * MS_PER_S:.1f} ms", style="cyan")
+            line.append(f"  {result.latency_s:.4f} s", style="cyan")
         if result.detail:
             line.append(f"  {result.detail}", style="red" if result.status == FAILED else "dim")
         console.print(line, soft_wrap=True)

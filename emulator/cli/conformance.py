@@ -51,7 +51,12 @@ def command(
         Path | None, typer.Option(help="Write a page with all that was sent, expected and seen.")
     ] = None,
     dialect: Annotated[str, typer.Option(help="Form of serial replies: a, b or c.")] = "b",
-    baud: Annotated[int | None, typer.Option(help="Bit rate of the serial line.")] = None,
+    baud: Annotated[
+        int | None,
+        typer.Option(
+            help="Bit rate of the serial line; without it the port is opened at 115200 and the pace of replies is not checked."
+        ),
+    ] = None,
     host_address: Annotated[int, typer.Option(help="CAN address of the tester.")] = 1,
     device_address: Annotated[int, typer.Option(help="CAN address of the device.")] = 4,
     time_out: Annotated[float, typer.Option(min=0.01, help="Longest time for an answer, s.")] = 1.0,

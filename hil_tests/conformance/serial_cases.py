@@ -260,7 +260,7 @@ def no_flag(probe: SerialProbe) -> None:
 def pace(probe: SerialProbe) -> None:
     """Nothing is faster than the bit rate: telemetry 211 has 54 bytes."""
     if probe.baud is None:
-        raise CaseSkipped("the bit rate of the line is not known; use --baud")
+        raise CaseSkipped("the pace is not checked without --baud, the bit rate of the line")
     begin = probe.now()
     probe.post(211)
     data = probe.expect_telemetry(211)
