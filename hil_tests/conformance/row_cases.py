@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from hil_tests.conformance.case import Case, case, check, check_equal
+from hil_tests.conformance.case import Case, case, check, check_equal, rule
 from hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -83,7 +83,7 @@ def unknown_telecommands(probe: LinkProbe) -> None:
     _IDENTIFIER_CASES,
     "identifiers.telemetry-with-data",
     "a request of telemetry with data is refused for its length",
-    "rule of this product (docs of the interface definition)",
+    rule(5),
 )
 def telemetry_with_data(probe: LinkProbe) -> None:
     """Every row."""
@@ -186,7 +186,7 @@ def _bad_field_case(row: Row, name: str, index: int, why: str, data: bytes) -> C
 
 
 def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
-    clause = f"configs/icd parameter {parameter.name} (ours)"
+    clause = f"configs/icd parameter {parameter.name}; {rule(19)}"
 
     def limits(probe: LinkProbe) -> None:
         seen = probe.parameter(parameter.name)

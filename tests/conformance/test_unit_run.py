@@ -123,6 +123,24 @@ def test_an_interrupted_run_leaves_the_unit_as_it_was():
         assert_as_found(unit)
 
 
+@pytest.mark.parametrize("name", ["time.set", "time.flag"])
+def test_a_case_that_fails_or_is_interrupted_puts_the_clock_back(name, monkeypatch):
+    case = next(case for case in SUITES["serial"] if case.id == f"serial.{name}")
+    with SimulatedUnit("serial") as unit:
+        unit.probe.command("set_unix_time", seconds=1_800_000_000, milliseconds=0)
+        command = unit.probe.command
+
+        def interrupted(telecommand, **values):
+            command(telecommand, **values)
+            if values.get("seconds") == 1_700_000_000:
+                raise Interrupted(15)
+
+        monkeypatch.setattr(unit.probe, "command", interrupted)
+        with pytest.raises(Interrupted):
+            case.run(unit.probe)
+        assert 1_800_000_000 <= unit.probe.telemetry("device_status")["clock"] < 1_800_000_060
+
+
 def test_settings_that_cannot_be_put_back_are_named(monkeypatch):
     with SimulatedUnit("serial") as unit:
         set_up(unit)
