@@ -8,6 +8,9 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ValidationError
 
+NEAR: Final = 0.55
+"""Likeness from which on a known key is offered in place of an unknown one."""
+
 
 def explain(
     error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
@@ -23,13 +26,15 @@ def explain(
     also
         Keys that may stand at the top beside those of the model.
     """
-    first = error.errors(include_url=False)[0]
+    first = _telling_fault(error)
     loc = (*under, *first["loc"])
-    path = [str(part) for part in loc if part not in _TAGS]
+    unknown = first["type"] == "extra_forbidden"  # its last part is what a user wrote, whatever it is called
+    path = [str(part) for part in (loc[:-1] if unknown else loc) if part not in _TAGS]
+    path += [str(loc[-1])] if unknown else []
     where = ".".join(path) or "as a whole"
-    if first["type"] == "extra_forbidden":
+    if unknown:
         known = sorted([*_keys_at(model, loc[:-1]), *(also if len(loc) == 1 else ())])
-        near = difflib.get_close_matches(str(loc[-1]), known, n=1)
+        near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=NEAR)
         remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
         return f"{where}: unknown key; {remedy}"
     context = first.get("ctx", {})
@@ -44,6 +49,17 @@ def explain(
         return f"{'.'.join([*path, key])}: must be one of {expected}{given}"
     shown = "" if isinstance(first["input"], (dict, list)) else f" (given: {first['input']!r})"
     return f"{where}: {plain(first['msg'])}{shown}"
+
+
+def _telling_fault(error: ValidationError) -> Any:
+    """Return the first fault; where a key is missing beside an unknown one, the unknown one, which is the likelier slip."""
+    faults = error.errors(include_url=False)
+    first = faults[0]
+    if first["type"] == "missing":
+        for fault in faults:
+            if fault["type"] == "extra_forbidden" and fault["loc"][:-1] == first["loc"][:-1]:
+                return fault
+    return first
 
 
 def plain(message: str) -> str:

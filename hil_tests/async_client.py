@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -20,6 +21,8 @@ from protocol.values import Value
 
 DEFAULT_TIMEOUT_S: Final = 1.0
 """Time-out of a transaction, that of current public flight software."""
+UNSOLICITED_KEPT: Final = 1000
+"""Unsolicited readings that wait to be taken; the oldest go first."""
 SETTLE_S: Final = 0.05
 """Pause after a time-out, in which a late reply is thrown away so that no later request takes it for its own."""
 
@@ -55,7 +58,8 @@ class AsyncObcClient:
         self.transactions: list[Transaction] = []
         self.faults: list[LinkFault] = []
         self.stray_replies: list[Reply] = []
-        self.unsolicited: asyncio.Queue[Reading] = asyncio.Queue()
+        self.unsolicited: asyncio.Queue[Reading] = asyncio.Queue(UNSOLICITED_KEPT)
+        self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
         self._turn = asyncio.Lock()
         self._pending: tuple[Request, asyncio.Future[tuple[Reply, float]]] | None = None
@@ -99,16 +103,24 @@ class AsyncObcClient:
         *,
         timeout_s: float | None = None,
         retries: int | None = None,
+        checked: bool = True,
         **fields: Value,
     ) -> Ack:
         """Send a telecommand and wait for its acknowledge; fields as a mapping, by keyword, or both.
 
+        Parameters
+        ----------
+        checked
+            False to send values outside the limits of the interface definition too, for the device to refuse.
+
         Raises
         ------
+        FieldError
+            A value that the definition does not allow; nothing is sent.
         NackError
             The device refused it; carries the published code.
         """
-        data = self.icd.telecommands[name].encode({**(values or {}), **fields})
+        data = self.icd.telecommands[name].encode({**(values or {}), **fields}, check=checked)
         return await self.command_raw(name, data, timeout_s=timeout_s, retries=retries)
 
     async def command_raw(
@@ -120,10 +132,25 @@ class AsyncObcClient:
         _reply, latency = await self.transact(request, row.name, 0, timeout_s=timeout_s, retries=retries)
         return Ack(row.name, latency)
 
-    async def set_parameter(self, name: str, value: Value) -> Ack:
-        """Set a parameter by name, in its own unit."""
+    async def set_parameter(
+        self,
+        name: str,
+        value: Value,
+        *,
+        timeout_s: float | None = None,
+        retries: int | None = None,
+        checked: bool = True,
+    ) -> Ack:
+        """Set a parameter by name, in its own unit; `checked` as with `command`."""
         parameter = self.icd.parameters[name]
-        return await self.command("set_parameter", parameter=parameter.id, value=parameter.to_number(value))
+        number = parameter.to_number(value) if checked or isinstance(value, str) else float(value)
+        return await self.command(
+            "set_parameter",
+            {"parameter": parameter.id, "value": number},
+            timeout_s=timeout_s,
+            retries=retries,
+            checked=checked,
+        )
 
     async def read_parameter(self, name: str) -> Reading:
         """Select a parameter by name and read its value, limits and default."""
@@ -165,15 +192,23 @@ class AsyncObcClient:
                 )
             await asyncio.sleep(every_s)
 
-    async def wait_unsolicited(self, name: str, *, timeout_s: float | None = None) -> Reading:
-        """Return the next unsolicited telemetry of a row; that of other rows is dropped."""
+    async def wait_unsolicited(
+        self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
+    ) -> Reading:
+        """Return the next unsolicited telemetry of a row; that of other rows is dropped.
+
+        Parameters
+        ----------
+        since_s
+            Time on `time.monotonic`: what was received before is dropped too.
+        """
         wanted = self.icd.telemetry[name].name
         limit = self.timeout_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(limit):
                 while True:
                     reading = await self.unsolicited.get()
-                    if reading.name == wanted:
+                    if reading.name == wanted and reading.received_s >= since_s:
                         return reading
         except TimeoutError:
             raise NoReplyError(f"unsolicited {wanted}", limit) from None
@@ -256,6 +291,9 @@ class AsyncObcClient:
         if row is None or row.kind != "telemetry" or len(reply.data) != row.size:
             self.stray_replies.append(reply)
         else:
+            if self.unsolicited.full():
+                self.unsolicited.get_nowait()
+                self.unsolicited_dropped += 1
             self.unsolicited.put_nowait(self._reading(reply, 0.0))
 
     def _reading(self, reply: Reply, latency: float) -> Reading:
@@ -266,7 +304,7 @@ class AsyncObcClient:
             values = row.decode(reply.data)
         except ProtocolError as error:
             raise BadReplyError(str(error)) from None
-        return Reading(row.name, values, latency, time.time())
+        return Reading(row.name, values, latency, time.time(), time.monotonic())
 
 
 _ANSWERS: Final = {

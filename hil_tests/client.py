@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Coroutine, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -142,10 +143,13 @@ class ObcClient:
         *,
         timeout_s: float | None = None,
         retries: int | None = None,
+        checked: bool = True,
         **fields: Value,
     ) -> Ack:
-        """Send a telecommand and wait for its acknowledge."""
-        return self.run(self.core.command(name, values, timeout_s=timeout_s, retries=retries, **fields))
+        """Send a telecommand and wait for its acknowledge; `checked=False` sends values outside their limits too."""
+        return self.run(
+            self.core.command(name, values, timeout_s=timeout_s, retries=retries, checked=checked, **fields)
+        )
 
     def request(self, identifier: int, data: bytes = b"", *, timeout_s: float | None = None) -> Reply:
         """Send a request by number with parameters as they stand; return the reply to it."""
@@ -154,9 +158,9 @@ class ObcClient:
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
         return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
 
-    def set_parameter(self, name: str, value: Value) -> Ack:
-        """Set a parameter by name, in its own unit."""
-        return self.run(self.core.set_parameter(name, value))
+    def set_parameter(self, name: str, value: Value, *, checked: bool = True) -> Ack:
+        """Set a parameter by name, in its own unit; `checked=False` sends a value outside its limits too."""
+        return self.run(self.core.set_parameter(name, value, checked=checked))
 
     def get_parameter(self, name: str) -> Value:
         """Return the value of a parameter in its own type."""
@@ -168,9 +172,11 @@ class ObcClient:
         """Read a row until the condition holds."""
         return self.run(self.core.wait_for(name, condition, within_s=within_s, every_s=every_s))
 
-    def wait_unsolicited(self, name: str, *, timeout_s: float | None = None) -> Reading:
-        """Return the next unsolicited telemetry of a row."""
-        return self.run(self.core.wait_unsolicited(name, timeout_s=timeout_s))
+    def wait_unsolicited(
+        self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
+    ) -> Reading:
+        """Return the next unsolicited telemetry of a row received after a time on `time.monotonic`."""
+        return self.run(self.core.wait_unsolicited(name, timeout_s=timeout_s, since_s=since_s))
 
     def download_image(
         self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0

@@ -19,6 +19,9 @@ from hil_tests.errors import EmulatorProcessError
 
 STARHIL: Final = "from emulator.cli.app import main; main()"
 """What the command `starhil` does, for a Python whose script folder is not known."""
+_ENDS_WITH_PARENT: Final = (
+    "from emulator.parent_death_signal import end_with_parent; end_with_parent({}, {:d}); "
+)
 READY_WITHIN_S: Final = 300.0
 """A first start on a machine compiles for minutes; a warm one takes about 3 s."""
 STOP_WITHIN_S: Final = 15.0
@@ -37,8 +40,8 @@ def emulator_command(
     truth_log: Path | None = None,
     extra: Sequence[str] = (),
 ) -> list[str]:
-    """Return the command line that starts the emulator with this very Python."""
-    command = [sys.executable, "-c", STARHIL, "run"]
+    """Return the command line that starts the emulator with this very Python, to end with this process."""
+    command = [*_starhil_command(), "run"]
     if profile is not None:
         command.append(profile)
     command += ["--serial", serial, "--can", can]
@@ -54,9 +57,15 @@ def emulator_command(
 
 
 def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
-    """Return the command line that starts a CAN hub, at a free port by default, with this very Python."""
-    command = [sys.executable, "-c", STARHIL, "hub", "--port", str(port)]
+    """Return the command line that starts a CAN hub, at a free port by default, to end with this process."""
+    command = [*_starhil_command(), "hub", "--port", str(port)]
     return command if log is None else [*command, "--log", str(log)]
+
+
+def _starhil_command() -> list[str]:
+    """Return the command `starhil` of this very Python, which the kernel ends by SIGTERM when this process has ended."""
+    code = _ENDS_WITH_PARENT.format(os.getpid(), signal.SIGTERM) + STARHIL
+    return [sys.executable, "-c", code]
 
 
 def parse_ready_line(line: str) -> dict[str, str]:
@@ -74,7 +83,7 @@ def parse_ready_line(line: str) -> dict[str, str]:
 
 
 class EmulatorProcess:
-    """A running emulator.
+    """A running emulator. One that `emulator_command` starts also ends with the thread that called `start`.
 
     Parameters
     ----------
@@ -139,7 +148,9 @@ class EmulatorProcess:
             reader.start()
         try:
             self.ready = self._wait_for_ready(begin + self._ready_within_s)
-        except EmulatorProcessError:
+        except (
+            BaseException
+        ):  # an interruption too: the process has a session of its own and no signal reaches it
             self.kill()
             raise
         return self

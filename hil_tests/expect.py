@@ -24,6 +24,9 @@ from protocol.values import Value
 RELATIVE_ROUNDING: Final = 1e-6
 """Numbers given without a tolerance may differ by the rounding of a 32-bit float."""
 
+WHOLE_DIGITS: Final = 1e4
+"""Numbers from here on are shown with six decimals, as ten digits would cut the fraction of a Unix time off."""
+
 CLOCK_VARIABLES: Final = ("now", "now_s", "now_ms")
 """Variables that every script has: the OBC's Unix time in seconds; its whole seconds; its milliseconds."""
 
@@ -63,7 +66,7 @@ def show(value: Value) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
-        return f"{value:.10g}"
+        return f"{value:.10g}" if abs(value) < WHOLE_DIGITS else f"{value:.6f}".rstrip("0").rstrip(".")
     if isinstance(value, bytes):
         return (
             value.hex(" ").upper()

@@ -27,6 +27,8 @@ class Reading:
     """As that of an acknowledge; 0 for unsolicited telemetry."""
     received_unix_s: float
     """OBC's clock when it came, seconds since 1970-01-01 UTC."""
+    received_s: float
+    """The same on `time.monotonic`, which nobody sets: for intervals."""
 
     def __getitem__(self, field: str) -> Value:
         """Return the value of a field."""

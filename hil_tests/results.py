@@ -13,11 +13,14 @@ from xml.etree import ElementTree as ET
 
 from hil_tests.errors import BenchError
 from hil_tests.expect import show
+from hil_tests.interruption import Interrupted
 from protocol.values import Value
 
 PASSED: Final = "passed"
 FAILED: Final = "failed"
 SKIPPED: Final = "skipped"
+NOT_RUN: Final = "not run"
+"""Of a case that a run did not come to; a JUnit file has it as skipped."""
 SHOWN_VALUES: Final = 6
 """Values of a row that the one line of a step shows."""
 
@@ -77,6 +80,8 @@ class SessionResult:
     title: str
     results: tuple[StepResult, ...]
     seconds: float
+    interruption: Interrupted | None = None
+    """The signal that ended it before its last step."""
 
     def count(self, status: str) -> int:
         """Return how many steps ended with a status."""
@@ -84,14 +89,15 @@ class SessionResult:
 
     @property
     def passed(self) -> bool:
-        """Whether no step failed and at least one passed."""
-        return self.count(FAILED) == 0 and self.count(PASSED) > 0
+        """Whether it ran to its end, no step failed and at least one passed."""
+        return self.interruption is None and self.count(FAILED) == 0 and self.count(PASSED) > 0
 
     def to_json(self) -> dict[str, Any]:
         """Return the whole as JSON takes it."""
         return {
             "title": self.title,
             "passed": self.passed,
+            "interrupted": self.interruption is not None,
             "steps": len(self.results),
             "failed": self.count(FAILED),
             "skipped": self.count(SKIPPED),
@@ -163,7 +169,7 @@ def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float
         "tests": len(cases),
         "failures": sum(case.status == FAILED for case in cases),
         "errors": 0,
-        "skipped": sum(case.status == SKIPPED for case in cases),
+        "skipped": sum(case.status in (SKIPPED, NOT_RUN) for case in cases),
     }
     attributes = {
         "name": name,
@@ -181,7 +187,7 @@ def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float
         if case.status == FAILED:
             failure = ET.SubElement(item, "failure", {"message": _printable(case.detail)})
             failure.text = _printable(case.detail)
-        elif case.status == SKIPPED:
+        elif case.status in (SKIPPED, NOT_RUN):
             ET.SubElement(item, "skipped", {"message": _printable(case.detail)})
         if case.output:
             ET.SubElement(item, "system-out").text = _printable(case.output)

@@ -13,6 +13,7 @@ from hil_tests.bench import Bench
 from hil_tests.client import ObcClient
 from hil_tests.errors import BenchError, NackError
 from hil_tests.expect import resolve, show
+from hil_tests.interruption import Interrupted
 from hil_tests.png import write_png
 from hil_tests.raw_exchange import matches, pattern, send_and_listen
 from hil_tests.readings import Reading
@@ -36,6 +37,7 @@ from protocol.errors import ProtocolError
 from protocol.values import Value
 
 MS_PER_S: Final = 1e3
+CLOCK_GRAIN_S: Final = 1e-6
 
 
 @dataclass
@@ -103,17 +105,24 @@ class SessionRunner:
         """Run all steps; after a failed one the rest is skipped unless the script says `keep_going`."""
         begin = time.monotonic()
         results: list[StepResult] = []
-        failed = False
+        reason = ""
+        interruption = None
         for step in self._script.steps:
             for link in self._links_of(step):
-                if failed and not self._script.keep_going:
-                    result = StepResult(step.number, step.name, link, SKIPPED, "an earlier step failed", 0.0)
+                if reason:
+                    result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
                 else:
-                    result = self._step(step, link)
-                failed = failed or result.status == FAILED
+                    try:
+                        result = self._step(step, link)
+                    except Interrupted as signalled:
+                        interruption = signalled
+                        reason = f"not run: {signalled.reason}"
+                        result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
+                if result.status == FAILED and not self._script.keep_going:
+                    reason = "an earlier step failed"
                 results.append(result)
                 self._on_result(result)
-        return SessionResult(self._script.title, tuple(results), time.monotonic() - begin)
+        return SessionResult(self._script.title, tuple(results), time.monotonic() - begin, interruption)
 
     def _links_of(self, step: Step) -> tuple[str, ...]:
         if isinstance(step.action, Wait | Restart):
@@ -174,8 +183,7 @@ class SessionRunner:
             return Outcome(problem=str(error))
         limit = step.max_latency_s
         if outcome.problem is None and limit is not None and (outcome.latency_s or 0.0) > limit:
-            seen = (outcome.latency_s or 0.0) * MS_PER_S
-            outcome.problem = f"latency {seen:.1f} ms, expected at most {limit * MS_PER_S:g} ms"
+            outcome.problem = f"latency {outcome.latency_s or 0.0:.4f} s, expected at most {limit:g} s"
         if outcome.problem is None:
             self._captured.update({name: outcome.values[key] for name, key in step.capture.items()})
         return outcome
@@ -229,21 +237,14 @@ class SessionRunner:
     def _set_parameter(self, step: Step, action: SetParameter, client: ObcClient) -> Outcome:
         parameter = action.parameter
         value = resolve(action.value, self._variables())
-        number = (
-            float(value)
-            if action.refused is not None and not isinstance(value, str)
-            else parameter.to_number(value)
+        request = client.core.set_parameter(
+            parameter.name,
+            value,
+            timeout_s=step.timeout_s,
+            retries=step.retries,
+            checked=action.refused is None,
         )
-        row = client.icd.telecommands["set_parameter"]
-        data = row.encode({"parameter": parameter.id, "value": number}, check=False)
-        outcome = self._refusable(
-            lambda: (
-                client.run(
-                    client.core.command_raw(row.name, data, timeout_s=step.timeout_s, retries=step.retries)
-                ).latency_s
-            ),
-            action.refused,
-        )
+        outcome = self._refusable(lambda: client.run(request).latency_s, action.refused)
         if outcome.problem is None and action.refused is None:
             seen = client.get_parameter(parameter.name)
             wanted = parameter.check(value)
@@ -284,16 +285,18 @@ class SessionRunner:
 
     def _listen(self, step: Step, action: Listen, client: ObcClient) -> Outcome:
         outcome = Outcome()
-        begin = time.monotonic()
+        times = [time.monotonic()]
         for _ in range(action.count):
             reading = client.wait_unsolicited(
-                action.row.name, timeout_s=step.timeout_s or self._script.timeout_s
+                action.row.name, timeout_s=step.timeout_s or self._script.timeout_s, since_s=times[0]
             )
+            times.append(reading.received_s)
             outcome = self._judge(step, reading)
             if outcome.problem is not None:
                 return outcome
         outcome.latency_s = None
-        outcome.figures["rate_hz"] = action.count / max(time.monotonic() - begin, 1e-9)
+        if action.count > 1:  # between the readings themselves; the wait for the first one is of no meaning
+            outcome.figures["rate_hz"] = (action.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
         return outcome
 
     def _sample(self, step: Step, action: Sample, client: ObcClient) -> Outcome:

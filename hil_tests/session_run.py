@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 from rich.console import Console
@@ -15,6 +14,7 @@ from rich.text import Text
 from hil_tests.bench import Bench, LinkOptions
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
+from hil_tests.interruption import Interrupted
 from hil_tests.own_hub import OwnBus
 from hil_tests.results import (
     FAILED,
@@ -26,9 +26,10 @@ from hil_tests.results import (
     prepare_report,
     write_junit,
 )
+from hil_tests.scratch import scratch_folder
 from hil_tests.script import load_script
 from hil_tests.script_model import Script
-from hil_tests.session import MS_PER_S, SessionRunner
+from hil_tests.session import SessionRunner
 from protocol.icd import load_icd
 from protocol.serial_framing import Dialect
 
@@ -101,7 +102,7 @@ def run_session(request: SessionRequest) -> SessionResult:
             if request.start:
                 if options.can == "auto":
                     options = replace(options, can=stack.enter_context(OwnBus()))
-                state = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-session-")))
+                state = stack.enter_context(scratch_folder("starhil-session-"))
                 emulator = _emulator(request, script, options, folder, state)
             bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
             for link in bench.links:
@@ -115,6 +116,10 @@ def run_session(request: SessionRequest) -> SessionResult:
         )
         show(end)
         result = replace(result, results=(*result.results, end))
+    except Interrupted as interruption:  # before the first step
+        reason = f"not run: {interruption.reason}"
+        skipped = tuple(StepResult(step.number, step.name, "", SKIPPED, reason, 0.0) for step in script.steps)
+        result = SessionResult(script.title, skipped, 0.0, interruption)
     if request.junit is not None:
         write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
     if not request.quiet:
@@ -172,7 +177,7 @@ def _printer(*, quiet: bool) -> Callable[[StepResult], None]:
         if result.link:
             line.append(f"  [{result.link}]", style="dim")
         if result.latency_s is not None:
-            line.append(f"  {result.latency_s * MS_PER_S:.1f} ms", style="cyan")
+            line.append(f"  {result.latency_s:.4f} s", style="cyan")
         if result.detail:
             line.append(f"  {result.detail}", style="red" if result.status == FAILED else "dim")
         console.print(line, soft_wrap=True)

@@ -2,13 +2,17 @@
 
 Numba's own cache compares only the file of the function itself: after a change to a kernel that it calls in
 another module, it would go on running the old machine code. So every cache index is stamped with the
-contents of all modules of the project that the function's module imports, directly or not.
+contents of all modules of the project that the function's module imports, directly or not. And Numba runs
+whatever it finds in its files: here each begins with a checksum of the rest, and a damaged one is removed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib
+import io
+import logging
+import pickle
 import re
 import sys
 from collections.abc import Callable
@@ -17,8 +21,13 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 from numba import njit
+from numba.core import caching
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
+
+_log = logging.getLogger(__name__)
+
+_NumbaCacheFile: Any = caching.IndexDataCacheFile
 
 _IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
 
@@ -54,10 +63,62 @@ def stamped(dispatcher: Any) -> Any:
     dispatcher : numba dispatcher
         From ``njit(cache=True, …)``; returned as it is where numba keeps no cache for it.
     """
-    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if cache_file is not None and hasattr(cache_file, "_source_stamp"):
-        cache_file._source_stamp = source_stamp(dispatcher.py_func.__module__)  # noqa: SLF001
+    cache: Any = getattr(dispatcher, "_cache", None)
+    if isinstance(getattr(cache, "_cache_file", None), caching.IndexDataCacheFile):
+        stamp = source_stamp(dispatcher.py_func.__module__)
+        base = cache._impl.filename_base  # noqa: SLF001
+        cache._cache_file = VerifiedCacheFile(cache.cache_path, base, stamp)  # noqa: SLF001
     return dispatcher
+
+
+class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
+    """Numba's cache files of one function, each with a checksum: what is damaged is removed and compiled again.
+
+    A file that cannot be written is reported in the log, and the function is compiled in each process.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep the machine code of a signature."""
+        try:
+            super().save(key, data)
+        except OSError as error:
+            _log.warning("%s: machine code cannot be kept (%s): compiled each time", self._index_path, error)
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            stream = io.BytesIO(self._read(Path(self._index_path)))
+        except FileNotFoundError:
+            return {}
+        if pickle.load(stream) != self._version:  # noqa: S301 (of this package's own cache, as all below)
+            return {}  # the rest may not even be readable
+        stamp, overloads = pickle.load(stream)  # noqa: S301
+        return overloads if stamp == self._source_stamp else {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        self._write(
+            self._index_path, pickle.dumps(self._version) + self._dump((self._source_stamp, overloads))
+        )
+
+    def _load_data(self, name: str) -> Any:
+        return pickle.loads(self._read(Path(self._data_path(name))))  # noqa: S301
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(self._data_path(name), self._dump(data))
+
+    def _write(self, path: str, content: bytes) -> None:
+        with self._open_for_write(path) as stream:
+            stream.write(hashlib.sha256(content).digest() + content)
+
+    @staticmethod
+    def _read(path: Path) -> bytes:
+        """Return the content of a file; one whose checksum is wrong is removed and counts as missing."""
+        data = path.read_bytes()
+        size = hashlib.sha256().digest_size
+        if hashlib.sha256(data[size:]).digest() != data[:size]:
+            _log.warning("%s: damaged, removed; compiled again", path)
+            path.unlink(missing_ok=True)
+            raise FileNotFoundError(path)
+        return data[size:]
 
 
 @cache

@@ -39,6 +39,7 @@ COMMANDS: Final[dict[str, str]] = {
     "features": "features",
     "database": "database",
     "reproduce": "reproduce",
+    "cache": "cache",
 }
 """Sub-command → module under `emulator.cli`: its `command` function, or its `group` of sub-commands.
 

@@ -51,7 +51,12 @@ def command(
         Path | None, typer.Option(help="Write a page with all that was sent, expected and seen.")
     ] = None,
     dialect: Annotated[str, typer.Option(help="Form of serial replies: a, b or c.")] = "b",
-    baud: Annotated[int | None, typer.Option(help="Bit rate of the serial line.")] = None,
+    baud: Annotated[
+        int | None,
+        typer.Option(
+            help="Bit rate of the serial line; without it the port is opened at 115200 and the pace of replies is not checked."
+        ),
+    ] = None,
     host_address: Annotated[int, typer.Option(help="CAN address of the tester.")] = 1,
     device_address: Annotated[int, typer.Option(help="CAN address of the device.")] = 4,
     time_out: Annotated[float, typer.Option(min=0.01, help="Longest time for an answer, s.")] = 1.0,
@@ -59,6 +64,9 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Run conformance cases; exit status 0 none failed, 1 some failed, 2 refused.
+
+    Settings that cases change are noted before and put back at the end, also after SIGINT, SIGTERM or SIGHUP, which leave
+    the other cases as not run in the reports (exit status 128 and the number of the signal).
 
     Each case has an identifier, the clause or source that it checks, and what was sent, expected and seen.
     """
@@ -68,6 +76,7 @@ def command(
     from hil_tests.conformance.conformance_run import ConformanceRequest, all_cases, run_conformance
     from hil_tests.conformance.link_probe import ProbeTimes
     from hil_tests.errors import BenchError
+    from hil_tests.interruption import interruptible
     from hil_tests.results import prepare_report
     from protocol.icd import load_icd
 
@@ -104,22 +113,26 @@ def command(
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    outcomes = run_conformance(
-        request, lambda outcome: report.print_outcome(console, outcome, verbose=verbose)
-    )
     words = (
         serial and f"serial {serial} (dialect {dialect})",
         can and f"CAN {can}",
         canopen and f"CANopen node {canopen}",
     )
     unit = ", ".join(word for word in words if word) + (", emulator started for this run" if start else "")
-    if junit is not None:
-        report.write_junit_report(junit, outcomes)
-    if html is not None:
-        report.write_html_report(html, outcomes, unit)
+    with interruptible():
+        result = run_conformance(
+            request, lambda outcome: report.print_outcome(console, outcome, verbose=verbose)
+        )
+        outcomes = result.outcomes
+        if junit is not None:
+            report.write_junit_report(junit, outcomes)
+        if html is not None:
+            report.write_html_report(html, outcomes, unit)
     if as_json:
         json.dump(report.to_json(outcomes, unit), sys.stdout)
         print()
     else:
         report.print_summary(console, outcomes)
+    if result.interruption is not None:
+        raise typer.Exit(result.interruption.exit_status)
     raise typer.Exit(1 if report.count(outcomes, "failed") else 0)

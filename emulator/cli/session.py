@@ -43,8 +43,13 @@ def command(
         bool, typer.Option("--json", help="Print one JSON object instead of the steps.")
     ] = False,
 ) -> None:
-    """Run a session script step by step; exit status 0 all as expected, 1 a step failed, 2 refused."""
+    """Run a session script step by step; exit status 0 all as expected, 1 a step failed, 2 refused.
+
+    SIGINT, SIGTERM and SIGHUP end it and the emulator that it started; the steps left are reported as not run (exit
+    status 128 and the number of the signal).
+    """
     from hil_tests.bench import LinkOptions
+    from hil_tests.interruption import interruptible
     from hil_tests.session_run import SessionRequest, run_session
 
     options = LinkOptions(
@@ -55,20 +60,22 @@ def command(
         host_address=host_address,
         device_address=device_address,
     )
-    result = run_session(
-        SessionRequest(
-            script=script,
-            options=options,
-            start=start,
-            profile=profile,
-            folder=log,
-            junit=junit,
-            truth=truth,
-            keep_going=keep_going,
-            quiet=as_json,
-        )
+    request = SessionRequest(
+        script=script,
+        options=options,
+        start=start,
+        profile=profile,
+        folder=log,
+        junit=junit,
+        truth=truth,
+        keep_going=keep_going,
+        quiet=as_json,
     )
+    with interruptible():
+        result = run_session(request)
     if as_json:
         json.dump(result.to_json(), sys.stdout)
         print()
+    if result.interruption is not None:
+        raise typer.Exit(result.interruption.exit_status)
     raise typer.Exit(0 if result.passed else 1)

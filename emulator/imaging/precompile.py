@@ -10,7 +10,7 @@ import subprocess
 import sys
 from typing import Any
 
-from emulator.imaging.parenthood import end_with_parent
+from emulator.parent_death_signal import end_with_parent
 from starid.projection import back_project_kernel
 
 

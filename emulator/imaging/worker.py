@@ -10,7 +10,7 @@ import sys
 from typing import Any, Final
 
 from emulator.imaging.frames import LENGTH, Failure
-from emulator.imaging.parenthood import end_with_parent
+from emulator.parent_death_signal import end_with_parent
 
 NICE: Final = 5
 """How much the worker stands back where processors are short: the links of the emulator come first."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
-from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal, rule
 from hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
+from hil_tests.conformance.unit_settings import save_parameters
 
 ACKNOWLEDGE: Final = "CubeComputer TLM 240: last telecommand, processed, error, index (AlbertaSat, CTS)"
 COUNTERS: Final = "CubeComputer TLM 144: counts of telecommands and telemetry (AlbertaSat, CTS)"
 CLOCK: Final = "CubeComputer TC 2 and TLM 140 (AlbertaSat, CTS)"
 RESET: Final = "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)"
 HOLE_MAP: Final = "CubeComputer TC 120 to 127 and TLM 247 to 254 (AlbertaSat, CTS)"
-OURS: Final = "rule of this product (docs of the interface definition)"
 
 CLOCK_STEP_S: Final = 1_700_000_000
 CLOCK_TOLERANCE_S: Final = 0.25
@@ -201,18 +203,23 @@ def _clock(probe: LinkProbe) -> float:
 @case(_CASES, "time.set", "the clock is what it was set to", CLOCK, intrusive=True)
 def time_set(probe: LinkProbe) -> None:
     """Seconds and milliseconds, with bytes that have to be stuffed; the clock is put back afterwards."""
+    with _kept_clock(probe):
+        for seconds, milliseconds in ((CLOCK_STEP_S, 250), (0x1F1F1F1F, 31), (0, 0), (0xFFFFFFF0, 999)):
+            probe.command("set_unix_time", seconds=seconds, milliseconds=milliseconds)
+            wanted = seconds + milliseconds / 1000.0
+            seen = _clock(probe)
+            check(0.0 <= seen - wanted <= CLOCK_TOLERANCE_S, f"clock from {wanted:.3f} on", f"{seen:.3f}")
+
+
+@contextmanager
+def _kept_clock(probe: LinkProbe) -> Iterator[None]:
+    """Put the clock back to what it would be, whatever happens."""
     before, began = _clock(probe), probe.now()
-    for seconds, milliseconds in ((CLOCK_STEP_S, 250), (0x1F1F1F1F, 31), (0, 0), (0xFFFFFFF0, 999)):
-        probe.command("set_unix_time", seconds=seconds, milliseconds=milliseconds)
-        wanted = seconds + milliseconds / 1000.0
-        seen = _clock(probe)
-        check(0.0 <= seen - wanted <= CLOCK_TOLERANCE_S, f"clock from {wanted:.3f} on", f"{seen:.3f}")
-    _put_back(probe, before, began)
-
-
-def _put_back(probe: LinkProbe, before: float, began: float) -> None:
-    whole = before + probe.now() - began
-    probe.command("set_unix_time", seconds=int(whole), milliseconds=int(whole % 1.0 * 1000))
+    try:
+        yield
+    finally:
+        whole = before + probe.now() - began
+        probe.command("set_unix_time", seconds=int(whole), milliseconds=int(whole % 1.0 * 1000))
 
 
 @case(_CASES, "time.runs", "the clock runs as fast as the tester's", CLOCK)
@@ -235,16 +242,15 @@ def time_runs(probe: LinkProbe) -> None:
 )
 def time_flag(probe: LinkProbe) -> None:
     """The two rows agree."""
-    before, began = _clock(probe), probe.now()
-    probe.command("set_unix_time", seconds=CLOCK_STEP_S, milliseconds=0)
-    status = probe.telemetry("device_status")
+    with _kept_clock(probe):
+        probe.command("set_unix_time", seconds=CLOCK_STEP_S, milliseconds=0)
+        status = probe.telemetry("device_status")
     check(status["time_set"], "flag time_set", "not set")
     check(
         0.0 <= float(status["clock"]) - CLOCK_STEP_S <= CLOCK_TOLERANCE_S,
         f"clock from {CLOCK_STEP_S} on",
         status["clock"],
     )
-    _put_back(probe, before, began)
 
 
 @case(_CASES, "time.uptime", "runtime and uptime agree and grow", RESET)
@@ -266,7 +272,11 @@ def uptime(probe: LinkProbe) -> None:
 
 
 @case(
-    _CASES, "modes.standby", "in standby no attitude is valid, and the rows agree on it", OURS, intrusive=True
+    _CASES,
+    "modes.standby",
+    "in standby no attitude is valid, and the rows agree on it",
+    rule(11),
+    intrusive=True,
 )
 def standby(probe: LinkProbe) -> None:
     """precise_attitude, device_status, star_performance_2."""
@@ -282,13 +292,14 @@ def standby(probe: LinkProbe) -> None:
     _CASES,
     "modes.frames",
     "out of standby frames are made at the update rate, in standby none",
-    OURS,
+    rule(12),
     intrusive=True,
 )
 def frames(probe: LinkProbe) -> None:
-    """Two seconds at 5 Hz, with or without stars."""
+    """Two seconds at 5 Hz, with or without stars; the exposure must leave room for that rate."""
     probe.standby()
-    with probe.kept("update_rate"):
+    with probe.kept("update_rate", "exposure"):
+        probe.set_parameter("exposure", 50.0)
         probe.set_parameter("update_rate", 5.0)
         probe.command("set_mode", mode="lost_in_space")
         probe.sleep(0.6)
@@ -303,7 +314,7 @@ def frames(probe: LinkProbe) -> None:
         check_equal(int(probe.telemetry("device_status")["frames_captured"]), first, "frames in standby")
 
 
-@case(_CASES, "modes.changes", "mode and its counter follow the command", OURS, intrusive=True)
+@case(_CASES, "modes.changes", "mode and its counter follow the command", rule(13), intrusive=True)
 def changes(probe: LinkProbe) -> None:
     """Standby to lost in space and back."""
     probe.standby()
@@ -325,7 +336,7 @@ def changes(probe: LinkProbe) -> None:
     _CASES,
     "modes.no-tracking",
     "tracking without an attitude to start from is refused with code 7",
-    OURS,
+    rule(14),
     intrusive=True,
 )
 def no_tracking(probe: LinkProbe) -> None:
@@ -340,7 +351,7 @@ def no_tracking(probe: LinkProbe) -> None:
     _CASES,
     "modes.attitude",
     "with stars in view: valid, of unit length, its time just past, all rows agree",
-    OURS,
+    rule(15),
     intrusive=True,
 )
 def attitude(probe: LinkProbe) -> None:
@@ -409,7 +420,7 @@ def reset_acknowledged(probe: LinkProbe) -> None:
     _CASES,
     "store.reset",
     "a parameter that is not saved is lost at a reset, a saved one is kept",
-    OURS,
+    rule(16),
     intrusive=True,
 )
 def store_reset(probe: LinkProbe) -> None:
@@ -417,28 +428,21 @@ def store_reset(probe: LinkProbe) -> None:
     before = float(probe.parameter("exposure")["value"])
     probe.set_parameter("exposure", TEST_VALUE)
     probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
-    _save(probe)
+    save_parameters(probe)
     probe.set_parameter("exposure", TEST_VALUE + 1)
     probe.reset()
     try:
         check_equal(float(probe.parameter("exposure")["value"]), TEST_VALUE, "saved exposure")
     finally:
         probe.set_parameter("exposure", before)
-        _save(probe)
+        save_parameters(probe)
 
 
-def _save(probe: LinkProbe) -> None:
-    probe.command("save_parameters")
-    seen = probe.wait_for("acknowledge", {"processed": True}, 5.0)
-    check_equal(seen["error"], "ok", "result of save_parameters")
-    probe.wait_for("device_status", {"parameters_changed": False}, 2.0)
-
-
-@case(_CASES, "store.restore", "restore_parameters brings back what is stored", OURS, intrusive=True)
+@case(_CASES, "store.restore", "restore_parameters brings back what is stored", rule(17), intrusive=True)
 def store_restore(probe: LinkProbe) -> None:
     """Without a reset."""
     before = float(probe.parameter("exposure")["value"])
-    _save(probe)
+    save_parameters(probe)
     probe.set_parameter("exposure", TEST_VALUE)
     probe.command("restore_parameters")
     check_equal(float(probe.parameter("exposure")["value"]), before, "exposure")
@@ -448,22 +452,22 @@ def store_restore(probe: LinkProbe) -> None:
     _CASES,
     "store.defaults",
     "default_parameters sets the defaults and leaves the store as it is",
-    OURS,
+    rule(18),
     intrusive=True,
 )
 def store_defaults(probe: LinkProbe) -> None:
     """Restored afterwards."""
-    _save(probe)
+    save_parameters(probe)
     stored = float(probe.parameter("limiting_magnitude")["value"])
     probe.set_parameter("limiting_magnitude", 4.25)
-    _save(probe)
+    save_parameters(probe)
     probe.command("default_parameters")
     seen = probe.parameter("limiting_magnitude")
     check_equal(seen["value"], seen["default"], "limiting_magnitude")
     probe.command("restore_parameters")
     check_equal(float(probe.parameter("limiting_magnitude")["value"]), 4.25, "stored limiting_magnitude")
     probe.set_parameter("limiting_magnitude", stored)
-    _save(probe)
+    save_parameters(probe)
 
 
 @case(

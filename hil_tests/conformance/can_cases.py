@@ -12,7 +12,7 @@ from hil_tests.conformance.can_probe import (
     identifier_of,
     segments,
 )
-from hil_tests.conformance.case import Case, case, check, check_equal
+from hil_tests.conformance.case import Case, case, check, check_equal, rule
 from hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
 from hil_tests.errors import BenchError
 from hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
@@ -21,7 +21,6 @@ from protocol.can_framing import CanFrame
 LAYOUT: Final = "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
 TYPES: Final = "message types 0 to 12 (libCubeObc)"
 SEGMENTS: Final = "more than 8 bytes: 7 and a counter down to 0, no padding (libCubeObc)"
-OURS: Final = "rule of this product (docs of the interface definition)"
 ERRORS: Final = "configs/icd: communication_status 144, flag can_telecommand_error"
 
 LONG_PAUSE_S: Final = 0.8
@@ -54,14 +53,14 @@ EXCHANGES: Final = (
     Exchange("telemetry", "a request of telemetry is answered with type 5, addresses exchanged", LAYOUT, ("0480HHDD#",), ("0580DDHH#................",)),
     Exchange("telemetry-6", "telemetry of 6 bytes has 6 bytes, no padding", LAYOUT, ("04E6HHDD#",), ("05E6DDHH#............",)),
     Exchange("unknown-telemetry", "an unknown telemetry identifier is refused with type 6 and the code", TYPES, ("04C8HHDD#",), ("06C8DDHH#01",)),
-    Exchange("request-with-data", "a request of telemetry with data is refused for its length", OURS, ("0480HHDD#00",), ("0680DDHH#02",)),
+    Exchange("request-with-data", "a request of telemetry with data is refused for its length", rule(5), ("0480HHDD#00",), ("0680DDHH#02",)),
     Exchange("other-device", "a frame for another address is not answered", LAYOUT, ("0480HHFE#",), ()),
     Exchange("other-device-zero", "a frame for address 0 is not answered", LAYOUT, ("0480HH00#",), ()),
     Exchange("standard", "a frame with an 11-bit identifier is not answered", LAYOUT, ("480#", "604#"), ()),
     Exchange("remote", "a remote frame is not answered", LAYOUT, ("0480HHDD#R",), ()),
     *(Exchange(f"type-{kind}", f"{words} is not answered", TYPES, (f"{kind:02X}80HHDD#00",), ()) for kind, words in IGNORED),
-    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", OURS, ("0180HHDD#",), ()),
-    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", OURS, ("0402HHDD#",), ()),
+    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", rule(6), ("0180HHDD#",), ()),
+    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", rule(6), ("0402HHDD#",), ()),
     Exchange("two-at-once", "two requests back to back are answered in order", LAYOUT, ("0480HHDD#", "04E6HHDD#"), ("0580DDHH#................", "05E6DDHH#............")),
 )  # fmt: skip
 
@@ -72,7 +71,7 @@ INTRUSIVE_EXCHANGES: Final = (
     Exchange("short-telecommand", "a telecommand that is too short is refused with code 2", TYPES, ("0102HHDD#0102",), ("0302DDHH#02",)),
     Exchange("long-telecommand", "a telecommand that is too long is refused with code 2", TYPES, ("0167HHDD#00",), ("0367DDHH#02",)),
     Exchange("eight", "a telecommand of 8 bytes goes in one frame", SEGMENTS, ("0170HHDD#0200000000000100",), ("0370DDHH#03",)),
-    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", OURS, ("0770HHDD#0200000000000101", "0770HHDD#0000"), ("0370DDHH#03",)),
+    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", rule(7), ("0770HHDD#0200000000000101", "0770HHDD#0000"), ("0370DDHH#03",)),
     Exchange("segmented-unknown", "an unknown telecommand in segments is refused once, after the last", SEGMENTS, ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B00"), ("033CDDHH#01",)),
     Exchange("segmented-full-last", "the last segment may hold 7 bytes", SEGMENTS, ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B0C0D00"), ("033CDDHH#01",)),
 )  # fmt: skip
@@ -160,7 +159,7 @@ def all_rows(probe: CanProbe) -> None:
     _CASES,
     "unsolicited.segments",
     "a long row comes unsolicited as first, body and last, counters down to 0",
-    "types 10 to 12 (libCubeObc), use ours",
+    "types 10 to 12 (libCubeObc); their use: R20, docs/rules.md",
     intrusive=True,
 )
 def unsolicited_segments(probe: CanProbe) -> None:
@@ -258,7 +257,7 @@ def empty_segment(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.half", "half a message is given up after a while", OURS, intrusive=True)
+@case(_CASES, "segments.half", "half a message is given up after a while", rule(2), intrusive=True)
 def half_message(probe: CanProbe) -> None:
     """The last segment, when it comes too late, has no effect (two of them would be a message of their own)."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
@@ -270,7 +269,7 @@ def half_message(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.pause", "a pause of 0.1 s between segments does no harm", OURS, intrusive=True)
+@case(_CASES, "segments.pause", "a pause of 0.1 s between segments does no harm", rule(1), intrusive=True)
 def pause_between(probe: CanProbe) -> None:
     """As slow hosts send."""
     for frame in _segment_frames(probe, UNKNOWN, LONG):
@@ -279,7 +278,7 @@ def pause_between(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.anew", "a message may begin anew before it was ended", OURS, intrusive=True)
+@case(_CASES, "segments.anew", "a message may begin anew before it was ended", rule(8), intrusive=True)
 def begun_anew(probe: CanProbe) -> None:
     """Two segments, then all of them."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
@@ -317,7 +316,7 @@ def request_between(probe: CanProbe) -> None:
     _CASES,
     "segments.overlong",
     "a message that is too long has no effect, the next one has",
-    OURS,
+    rule(4),
     intrusive=True,
 )
 def overlong(probe: CanProbe) -> None:
@@ -332,7 +331,7 @@ def overlong(probe: CanProbe) -> None:
     _CASES,
     "segments.long",
     "a message of 500 bytes is taken and refused for its length",
-    OURS,
+    rule(4),
     intrusive=True,
 )
 def long_message(probe: CanProbe) -> None:
@@ -401,7 +400,7 @@ def no_flag(probe: CanProbe) -> None:
 # --- time ---
 
 
-@case(_CASES, "timing.burst", "two hundred requests back to back are all answered", OURS)
+@case(_CASES, "timing.burst", "two hundred requests back to back are all answered", rule(10))
 def many_at_once(probe: CanProbe) -> None:
     """In order, none lost."""
     identifier = identifier_of(TELEMETRY_REQUEST, IDENTIFICATION, probe.host, probe.device)

@@ -22,6 +22,10 @@ PRE_OPERATIONAL: Final = 128
 RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
+BOOT_S: Final = 3.0
+"""Longest time from a reset of the communication to the boot-up message."""
+FIRST_OWN_OBJECT: Final = 0x2000
+
 NOBODY: Final = -1
 """No identifier: waiting for it lets time pass."""
 SETTLING_S: Final = 0.05
@@ -102,6 +106,54 @@ class CanopenProbe:
         self.log: list[str] = []
         self._boots = True
         self._multiplexer = bytes(3)
+        self._found: dict[tuple[int, int], bytes] = {}
+
+    # Around a run
+
+    def silence(self, *, booting: bool) -> str | None:
+        """Return `nothing` if the node answers no reading of its device type, None if it does.
+
+        A node that may be booting or stopped is asked again, with its boot-up message as an answer too.
+        """
+        if booting:
+            self.drain()
+            self.command(RESET_COMMUNICATION)
+        mine = {base + self.node for base in (0x080, 0x580, 0x700)}
+        for _ in range(3):
+            self.send_request(bytes([0x40]) + multiplexer(0x1000, 0))
+            if (
+                self.wait_for(mine, max(self.timeout_s, BOOT_S / 3) if booting else self.timeout_s)
+                is not None
+            ):
+                return None
+        return "nothing"
+
+    def prepare(self) -> None:
+        """Note the values that the node's own objects have."""
+        self.abandon_transfer()
+        self._found = {
+            (item.index, item.subindex): self.read(item.index, item.subindex)
+            for item in self.variables()
+            if item.index >= FIRST_OWN_OBJECT and item.access_type == "rw" and size_of(item)
+        }
+
+    def restore(self) -> None:
+        """Put the values back that `prepare` found, and have them stored.
+
+        Raises
+        ------
+        CaseFailed
+            The node does not take them.
+        """
+        if not self._found:
+            return
+        self.begin_anew()
+        changed = {item: value for item, value in self._found.items() if self.read(*item) != value}
+        refused = {item: value for item, value in changed.items() if self.write(*item, value)}
+        for item, value in refused.items():  # one that another one bounds
+            self.set(*item, value)
+        if 0x1010 in self.od:
+            self.set(0x1010, 1, b"save")
 
     # Around a case
 

@@ -69,6 +69,11 @@ def case(
     return enter
 
 
+def rule(number: int) -> str:
+    """Return the clause of a rule of this product, for what no standard and no public source settles."""
+    return f"R{number}, docs/rules.md"
+
+
 def check(condition: object, expected: str, seen: object) -> None:
     """Raise `CaseFailed` unless the condition holds."""
     if not condition:

@@ -6,20 +6,21 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from hil_tests.conformance.can_probe import CanProbe
 from hil_tests.conformance.case import Case
 from hil_tests.conformance.link_probe import ProbeTimes
 from hil_tests.conformance.ports import live_can, live_serial
-from hil_tests.conformance.runner import Outcome, run_cases, select_cases
+from hil_tests.conformance.runner import Outcome, not_run, run_cases, select_cases
 from hil_tests.conformance.serial_probe import SerialProbe
 from hil_tests.conformance.suites import can_suite, serial_suite
 from hil_tests.emulator_process import EmulatorProcess, emulator_command
 from hil_tests.errors import BenchError, EmulatorProcessError
+from hil_tests.interruption import Interrupted
 from hil_tests.own_hub import OwnBus
 from hil_tests.results import FAILED
+from hil_tests.scratch import scratch_folder
 from protocol.icd import InterfaceDefinition, load_icd
 
 DEFAULT_BAUD: Final = 115200
@@ -67,10 +68,18 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     return select_cases(cases, request.patterns, safe_only=request.safe_only)
 
 
+@dataclass(frozen=True)
+class ConformanceResult:
+    """What a run found, and the signal that interrupted it if one did."""
+
+    outcomes: list[Outcome]
+    interruption: Interrupted | None = None
+
+
 def run_conformance(
     request: ConformanceRequest, on_outcome: Callable[[Outcome], None] = lambda _outcome: None
-) -> list[Outcome]:
-    """Run the cases on the links that are asked for.
+) -> ConformanceResult:
+    """Run the cases on the links that are asked for; those that an interruption leaves are marked as not run.
 
     Raises
     ------
@@ -79,19 +88,31 @@ def run_conformance(
     """
     icd = load_icd()
     cases = all_cases(request, icd)
-    outcomes: list[Outcome] | None = None
+    outcomes: list[Outcome] = []
+    complete = False
+
+    def record(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        on_outcome(outcome)
+
     try:
         with ExitStack() as stack:
             serial, can = request.serial, request.can
             if request.start:
                 serial, can = _start(request, stack)
-            outcomes = _run_on_links(request, icd, cases, serial, can, on_outcome)
+            _run_on_links(request, icd, cases, serial, can, record)
+            complete = True
     except EmulatorProcessError as error:
-        if outcomes is None:
+        if not complete:
             raise
-        outcomes.append(_fallen(error))
-        on_outcome(outcomes[-1])
-    return outcomes
+        record(_fallen(error))
+    except Interrupted as interruption:
+        done = {outcome.id for outcome in outcomes}
+        for item in cases:
+            if item.id not in done:
+                record(not_run(item, interruption.reason))
+        return ConformanceResult(outcomes, interruption)
+    return ConformanceResult(outcomes)
 
 
 def _run_on_links(
@@ -101,9 +122,8 @@ def _run_on_links(
     serial: str | None,
     can: str | None,
     on_outcome: Callable[[Outcome], None],
-) -> list[Outcome]:
+) -> None:
     """Run the cases of one link after those of the other."""
-    outcomes: list[Outcome] = []
     with ExitStack() as stack:
         mine = [item for item in cases if item.id.startswith("serial.")]
         if mine and serial is not None:
@@ -112,16 +132,16 @@ def _run_on_links(
             if baud is not None:  # the line itself keeps its pace
                 baud = round(baud / request.speed)
             probe = SerialProbe(port, icd, dialect=request.dialect, baud=baud, times=request.times)
-            outcomes += run_cases(probe, mine, on_outcome)
+            run_cases(probe, mine, on_outcome, port=serial)
         mine = [item for item in cases if item.id.startswith("can.")]
         if mine and can is not None:
             bus = stack.enter_context(live_can(can, request.speed))
             addresses = {"host": request.host_address, "device": request.device_address}
-            outcomes += run_cases(CanProbe(bus, icd, times=request.times, **addresses), mine, on_outcome)
+            can_probe = CanProbe(bus, icd, times=request.times, **addresses)
+            run_cases(can_probe, mine, on_outcome, port=f"{can} at address {request.device_address}")
         mine = [item for item in cases if item.id.startswith("canopen.")]
         if mine and can is not None:
-            outcomes += _run_canopen(request, can, mine, on_outcome)
-    return outcomes
+            _run_canopen(request, can, mine, on_outcome)
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:
@@ -142,7 +162,7 @@ def _fallen(error: EmulatorProcessError) -> Outcome:
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, str | None]:
     """Start an emulator with the links that are asked for; return port and channel."""
-    folder = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-conformance-")))
+    folder = stack.enter_context(scratch_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"
     if needs_bus:
@@ -165,7 +185,7 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
 
 def _run_canopen(
     request: ConformanceRequest, can: str, cases: Sequence[Case[Any]], on_outcome: Callable[[Outcome], None]
-) -> list[Outcome]:
+) -> None:
     """Run the CANopen cases; the data sheet is the one given, else that of the product."""
     import canopen
     from canopen.objectdictionary import import_od
@@ -174,15 +194,16 @@ def _run_canopen(
 
     node = int(request.canopen_node or 0)
     text = _data_sheet(request.eds)
-    with TemporaryDirectory(prefix="starhil-eds-") as folder:
-        path = Path(folder) / "unit.eds"
+    with scratch_folder("starhil-eds-") as folder:
+        path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
         try:
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
             raise BenchError(f"{request.eds}: not a data sheet that can be read: {error}") from None
     with live_can(can, request.speed) as bus:
-        return run_cases(CanopenProbe(bus, node, dictionary, text), cases, on_outcome)
+        probe = CanopenProbe(bus, node, dictionary, text)
+        run_cases(probe, cases, on_outcome, port=f"{can} at node {node}")
 
 
 def _data_sheet(path: Path | None) -> str:

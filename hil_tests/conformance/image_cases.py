@@ -12,7 +12,6 @@ from protocol.values import Value
 FRAMES: Final = "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)"
 BURSTS: Final = "CubeComputer TC 112, 119 to 127 and TLM 242 (AlbertaSat, CTS)"
 SAVE: Final = "CubeComputer TC 80, TLM 233 (AlbertaSat, CTS)"
-OURS: Final = "rule of this product (docs of the interface definition)"
 EDGE: Final = 64
 FRAME: Final = 128
 PACKET: Final = 20

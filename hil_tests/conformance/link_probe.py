@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from hil_tests.conformance.case import CaseFailed, CaseSkipped
+from hil_tests.conformance.unit_settings import UnitSettings
 from protocol.codec import Row
 from protocol.errors import ProtocolError
 from protocol.icd import InterfaceDefinition
@@ -28,6 +29,9 @@ BURST_ID: Final = 119
 
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, for time-outs of the device to pass."""
+
+LIVELY: Final = ("identification", "device_status", "acknowledge")
+"""Rows of which a unit answers one at least."""
 
 AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malformed", "none"]
 
@@ -98,6 +102,7 @@ class LinkProbe(ABC):
         self.icd = icd
         self.times = times
         self.log: list[str] = []
+        self._found: UnitSettings | None = None
 
     # --- the link ---
 
@@ -240,6 +245,54 @@ class LinkProbe(ABC):
         if name not in self.icd.telemetry:
             raise CaseSkipped(f"the interface definition has no telemetry '{name}'")
         return self.icd.telemetry[name]
+
+    # --- around a run ---
+
+    def silence(self, *, booting: bool) -> str | None:
+        """Return what came in place of answers to three rows of telemetry; None if one of them was answered well.
+
+        A unit that may be booting is asked again until it must have booted.
+        """
+        end = self.now() + (self.times.boot_s if booting else 0.0)
+        while True:
+            seen = [str(answer) for name in LIVELY if (answer := self._bad_answer(name)) is not None]
+            if len(seen) < len(LIVELY):
+                return None
+            if self.now() >= end:
+                return next((text for text in seen if text != "nothing"), "nothing")
+
+    def _bad_answer(self, name: str) -> Answer | None:
+        """Ask for a row; return the answer unless it is telemetry of the row's length or a published refusal."""
+        self.drain()
+        row = self.icd.telemetry[name]
+        answer = self.ask(row.id)
+        if answer.kind == "telemetry" and len(answer.data) == row.size:
+            return None
+        if answer.kind == "nack" and answer.code in self.icd.enums["error_code"].names:
+            return None
+        return answer
+
+    def prepare(self) -> None:
+        """Note the settings of the unit, and give the cases a unit at its defaults."""
+        self._found = UnitSettings.read(self)
+        self._found.prepare(self)
+
+    def restore(self) -> None:
+        """Put the settings back that `prepare` found; those that cannot be are named.
+
+        Raises
+        ------
+        CaseFailed
+            The unit does not take them.
+        """
+        if self._found is None:
+            return
+        self.recover()
+        self.drain()
+        try:
+            self._found.restore(self)
+        except CaseFailed as failure:
+            raise CaseFailed(f"the stored parameters back as found ({self._found})", failure.seen) from None
 
     # --- around a case ---
 

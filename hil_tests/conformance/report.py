@@ -12,9 +12,15 @@ from rich.table import Table
 from rich.text import Text
 
 from hil_tests.conformance.runner import Outcome
-from hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit, write_report
+from hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
 
-STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
+STYLES: Final = {
+    PASSED: ("✓", "green"),
+    FAILED: ("✗", "bold red"),
+    SKIPPED: ("-", "yellow"),
+    NOT_RUN: ("-", "dim"),
+}
+SHOWN_IF_VERBOSE: Final = (PASSED, NOT_RUN)
 
 _PAGE: Final = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{title}</title>
@@ -23,13 +29,13 @@ body {{ font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 75r
 table {{ border-collapse: collapse; width: 100%; margin: 1rem 0 2rem; }}
 th, td {{ text-align: left; vertical-align: top; padding: .3rem .6rem; border-bottom: 1px solid #d8dee4; }}
 th {{ background: #f6f8fa; }} code, pre {{ font: 12.5px/1.4 ui-monospace, monospace; }}
-.passed {{ color: #1a7f37; }} .failed {{ color: #cf222e; font-weight: 600; }} .skipped {{ color: #9a6700; }}
+.passed {{ color: #1a7f37; }} .failed {{ color: #cf222e; font-weight: 600; }} .skipped, .not-run {{ color: #9a6700; }}
 details pre {{ background: #f6f8fa; padding: .5rem; overflow-x: auto; }}
 </style>
 <h1>{title}</h1>
 <p>{unit}</p>
 <p><b>{total}</b> cases: <span class="passed">{passed} passed</span>, <span class="failed">{failed} failed</span>,
-<span class="skipped">{skipped} skipped</span>.</p>
+<span class="skipped">{skipped} skipped</span>, <span class="not-run">{not_run} not run</span>.</p>
 {areas}
 {details}
 </html>
@@ -49,13 +55,14 @@ def to_json(outcomes: Sequence[Outcome], unit: str) -> dict[str, Any]:
         "passed": count(outcomes, PASSED),
         "failed": count(outcomes, FAILED),
         "skipped": count(outcomes, SKIPPED),
+        "not_run": count(outcomes, NOT_RUN),
         "outcomes": [outcome.to_json() for outcome in outcomes],
     }
 
 
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
-    """Print a line for a case; of passed ones only where that is wished."""
-    if outcome.status == PASSED and not verbose:
+    """Print a line for a case; of those that passed or were not run only where that is wished."""
+    if outcome.status in SHOWN_IF_VERBOSE and not verbose:
         return
     mark, style = STYLES[outcome.status]
     line = Text(f"{mark} ", style=style)
@@ -63,7 +70,7 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
     line.append(f"{outcome.title} [{outcome.clause}]", style="dim")
     if outcome.status == FAILED:
         line.append(f"\n    expected {outcome.expected}\n    seen     {outcome.seen}", style="red")
-    elif outcome.status == SKIPPED:
+    elif outcome.status in (SKIPPED, NOT_RUN):
         line.append(f"  {outcome.seen}", style="yellow")
     console.print(line, soft_wrap=True)
 
@@ -75,16 +82,16 @@ def areas_of(outcomes: Sequence[Outcome]) -> list[str]:
 
 def print_summary(console: Console, outcomes: Sequence[Outcome]) -> None:
     """Print a table by area."""
-    table = Table("area", "cases", "passed", "failed", "skipped", "seconds", box=None, pad_edge=False)
+    table = Table("area", "cases", *STYLES, "seconds", box=None, pad_edge=False)
     for area in areas_of(outcomes):
         rows = [outcome for outcome in outcomes if outcome.area == area]
-        numbers = [len(rows), *(count(rows, status) for status in (PASSED, FAILED, SKIPPED))]
+        numbers = [len(rows), *(count(rows, status) for status in STYLES)]
         style = "red" if count(rows, FAILED) else ""
         table.add_row(area, *map(str, numbers), f"{sum(row.seconds for row in rows):.1f}", style=style)
     console.print(table)
-    numbers = [len(outcomes), *(count(outcomes, status) for status in (PASSED, FAILED, SKIPPED))]
+    counts = ", ".join(f"{count(outcomes, status)} {status}" for status in STYLES)
     style = "bold red" if count(outcomes, FAILED) else "bold green"
-    console.print(Text("{} cases: {} passed, {} failed, {} skipped".format(*numbers), style=style))
+    console.print(Text(f"{len(outcomes)} cases: {counts}", style=style))
 
 
 def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:
@@ -108,11 +115,11 @@ def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> Non
     rows = []
     for area in areas_of(outcomes):
         mine = [outcome for outcome in outcomes if outcome.area == area]
-        cells = "".join(f"<td>{count(mine, status)}</td>" for status in (PASSED, FAILED, SKIPPED))
+        cells = "".join(f"<td>{count(mine, status)}</td>" for status in STYLES)
         rows.append(
             f'<tr><td><a href="#{escape(area)}">{escape(area)}</a></td><td>{len(mine)}</td>{cells}</tr>'
         )
-    heads = "".join(f"<th>{word}</th>" for word in ("area", "cases", "passed", "failed", "skipped"))
+    heads = "".join(f"<th>{word}</th>" for word in ("area", "cases", *STYLES))
     text = _PAGE.format(
         title="Conformance",
         unit=escape(unit),
@@ -120,6 +127,7 @@ def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> Non
         passed=count(outcomes, PASSED),
         failed=count(outcomes, FAILED),
         skipped=count(outcomes, SKIPPED),
+        not_run=count(outcomes, NOT_RUN),
         areas=f"<table><tr>{heads}</tr>{''.join(rows)}</table>",
         details="".join(_area_table(area, outcomes) for area in areas_of(outcomes)),
     )
@@ -133,10 +141,11 @@ def _area_table(area: str, outcomes: Sequence[Outcome]) -> str:
 
 
 def _row(outcome: Outcome) -> str:
-    result = f'<span class="{outcome.status}">{outcome.status}</span> in {outcome.seconds * 1e3:.0f} ms'
+    kind_of_result = outcome.status.replace(" ", "-")
+    result = f'<span class="{kind_of_result}">{outcome.status}</span> in {outcome.seconds * 1e3:.0f} ms'
     if outcome.status == FAILED:
         result += f"<br>expected {escape(outcome.expected)}<br>seen {escape(outcome.seen)}"
-    elif outcome.status == SKIPPED:
+    elif outcome.status in (SKIPPED, NOT_RUN):
         result += f"<br>{escape(outcome.seen)}"
     if outcome.log:
         result += f"<details><summary>sent and seen</summary><pre>{escape(chr(10).join(outcome.log))}</pre></details>"

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from hil_tests.conformance.case import Case, case, check, check_equal
+from hil_tests.conformance.case import Case, case, check, check_equal, rule
 from hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -15,16 +15,13 @@ from hil_tests.conformance.link_probe import (
     LinkProbe,
     checked_values,
 )
+from hil_tests.conformance.unit_settings import LINK_PARAMETERS
 from protocol.codec import Field, Row
 from protocol.icd import InterfaceDefinition
 from protocol.values import Parameter
 
 CODES: Final = "published error codes 0 to 4 (AlbertaSat, CTS)"
 IDENTIFIERS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
-LINK_PARAMETERS: Final = frozenset(
-    {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}
-)
-"""Parameters that would cut the tester off; they are only refused values, and set to what they are."""
 PARTNERS: Final = {
     "max_star_pixels": ("min_star_pixels", 1.0),
     "min_star_pixels": ("max_star_pixels", 255.0),
@@ -92,7 +89,7 @@ def unknown_telecommands(probe: LinkProbe) -> None:
     _IDENTIFIER_CASES,
     "identifiers.telemetry-with-data",
     "a request of telemetry with data is refused for its length",
-    "rule of this product (docs of the interface definition)",
+    rule(5),
 )
 def telemetry_with_data(probe: LinkProbe) -> None:
     """Every row."""
@@ -195,7 +192,7 @@ def _bad_field_case(row: Row, name: str, index: int, why: str, data: bytes) -> C
 
 
 def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
-    clause = f"configs/icd parameter {parameter.name} (ours)"
+    clause = f"configs/icd parameter {parameter.name}; {rule(19)}"
 
     def limits(probe: LinkProbe) -> None:
         seen = probe.parameter(parameter.name)

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
 from hil_tests.errors import BenchError, LinkLostError
-from hil_tests.results import FAILED, PASSED, SKIPPED
+from hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
 from protocol.errors import ProtocolError
 
 
@@ -23,9 +23,9 @@ class Outcome:
     id, area, title, clause, intrusive
         Those of the case.
     status
-        `passed`, `failed` or `skipped`.
+        `passed`, `failed`, `skipped` or `not run`.
     expected, seen
-        Of a failed case; of a skipped one the reason is in `seen`.
+        Of a failed case; of one that was skipped or not run the reason is in `seen`.
     log
         What was sent and received, with times.
     """
@@ -82,6 +82,15 @@ class Probe(Protocol):
 
     log: list[str]
     """What was sent and received."""
+
+    def silence(self, *, booting: bool) -> str | None:
+        """Return what comes in place of good answers; None if the device answers."""
+
+    def prepare(self) -> None:
+        """Note the settings of the device before cases that change them."""
+
+    def restore(self) -> None:
+        """Put the settings back after such cases."""
 
     def begin(self, *, intrusive: bool) -> None:
         """Get ready for a case."""
@@ -160,11 +169,88 @@ def run_cases(
     probe: Probe,
     cases: Iterable[Case[Any]],
     on_outcome: Callable[[Outcome], None] = lambda _outcome: None,
+    *,
+    port: str = "the link",
 ) -> list[Outcome]:
-    """Run cases in order."""
-    outcomes = []
-    for item in cases:
-        outcome = run_case(probe, item)
+    """Run the cases of one link in order.
+
+    A device that answers nothing ends the run: a failed outcome names the port, and the cases that are left are not run.
+    Before the first case that changes settings these are noted; after the last one they are put back, also when the run is
+    interrupted. An outcome is added only if that fails.
+    """
+    waiting = list(cases)
+    outcomes: list[Outcome] = []
+
+    def record(outcome: Outcome) -> None:
         outcomes.append(outcome)
         on_outcome(outcome)
+
+    def report_trouble(what: str, title: str, act: Callable[[], None]) -> None:
+        verdict = _attempt(probe, act)
+        if verdict.status == FAILED:
+            record(_outcome_of_run(link, what, title, verdict, tuple(probe.log)))
+
+    if not waiting:
+        return outcomes
+    link = waiting[0].id.partition(".")[0]
+    probe.log.clear()
+    mute = _mute(probe, port, booting=False)
+    intrusive = mute is None and any(item.intrusive for item in waiting)
+    if intrusive:
+        report_trouble("settings.found", "the settings can be read before the first case", probe.prepare)
+    try:
+        while waiting and mute is None:
+            outcome = run_case(probe, waiting.pop(0))
+            record(outcome)
+            if outcome.status == FAILED and waiting:
+                mute = _mute(probe, port, booting=intrusive)
+    finally:
+        if intrusive:
+            probe.log.clear()
+            report_trouble("settings.kept", "the settings are put back after the last case", probe.restore)
+    if mute is not None:
+        record(_outcome_of_run(link, "answers", "the device answers", mute, tuple(probe.log)))
+        for item in waiting:
+            record(not_run(item, mute.seen))
     return outcomes
+
+
+def not_run(item: Case[Any], reason: str) -> Outcome:
+    """Return the outcome of a case that the run did not come to."""
+    text = f"not run: {reason}"
+    return Outcome(item.id, item.area, item.title, item.clause, item.intrusive, NOT_RUN, "", text, 0.0, ())
+
+
+def _outcome_of_run(link: str, what: str, title: str, verdict: _Verdict, log: tuple[str, ...]) -> Outcome:
+    """Return an outcome that is about the run and not about one case."""
+    identifier = f"{link}.{what}"
+    area = identifier.rpartition(".")[0]
+    return Outcome(
+        identifier,
+        area,
+        title,
+        "starhil conformance",
+        intrusive=False,
+        status=FAILED,
+        expected=verdict.expected,
+        seen=verdict.seen,
+        seconds=0.0,
+        log=log,
+    )
+
+
+def _mute(probe: Probe, port: str, *, booting: bool) -> _Verdict | None:
+    """Return the verdict on a device that does not answer; None if it answers, or if the link itself is gone."""
+    seen: str | None = None
+
+    def listen() -> None:
+        nonlocal seen
+        seen = probe.silence(booting=booting)
+
+    _attempt(probe, listen)
+    if seen is None:
+        return None
+    if seen == "nothing":
+        return _Verdict(FAILED, "an answer to a request", f"nothing answers on {port}")
+    remedy = "check --dialect, --baud and the addresses"
+    return _Verdict(FAILED, "an answer to a request", f"no star sensor answers on {port}: {seen}; {remedy}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal, rule
 from hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, INVALID_PARAMETER
 from hil_tests.conformance.serial_probe import SerialProbe, framed
 
@@ -13,7 +13,6 @@ FRAMING: Final = "serial framing 1F 7F … 1F FF (libCubeObc, AlbertaSat adcs_io
 STUFFING: Final = "1F in the data is doubled (libCubeObc, CTS)"
 REPLIES: Final = "forms of the replies: a AlbertaSat, b RADSAT, c libCubeObc"
 RECOVERY: Final = "configs/icd: communication_status 144, errors of the link are flagged and passed over"
-OURS: Final = "rule of this product (docs of the interface definition)"
 
 LONG_PAUSE_S: Final = 0.8
 """Longer than the device waits for the rest of a message (0.5 s)."""
@@ -45,7 +44,7 @@ LINES: Final = (
     Line("twenty-at-once", "twenty requests in one piece are all answered", FRAMING, (READ * 20,), (128,) * 20),
     Line("byte-by-byte", "a request may come byte by byte", FRAMING, ("1F", "7F", "80", "1F", "FF"), (128,), 0.005),
     Line("cut-in-escape", "a request may be cut between 1F and what follows it", FRAMING, ("1F", "7F 80 1F", "FF"), (128,), 0.02),
-    Line("pause", "a pause of 0.1 s within a request does no harm", OURS, ("1F 7F", "80 1F FF"), (128,), SHORT_PAUSE_S),
+    Line("pause", "a pause of 0.1 s within a request does no harm", rule(1), ("1F 7F", "80 1F FF"), (128,), SHORT_PAUSE_S),
     Line("junk-before", "bytes before a request are passed over", FRAMING, ("00 55 AA FF" + READ,), (128,)),
     Line("junk-between", "bytes between requests are passed over", FRAMING, (READ + "00 FF 7F" + READ,), (128, 128)),
     Line("junk-after", "bytes after a request do not spoil the next", FRAMING, (READ + "42", READ), (128, 128), 0.02),
@@ -60,8 +59,8 @@ LINES: Final = (
     Line("cut-off-data", "a message with data cut off by another is dropped", FRAMING, ("1F 7F 02 11 22 33" + READ,), (128,)),
     Line("empty", "a message without an identifier is no request", FRAMING, ("1F 7F 1F FF",), ()),
     Line("empty-then-good", "a request after an empty message is answered", FRAMING, ("1F 7F 1F FF" + READ,), (128,)),
-    Line("bad-escape", "1F before another byte within a message ends it without effect", OURS, ("1F 7F 80 1F 00",), ()),
-    Line("bad-escape-then-good", "a request after a bad escape is answered", OURS, ("1F 7F 80 1F 00" + READ,), (128,)),
+    Line("bad-escape", "1F before another byte within a message ends it without effect", rule(3), ("1F 7F 80 1F 00",), ()),
+    Line("bad-escape-then-good", "a request after a bad escape is answered", rule(3), ("1F 7F 80 1F 00" + READ,), (128,)),
     Line("start-of-ack", "1F 07 is the start of a reply, not of a request", REPLIES, ("1F 07 80 1F FF",), ()),
     Line("start-of-nack", "1F 0F is the start of a reply, not of a request", REPLIES, ("1F 0F 80 1F FF",), ()),
     Line("start-of-event", "1F 2F is the start of an event, not of a request", REPLIES, ("1F 2F 80 1F FF",), ()),
@@ -103,7 +102,7 @@ def reply_form(probe: SerialProbe) -> None:
     check_equal(seen, whole.hex().upper(), "bytes")
 
 
-@case(_CASES, "framing.half", "half a message is given up after a while", OURS)
+@case(_CASES, "framing.half", "half a message is given up after a while", rule(2))
 def half(probe: SerialProbe) -> None:
     """The rest of it, when it comes too late, is junk; the next request is answered."""
     probe.send(bytes.fromhex("1F 7F 80"))
@@ -113,7 +112,7 @@ def half(probe: SerialProbe) -> None:
     probe.expect_alive()
 
 
-@case(_CASES, "framing.overlong", "a message that is too long is dropped, the next one answered", OURS)
+@case(_CASES, "framing.overlong", "a message that is too long is dropped, the next one answered", rule(4))
 def overlong(probe: SerialProbe) -> None:
     """Longer than the 512 bytes of the published host's buffer."""
     probe.send(framed(0x80, bytes(4 * LONGEST_MESSAGE)))
@@ -121,7 +120,7 @@ def overlong(probe: SerialProbe) -> None:
     probe.expect_alive()
 
 
-@case(_CASES, "framing.longest", "a message of 512 bytes is still taken, and refused for its length", OURS)
+@case(_CASES, "framing.longest", "a message of 512 bytes is still taken, and refused for its length", rule(4))
 def longest(probe: SerialProbe) -> None:
     """Identifier and 511 bytes."""
     probe.expect_refusal(0x80, bytes(LONGEST_MESSAGE - 1), INVALID_LENGTH)
@@ -260,7 +259,7 @@ def no_flag(probe: SerialProbe) -> None:
 def pace(probe: SerialProbe) -> None:
     """Nothing is faster than the bit rate: telemetry 211 has 54 bytes."""
     if probe.baud is None:
-        raise CaseSkipped("the bit rate of the line is not known; use --baud")
+        raise CaseSkipped("the pace is not checked without --baud, the bit rate of the line")
     begin = probe.now()
     probe.post(211)
     data = probe.expect_telemetry(211)

@@ -6,12 +6,11 @@ import random
 from typing import Final
 
 from hil_tests.conformance.can_probe import CanProbe
-from hil_tests.conformance.case import Case, case, check, check_equal
+from hil_tests.conformance.case import Case, case, check, check_equal, rule
 from hil_tests.conformance.link_probe import INVALID_PARAMETER, Answer, LinkProbe, checked_values
 from hil_tests.conformance.serial_probe import SerialProbe
 from protocol.can_framing import CanFrame
 
-OURS: Final = "rule of this product (docs of the interface definition)"
 HOST_TIMEOUT_S: Final = 0.3
 """Time-out of the most impatient published flight software (AlbertaSat, first version)."""
 
@@ -40,7 +39,7 @@ def reply_time(probe: LinkProbe) -> None:
 # --- unsolicited telemetry ---
 
 UNSOLICITED: Final = (
-    "types 10 to 12, start bytes 1F 4F (libCubeObc); serial dialects a and b have none (ours)"
+    "types 10 to 12, start bytes 1F 4F (libCubeObc); serial dialects a and b have none: R20, docs/rules.md"
 )
 
 
@@ -104,7 +103,7 @@ def unsolicited_refused(probe: LinkProbe) -> None:
 # --- recovery ---
 
 
-@case(_CASES, "recovery.noise", "after noise the next good request is answered", OURS)
+@case(_CASES, "recovery.noise", "after noise the next good request is answered", rule(9))
 def noise(probe: LinkProbe) -> None:
     """Serial: 4000 random bytes; CAN: 400 random frames that are no requests."""
     rng = random.Random(7)  # noqa: S311 -- noise, not a secret
@@ -122,7 +121,7 @@ def noise(probe: LinkProbe) -> None:
     probe.expect_alive()
 
 
-@case(_CASES, "recovery.flood", "a flood of requests is answered whole and in order", OURS)
+@case(_CASES, "recovery.flood", "a flood of requests is answered whole and in order", rule(10))
 def flood(probe: LinkProbe) -> None:
     """Two rows in turn, a hundred times."""
     rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.cache import cache_dir
+from starid.cache import cache_dir, evict, mark_used
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.geometric import index_file
@@ -132,4 +132,10 @@ def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str 
         return index_file.unpack(index_file.pack(build_arrays(stars, settings), key), key)
     folder = cache_dir() if cache is True else Path(cache)
     path = folder / f"index-{key}.bin"
-    return index_file.load(path, key) or index_file.store(path, build_arrays(stars, settings), key)
+    stored = index_file.load(path, key)
+    if stored is not None:
+        mark_used(path)
+        return stored
+    built = index_file.store(path, build_arrays(stars, settings), key)
+    evict(keep=path)
+    return built

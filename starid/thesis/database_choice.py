@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.cache import cache_dir
+from starid.cache import cache_dir, evict, mark_used
 from starid.catalog import StarCatalog
 from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDatabase, build_database
 from starid.thesis.database_file import load_database, save_database
@@ -86,10 +86,12 @@ def obtain_database(stars: StarCatalog, parameters: DatabaseParameters, *, cache
     path = cache_dir() / f"features-{key}.bin"
     stored = _load(path)
     if stored is not None:
+        mark_used(path)
         return stored
     database = build_database(stars, parameters)
     try:
         save_database(database, path)
+        evict(keep=path)
     except DatabaseError as error:
         _log.warning("%s: built again each time", error)
     return database

@@ -90,6 +90,7 @@ def test_overrides_are_toml_or_text():
         ("truth = 3\n", "truth: must be a"),
         ("run = 3\n", "run: must be a table (given: 3)"),
         ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: missing; give it"),
+        ("[truth]\nkind = 'rate'\nrate = [0, 0, 1]\n", "truth.rate: unknown key; did you mean 'rate_deg_s'?"),
         ("[truth]\nkind = 'rate'\nrate_rad_s = [0, 0, 1]\n", "truth.rate_"),
         ("[truth]\nkind = 'fixed'\nattitude = {ra_deg = 1.0}\n", "give ra_deg and dec_deg"),
         ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),

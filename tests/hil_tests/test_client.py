@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 
 import pytest
@@ -12,6 +13,7 @@ from hil_tests.raw_exchange import send_and_listen
 from protocol.errors import ProtocolError
 from protocol.messages import ErrorCode
 from protocol.serial_framing import Dialect
+from protocol.values import FieldError
 from tests.hil_tests.fake_device import EDGE, FakeDevice
 
 PATIENCE_S = 5.0
@@ -79,6 +81,23 @@ def test_names_that_are_not_in_the_definition_are_refused_before_anything_is_sen
         client.command("set_mode", mode="dancing")
     assert device.received == []
     assert client.transactions == []
+
+
+def test_values_that_the_definition_does_not_allow_go_out_unchecked_if_asked(pair):
+    _device, client = pair
+    wrong = client.icd.telecommands["set_star_config"].example() | {"max_stars_matched": 0}
+    for send in (
+        lambda **options: client.command("set_star_config", wrong, **options),
+        lambda **options: client.set_parameter("exposure", 70000, **options),
+        lambda **options: client.set_parameter("exposure", 0.5, **options),
+    ):
+        client.transactions.clear()
+        with pytest.raises(FieldError):
+            send()
+        assert client.transactions == []
+        with contextlib.suppress(NackError):  # what the device thinks of it is its own affair
+            send(checked=False)
+        assert len(client.transactions) == 1
 
 
 def test_no_reply_is_an_error_after_the_time_out_and_is_tried_again_only_if_asked(pair):
@@ -211,3 +230,21 @@ def test_a_vanished_port_is_told_from_a_silent_device():
         device.close_links()
         with pytest.raises(LinkLostError, match="/dev/pts"):
             client.read("rates", timeout_s=TIMEOUT_S)
+
+
+def test_unsolicited_telemetry_that_nobody_takes_is_bounded_and_stamped_on_receipt(hub, monkeypatch):
+    monkeypatch.setattr("hil_tests.async_client.UNSOLICITED_KEPT", 5)
+    with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
+        began = time.monotonic()
+        for number in range(8):
+            device.say("precise_attitude", {"frame_counter": number})
+        client.read("rates")  # on one bus, so all of them have come
+        taken = time.monotonic()
+        seen = [client.wait_unsolicited("precise_attitude") for _ in range(5)]
+        assert [reading["frame_counter"] for reading in seen] == [3, 4, 5, 6, 7]
+        assert all(began <= reading.received_s <= taken for reading in seen)
+        assert client.core.unsolicited_dropped == 3
+        device.say("precise_attitude", {"frame_counter": 8})
+        client.read("rates")
+        with pytest.raises(NoReplyError):
+            client.wait_unsolicited("precise_attitude", since_s=time.monotonic(), timeout_s=0.05)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import sys
 from xml.etree import ElementTree as ET
 
@@ -57,3 +59,20 @@ def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_repo
     assert (end["step"], end["status"]) == (2, "failed")
     assert "by itself with status 7: no more sky" in end["detail"]
     assert ET.parse(junit).getroot().get("failures") == "1"
+
+
+def test_a_port_where_nothing_answers_ends_the_conformance_run_with_its_reports(tmp_path):
+    junit, html = tmp_path / "c.xml", tmp_path / "c.html"
+    master, slave = pty.openpty()
+    try:
+        port = os.ttyname(slave)
+        words = ("--serial", port, "--junit", junit, "--html", html, "--time-out", "0.05")
+        outcome = run_command("conformance", *words)
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert outcome.exit_code == 1, outcome.output
+    assert f"nothing answers on {port}" in outcome.output
+    suite = ET.parse(junit).getroot()
+    assert (suite.get("failures"), int(suite.get("skipped"))) == ("1", int(suite.get("tests")) - 1)
+    assert f"not run: nothing answers on {port}" in html.read_text(encoding="utf-8")

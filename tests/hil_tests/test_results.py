@@ -78,7 +78,7 @@ def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_says_so(m
 
     monkeypatch.setattr(conformance_run, "_start", start)
     told = []
-    outcomes = run_conformance(ConformanceRequest(serial="auto", start=True), told.append)
+    outcomes = run_conformance(ConformanceRequest(serial="auto", start=True), told.append).outcomes
     assert [(outcome.id, outcome.status) for outcome in outcomes] == [("emulator.end", "failed")]
     assert LAST_WORDS in outcomes[0].seen
     assert told == outcomes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import threading
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -13,8 +14,10 @@ from emulator.cli.app import build_app
 from hil_tests.attitude import from_radec_roll
 from hil_tests.bench import Bench, LinkOptions
 from hil_tests.errors import BenchError
+from hil_tests.results import junit_cases
 from hil_tests.script import load_script
 from hil_tests.session import SessionRunner
+from hil_tests.session_run import _printer
 from protocol.candump import read_candump
 from protocol.icd import load_icd
 from protocol.messages import ErrorCode
@@ -43,6 +46,55 @@ def play(device, tmp_path):
             return SessionRunner(script, bench, tmp_path).run()
 
     return _play
+
+
+def test_listen_judges_what_comes_after_it_began(device, hub, tmp_path):
+    path = tmp_path / "trial.toml"
+    path.write_text(
+        "[[step]]\nlisten = 'precise_attitude'\ncount = 4\ntimeout_s = 20\nexpect = { frame_counter = { min = 100 } }\n",
+        encoding="utf-8",
+    )
+    script = load_script(path, ICD)
+    pause = threading.Event()
+    with Bench(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as bench:
+        for number in range(50):  # they pile up before the step
+            device.say("precise_attitude", {"frame_counter": number})
+        bench.client("can").read("rates")
+        for number in range(50):
+            device.say("precise_attitude", {"frame_counter": number})
+        bench.client("can").read("rates")
+
+        def send() -> None:
+            for number in range(100, 200):
+                if pause.wait(0.1):
+                    return
+                device.say("precise_attitude", {"frame_counter": number})
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        try:
+            (result,) = SessionRunner(script, bench, tmp_path).run().results
+        finally:
+            pause.set()
+            sender.join()
+    assert result.status == "passed", result.detail
+    assert 0.0 < result.figures["rate_hz"] < 10.5
+
+
+def test_a_time_in_seconds_keeps_its_fraction_in_the_junit_file(play, device):
+    device.telemetry["precise_attitude"] = attitude_values() | {"time_of_exposure": 1767225619.53125}
+    result = play("[[step]]\nread = 'precise_attitude'\n")
+    (case,) = junit_cases(result, "trial")
+    assert "time_of_exposure = 1767225619.53125" in case.output.splitlines()
+
+
+def test_a_message_has_one_unit_of_time(play, device, capsys):
+    result = play("[[step]]\nread = 'rates'\nmax_latency_s = 0.0\nwithin_s = 0.1\nevery_s = 0.01\n")
+    assert result.results[0].detail.startswith("not within 0.1 s: latency 0.")
+    _printer(quiet=False)(result.results[0])
+    line = capsys.readouterr().out
+    assert " s" in line
+    assert " ms" not in line
 
 
 def attitude_values(dec_offset_arcsec: float = 0.0, **more) -> dict:

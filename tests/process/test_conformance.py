@@ -117,4 +117,4 @@ def test_a_device_that_does_not_answer_fails(emulator):
         "0.1",
     )
     assert done.returncode == 1
-    assert "seen     nothing" in done.stdout
+    assert f"nothing answers on {emulator.ready['can']} at address 77" in done.stdout.replace("\n", "")

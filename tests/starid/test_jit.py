@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from starid.jit import source_stamp
+import pytest
+
+from starid.jit import VerifiedCacheFile, source_stamp
 
 CALLER = """
 from other_kernels.inner import FACTOR, scaled
@@ -59,3 +61,56 @@ def test_a_changed_callee_in_another_module_is_noticed(tmp_path: Path) -> None:
 def test_stamps_follow_imports_only() -> None:
     assert source_stamp("starid.projection") == source_stamp("starid.projection")
     assert source_stamp("starid.projection") != source_stamp("starid.jit")
+
+
+def truncated(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def emptied(_data: bytes) -> bytes:
+    return b""
+
+
+def zeroed(data: bytes) -> bytes:
+    """As a file system may leave a file after a power failure: its length, without its content."""
+    return data[:-100] + bytes(100)
+
+
+def test_damaged_machine_code_is_removed_and_compiled_again(tmp_path: Path) -> None:
+    package = tmp_path / "other_kernels"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "outer.py").write_text(CALLER)
+    (package / "inner.py").write_text(INNER.format(factor=0.5, slope=2.0))
+    assert run(tmp_path) == ["2.5", "0"]
+    for suffix in ("nbc", "nbi"):
+        files = list(package.rglob(f"*.{suffix}"))
+        assert files
+        for file in files:
+            file.write_bytes(truncated(file.read_bytes()))
+        assert run(tmp_path) == ["2.5", "0"], "compiled again"
+    assert run(tmp_path) == ["2.5", "1"], "and kept"
+
+
+@pytest.mark.parametrize("damage", [truncated, emptied, zeroed])
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_a_damaged_cache_file_counts_as_missing_and_is_removed(tmp_path: Path, suffix: str, damage) -> None:
+    file = VerifiedCacheFile(str(tmp_path), "kernel", "stamp")
+    file.save("key", b"code" * 100)
+    assert file.load("key") == b"code" * 100
+    (path,) = tmp_path.glob(f"*.{suffix}")
+    path.write_bytes(damage(path.read_bytes()))
+    assert file.load("key") is None
+    assert not path.exists()
+    file.save("key", b"new")
+    assert file.load("key") == b"new"
+
+
+def test_machine_code_that_cannot_be_written_is_compiled_each_time(tmp_path: Path, monkeypatch) -> None:
+    def full(*_arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    file = VerifiedCacheFile(str(tmp_path), "kernel", "stamp")
+    monkeypatch.setattr(file, "_write", full)
+    file.save("key", "code")
+    assert file.load("key") is None

@@ -1,0 +1,54 @@
+"""`starhil cache`: what is kept of earlier computations, and removing it."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Annotated
+
+import typer
+
+group = typer.Typer(help="Star catalogue, indices and databases that were computed before and are kept.")
+
+AS_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+@group.callback(invoke_without_command=True)
+def command(context: typer.Context) -> None:
+    """Show the cache, as `info` does, unless a command follows."""
+    if context.invoked_subcommand is None:
+        info()
+
+
+@group.command("info")
+def info(as_json: AS_JSON = False) -> None:
+    """Show folder, size, limit and files; beyond the limit the least recently used file goes first.
+
+    STARHIL_CACHE_DIR names another folder, STARHIL_CACHE_LIMIT_MB another limit.
+    """
+    from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
+
+    files = cached_files()
+    total = sum(each.size for each in files)
+    if as_json:
+        rows = [{"name": each.path.name, "bytes": each.size, "used_unix_s": each.used_s} for each in files]
+        content = {"folder": str(cache_dir()), "bytes": total, "limit_bytes": size_limit(), "files": rows}
+        print(json.dumps(content))
+        return
+    for each in reversed(files):
+        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(each.used_s))
+        print(f"{each.size / BYTES_PER_MB:8.1f} MB  {used}  {each.path.name}")
+    limit = size_limit() / BYTES_PER_MB
+    print(f"{total / BYTES_PER_MB:8.1f} MB of {limit:g} MB in {len(files)} files in {cache_dir()}")
+
+
+@group.command("clear")
+def clear() -> None:
+    """Remove all cached files; they are computed again when they are needed."""
+    from starid.cache import BYTES_PER_MB, cache_dir, cached_files, remove
+
+    files = cached_files()
+    removed = [each for each in files if remove(each)]
+    megabytes = sum(each.size for each in removed) / BYTES_PER_MB
+    print(f"removed {len(removed)} of {len(files)} files, {megabytes:.1f} MB, from {cache_dir()}")
+    raise typer.Exit(0 if len(removed) == len(files) else 1)

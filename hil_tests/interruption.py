@@ -1,0 +1,53 @@
+"""Signals that ask a run to end, as an exception that unwinds it: what it started is ended, what it found is kept."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Final
+
+ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked this process to end.
+
+    Attributes
+    ----------
+    reason
+        `interrupted by SIGTERM`.
+    exit_status
+        As shells report it: 128 and the number of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.reason = f"interrupted by {signal.Signals(number).name}"
+        super().__init__(self.reason)
+        self.exit_status = 128 + number
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise `Interrupted` in the main thread at the first SIGINT, SIGTERM or SIGHUP; ignore those that follow.
+
+    A signal that is ignored already (`nohup`) stays so. In another thread, which no signal reaches, nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
+
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        raise Interrupted(number)
+
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,54 @@
+"""A folder for one run, which the next run removes if this one could not."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+LOCK_NAME: Final = "owner.lock"
+"""Held locked for as long as the owner of the folder lives: the kernel releases it, however that ends."""
+
+
+@contextmanager
+def scratch_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
+    """Make a temporary folder and remove it at the end, with those whose owner was killed.
+
+    Parameters
+    ----------
+    prefix
+        Beginning of its name; abandoned folders with the same prefix are removed.
+    base
+        Folder to make it in; default: the system's temporary folder.
+    """
+    root = Path(tempfile.gettempdir()) if base is None else base
+    for folder in root.glob(f"{prefix}*"):
+        _remove_abandoned(folder)
+    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=root))
+    lock = os.open(folder / LOCK_NAME, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+        os.close(lock)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove a folder whose lock nobody holds."""
+    try:
+        lock = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:  # not such a folder, just being made, or another user's
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(folder)
+    except OSError:  # its owner lives, or another process is removing it
+        return
+    finally:
+        os.close(lock)

@@ -1,0 +1,121 @@
+"""A session or a conformance run that is ended by a signal leaves no process and no folder behind, and keeps its reports."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from hil_tests.emulator_process import STARHIL, EmulatorProcess
+from hil_tests.scratch import scratch_folder
+
+pytestmark = pytest.mark.process
+
+PATIENCE_S = 240.0
+SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\nread = 'device_status'\n"
+SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGINT)
+
+
+def descendants(pid: int) -> set[int]:
+    """Processes that a process has started, and those that these have."""
+    parents = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+            parents[int(folder.name)] = int(fields[1])
+    found, wave = set(), {pid}
+    while wave:
+        wave = {child for child, parent in parents.items() if parent in wave}
+        found |= wave
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def wait_until(condition, what: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
+    """Start a command, send it a signal once a line of its run is out; return its exit status when all is over."""
+    command = [sys.executable, "-c", STARHIL, *map(str, words)]
+    environment = {**os.environ, "TMPDIR": str(folder)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        lines = iter(process.stdout)
+        assert any(line.startswith("✓") for line in lines), "the run did not begin"
+        family = descendants(process.pid)
+        assert len(family) >= 2, "the emulator and its worker"
+        process.send_signal(number)
+        process.wait(timeout=PATIENCE_S)
+        process.stdout.close()
+    wait_until(lambda: not any(alive(pid) for pid in family), f"{family} outlived {number.name}")
+    return process.returncode
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+@pytest.mark.parametrize("name", ["session", "conformance"])
+def test_a_signal_leaves_no_process_and_no_folder_behind(name, number, tmp_path):
+    script, junit, html, scratch = (tmp_path / each for each in ("s.toml", "j.xml", "c.html", "scratch"))
+    scratch.mkdir()
+    script.write_text(SESSION, encoding="ascii")
+    words = {
+        "session": ["session", script, "--log", tmp_path / "log"],
+        "conformance": ["conformance", "serial.data", "serial.modes", "--html", html, "--verbose"],
+    }[name]
+    status = interrupt([*words, "--start", "--serial", "auto", "--junit", junit], number, scratch)
+    if number is signal.SIGKILL:
+        with scratch_folder("starhil-", base=scratch):  # the next run clears away what this one could not
+            left = list(scratch.iterdir())
+        assert len(left) == 1
+        return
+    assert status == 128 + number
+    assert list(scratch.iterdir()) == []
+    suite = ET.parse(junit).getroot()
+    reasons = [item.get("message") for item in suite.iter("skipped")]
+    assert int(suite.get("tests")) > len(reasons) > 0
+    assert reasons[-1] == f"not run: interrupted by {number.name}"
+    if name == "conformance":
+        assert f"interrupted by {number.name}" in html.read_text()
+
+
+def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_path):
+    text = (
+        "import subprocess, sys, time\n"
+        "from hil_tests.emulator_process import emulator_command\n"
+        f"child = subprocess.Popen(emulator_command(state_dir={str(tmp_path)!r}), stdout=subprocess.DEVNULL)\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True) as parent:
+        child = int(parent.stdout.readline())
+        parent.kill()
+    wait_until(lambda: not alive(child), "the emulator outlived its parent")
+
+
+def test_an_interrupted_start_ends_the_emulator():
+    process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
+    timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    with pytest.raises(KeyboardInterrupt), process:
+        pass
+    timer.join()
+    assert not process.running
