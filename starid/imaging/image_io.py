@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 
 from starid.cache import write_atomically
 from starid.errors import StaridError
+from starid.files import MEGABYTE, is_stream, read_bytes
+
+IMAGE_LIMIT: Final = 1000 * MEGABYTE
+"""Largest image file that is read, bytes: a colour TIFF of 16 bits of the largest cameras has some 900 MB."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
@@ -44,7 +48,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
     """
     source = Path(path)
     try:
-        content = source.read_bytes()
+        content = read_bytes(source, IMAGE_LIMIT)
     except FileNotFoundError:
         raise StaridError(f"image {source}: no such file; give a PNG, TIFF or JPEG") from None
     except OSError as error:
@@ -76,7 +80,8 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
     Parameters
     ----------
     path : path
-        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy).
+        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy); a device or pipe
+        without one gets a PNG.
     image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
         Colour in the order blue, green, red.
 
@@ -88,7 +93,7 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
     import cv2
 
     target = Path(path)
-    suffix = target.suffix.lower()
+    suffix = target.suffix.lower() or (".png" if is_stream(target) else "")
     if suffix not in _SUFFIXES:
         raise StaridError(f"image {target}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
     if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
