@@ -25,8 +25,8 @@ from starid.typical_camera import typical_camera
 DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
 """Relative displacements at the corner of the image, of lenses that are tried."""
 
-TRIANGLES: Final = (100, 1000, 5000)
-"""Triangles looked up in each round; the last one is without other distortions."""
+TRIANGLES: Final = (100, 100, 1000, 5000)
+"""Triangles looked up in each round; the first one has narrow windows, and it and the last one no distortions."""
 
 ALL_ROUNDS: Final = range(len(TRIANGLES))
 
@@ -137,16 +137,13 @@ class RoughSearch:
         choices = [brightest[:MOST_AT_ONCE]]
         choices += [even_choice(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
         known_lens = any(self._first.camera.distortion)
-        if 0 in rounds:
-            strict = dataclasses.replace(_STRICT, max_triangles=TRIANGLES[0])
+        for number in rounds:
+            plain = known_lens or number in (ALL_ROUNDS[0], ALL_ROUNDS[-1])
+            windows = _STRICT if number == ALL_ROUNDS[0] else _LENIENT
+            effort = self._scaled(dataclasses.replace(windows, max_triangles=TRIANGLES[number]))
             for rows in choices:
-                yield _Chance(rows, 0.0, self._scaled(strict))
-        for triangles in (TRIANGLES[number] for number in rounds):
-            lenses = DISTORTIONS[:1] if known_lens or triangles == TRIANGLES[-1] else DISTORTIONS
-            lenient = self._scaled(dataclasses.replace(_LENIENT, max_triangles=triangles))
-            for rows in choices:
-                for distortion in lenses:
-                    yield _Chance(rows, distortion, lenient)
+                for distortion in DISTORTIONS[:1] if plain else DISTORTIONS:
+                    yield _Chance(rows, distortion, effort)
 
     def _scaled(self, effort: Effort) -> Effort:
         """Effort with its windows grown to the size of the image."""
