@@ -13,24 +13,26 @@ TOML, one `[[at]]` table an event, in any order::
     clear_faults = true
 
 `fault` and `truth` take what the control channel's `fault` and `set_truth` take. Events happen in run time, so that
-they come at the same frames whatever the clock. A live feed cannot be set by a scenario: it needs a socket, which takes time.
+they come at the same frames whatever the clock; names, links and files are checked at the start. A live feed cannot be set by a scenario: it needs a socket, which takes time.
 """
 
 from __future__ import annotations
 
 import logging
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from emulator.clock import NANOSECONDS
+from emulator.device.scheduler import Action
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
 from emulator.profile import configs_folder
+from emulator.toml_file import read_toml
 from emulator.truth.config import LiveConfig, Strict, TruthConfig
 from emulator.wording import explain
+from starid.errors import StaridError
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation
@@ -54,6 +56,24 @@ class ScenarioEvent(Strict):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
+    def prepare(self, emulation: Emulation) -> Action:
+        """Make what is to be done at the run time; whatever it needs is read and checked before."""
+        if self.fault is not None:
+            emulation.faults.check(self.fault)
+        folder = emulation.profile.folder
+        truth = None if self.truth is None else self.truth.build(self.run_time_s, folder)
+
+        def happen(_due_ns: int) -> None:
+            if self.clear_faults:
+                emulation.faults.clear()
+            if self.fault is not None:
+                emulation.faults.inject(self.fault)
+            if truth is not None:
+                emulation.device.cycle.truth = truth
+            log.info("scenario at %g s", self.run_time_s)
+
+        return happen
+
 
 class Scenario(Strict):
     """A whole scenario."""
@@ -62,10 +82,19 @@ class Scenario(Strict):
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
 
     def enter(self, emulation: Emulation) -> None:
-        """Enter all events into the run."""
+        """Enter all events into a run whose links are open; what they need is read and checked now.
+
+        Raises
+        ------
+        EmulatorError
+            An event asks for what this run does not have, or names a file that cannot be read.
+        """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
-            due_ns = round(event.run_time_s * NANOSECONDS)
-            emulation.device.scheduler.at(due_ns, lambda _due, event=event: _happen(emulation, event))  # type: ignore[misc]
+            try:
+                action = event.prepare(emulation)
+            except (EmulatorError, StaridError) as error:
+                raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
+            emulation.device.scheduler.at(round(event.run_time_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:
@@ -79,36 +108,11 @@ def load_scenario(name_or_path: str) -> Scenario:
     path = Path(name_or_path).expanduser()
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
         path = configs_folder() / "scenarios" / f"{name_or_path}.toml"
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         known = ", ".join(sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
-        raise EmulatorError(
-            f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}"
-        ) from None
-    except OSError as error:
-        raise EmulatorError(f"scenario {path}: cannot be read ({error.strerror}); give a TOML file") from None
-    except UnicodeDecodeError as error:
-        raise EmulatorError(f"scenario {path}: not UTF-8 ({error.reason}); give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise EmulatorError(f"scenario {path}: not TOML ({error})") from None
+        raise EmulatorError(f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}")
+    values = read_toml(path, "scenario")
     try:
         return Scenario.model_validate(values)
     except ValidationError as error:
         raise EmulatorError(f"scenario {path}: {explain(error, Scenario)}") from None
-
-
-def _happen(emulation: Emulation, event: ScenarioEvent) -> None:
-    """Do an event; what this run cannot do is told in the log, and the run goes on."""
-    try:
-        if event.clear_faults:
-            emulation.faults.clear()
-        if event.fault is not None:
-            emulation.faults.inject(event.fault)
-        if event.truth is not None:
-            now_s = emulation.clock.now_ns() / NANOSECONDS
-            emulation.device.cycle.truth = event.truth.build(now_s, emulation.profile.folder)
-    except EmulatorError as error:
-        log.warning("scenario at %g s: %s", event.run_time_s, error)
-    else:
-        log.info("scenario at %g s", event.run_time_s)

@@ -92,7 +92,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         file, step, name and near matches.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ScriptError(f"{path}: cannot be read: {reason}") from None

@@ -58,7 +58,7 @@ class TruthFile:
 
     def _read(self) -> None:
         try:
-            with self._path.open(newline="", encoding="utf-8") as stream:
+            with self._path.open(newline="", encoding="utf-8-sig") as stream:
                 rows = list(csv.DictReader(stream))
         except OSError as error:
             raise BenchError(f"{self._path}: the truth cannot be read: {error.strerror}") from None

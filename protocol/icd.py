@@ -141,8 +141,7 @@ def _load(path: Path) -> InterfaceDefinition:
 
 def _read(file: Path) -> FileModel:
     try:
-        with file.open("rb") as stream:
-            document = tomllib.load(stream)
+        document = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise IcdError(f"{file}: cannot read the interface definition: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -121,7 +121,7 @@ def _load_default() -> CanopenModel:
 
 def _load(path: Path) -> CanopenModel:
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         return _FileModel.model_validate(document).canopen
     except OSError as error:
         raise IcdError(f"{path}: cannot read the CANopen layout: {error.strerror}") from None
