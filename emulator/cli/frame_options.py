@@ -61,4 +61,5 @@ def frame_catalog(geometry: str, epoch: float | None) -> StarCatalog:
     """Catalogue at the epoch asked for, or at the geometry's own."""
     from starid.catalog import load_catalog
 
-    return load_catalog(epoch=epoch or (PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH))
+    own = PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH
+    return load_catalog(epoch=own if epoch is None else epoch)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output, report_stream
 from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ _FASTEST_DEG_S = 1000.0
 def command(
     ra: Annotated[float, typer.Option(help="Right ascension of the boresight, degrees.")],
     dec: Annotated[float, typer.Option(help="Declination of the boresight, degrees.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Image to write: .png, or .tiff.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=output_help("Image to write: .png, or .tiff."))
+    ],
     roll: Annotated[
         float, typer.Option(help="Celestial north counter-clockwise from image up, degrees.")
     ] = 0.0,
@@ -72,6 +75,7 @@ def command(
         raise EmulatorError(
             f"--rate {' '.join(f'{value:g}' for value in rate)}: at most {_FASTEST_DEG_S:g} degrees/s in all are needed"
         )
+    prepare_output(output, "-o")
     scene = _scene(profile, fov, size, model)
     camera = scene.camera
     changes = {
@@ -86,12 +90,13 @@ def command(
     frame = renderer.render(Attitude.from_radec_roll(ra, dec, roll), [math.radians(value) for value in rate])
     write_image(output, _marked(frame) if as_annotated else frame.image)
     if as_json:
-        typer.echo(json.dumps(_truth(frame, camera, sensor, output)))
+        text = json.dumps(_truth(frame, camera, sensor, output))
     else:
-        typer.echo(
+        text = (
             f"{output}: {camera.width}×{camera.height} of {sensor.bits} bits, {len(frame.stars.hip)} stars "
             f"to V {sensor.limiting_magnitude:g}, {frame.exposure_s:g} s"
         )
+    typer.echo(text, file=report_stream(output))
 
 
 @dataclass(frozen=True)

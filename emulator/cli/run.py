@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output
+
 
 def command(
     profile: Annotated[
@@ -29,7 +31,7 @@ def command(
     symlink: Annotated[Path | None, typer.Option(help="Link to the pty, removed at the end.")] = None,
     control: Annotated[str, typer.Option(help="Control channel: off, auto, or HOST:PORT.")] = "off",
     truth_log: Annotated[
-        Path | None, typer.Option(help="CSV file of truth and measurement, a row a frame.")
+        Path | None, typer.Option(help=output_help("CSV file of truth and measurement, a row a frame."))
     ] = None,
     scenario: Annotated[
         str,
@@ -82,6 +84,9 @@ def command(
             "no link: nothing could reach the device, and nothing is recorded; "
             "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
         )
+
+    if truth_log is not None:
+        prepare_output(truth_log, "--truth-log")
 
     async def run() -> None:
         import signal
