@@ -300,7 +300,7 @@ def _override(values: dict[str, Any], override: str) -> None:
         raise EmulatorError(f"--set {override}: write section.key=value, e.g. parameters.update_rate=5")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         value = text
     table = values
     for part in parts[:-1]:

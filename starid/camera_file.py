@@ -78,7 +78,7 @@ def load_camera(path: str | Path) -> Camera:
         ) from None
     except OSError as error:
         raise StaridError(f"camera profile {source}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StaridError(f"camera profile {source}: is no TOML ({error}); correct it") from None
     table = content.get("camera")
     if not isinstance(table, dict):

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.errors import StaridError
 from starid.geometric.identifier import Effort, Identifier, scaled_camera
 from starid.solution import Reason, Solution
 from starid.typical_camera import typical_camera
@@ -35,6 +36,9 @@ SIZE_PX: Final = 1000.0
 
 CELLS: Final = 60
 """Parts of the image for an even choice of detections, about."""
+
+NARROWEST_DEG: Final = 0.5
+"""Narrowest field: two stars of Hipparcos on average are in a square one of this width."""
 
 MOST_AT_ONCE: Final = 500
 """Brightest detections that take part."""
@@ -74,9 +78,18 @@ class RoughSearch:
         The stars.
     fov_tolerance : float
         Relative uncertainty of the focal length.
+
+    Raises
+    ------
+    StaridError
+        The field is so narrow that it has too few stars of the catalogue.
     """
 
     def __init__(self, camera: Camera, catalog: StarCatalog, *, fov_tolerance: float) -> None:
+        if camera.fov_deg < NARROWEST_DEG:
+            raise StaridError(
+                f"camera fov_deg: {camera.fov_deg:g} given, at least {NARROWEST_DEG:g} needed: a narrower field has too few stars"
+            )
         self._tolerance = fov_tolerance
         self._scale = max(math.sqrt(camera.width * camera.height) / SIZE_PX, 0.75)
         self._first = Identifier(

@@ -15,6 +15,7 @@ from hil_tests.conformance import conformance_run
 from hil_tests.emulator_process import EmulatorProcess
 from hil_tests.errors import BenchError
 from hil_tests.own_hub import OwnHub
+from hil_tests.results import write_report
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
 
@@ -57,3 +58,23 @@ def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_repo
     assert (end["step"], end["status"]) == (2, "failed")
     assert "by itself with status 7: no more sky" in end["detail"]
     assert ET.parse(junit).getroot().get("failures") == "1"
+
+
+def test_a_report_into_a_device_leaves_the_device(tmp_path):
+    null, full = tmp_path / "null", tmp_path / "full"
+    null.symlink_to("/dev/null")
+    full.symlink_to("/dev/full")
+    write_report(null, b"<report/>")
+    with pytest.raises(BenchError, match="No space left"):
+        write_report(full, b"<report/>")
+    assert null.is_char_device()
+    assert full.is_char_device()
+    assert sorted(tmp_path.iterdir()) == [full, null]
+
+
+def test_a_report_over_a_link_replaces_the_file_that_it_leads_to(tmp_path):
+    target, link = tmp_path / "file.xml", tmp_path / "link.xml"
+    link.symlink_to(target)
+    write_report(link, b"<report/>")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"<report/>"
