@@ -37,8 +37,8 @@ SIZE_PX: Final = 1000.0
 CELLS: Final = 60
 """Parts of the image for an even choice of detections, about."""
 
-NARROWEST_DEG: Final = 0.5
-"""Narrowest field: two stars of Hipparcos on average are in a square one of this width."""
+NARROWEST_DEG: Final = 1.0
+"""Narrowest field: a square one of this width has three stars of Hipparcos on average."""
 
 MOST_AT_ONCE: Final = 500
 """Brightest detections that take part."""

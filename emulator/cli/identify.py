@@ -67,9 +67,10 @@ def command(
     a negative; field and distortion are measured on it.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
-    from starid.imaging.image_io import read_image, write_image
+    from starid.imaging.image_io import image_suffix, read_image, write_image
 
     if annotate is not None:
+        image_suffix(annotate)
         prepare_output(annotate, "-o")
     pixels = read_image(image, allow_colour=fov is not None if allow_colour is None else allow_colour)
     catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)

@@ -64,7 +64,7 @@ def command(
     from emulator.imaging.sensor import Renderer
     from starid.attitude import Attitude
     from starid.catalog import load_catalog
-    from starid.imaging.image_io import write_image
+    from starid.imaging.image_io import image_suffix, write_image
 
     for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
         if not -_TURN_DEG <= value <= _TURN_DEG:
@@ -75,6 +75,7 @@ def command(
         raise EmulatorError(
             f"--rate {' '.join(f'{value:g}' for value in rate)}: at most {_FASTEST_DEG_S:g} degrees/s in all are needed"
         )
+    image_suffix(output)
     prepare_output(output, "-o")
     scene = _scene(profile, fov, size, model)
     camera = scene.camera

@@ -74,6 +74,20 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
     return np.ascontiguousarray(pixels)
 
 
+def image_suffix(path: Path) -> str:
+    """Return the suffix that chooses the format of an image to write: that of its name, .png for a device or pipe without.
+
+    Raises
+    ------
+    StaridError
+        The suffix is that of no format known here.
+    """
+    suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
+    if suffix not in _SUFFIXES:
+        raise StaridError(f"image {path}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    return suffix
+
+
 def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write a grey or colour image, whole or not at all.
 
@@ -93,9 +107,7 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
     import cv2
 
     target = Path(path)
-    suffix = target.suffix.lower() or (".png" if is_stream(target) else "")
-    if suffix not in _SUFFIXES:
-        raise StaridError(f"image {target}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    suffix = image_suffix(target)
     if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
         raise StaridError(
             f"image {target}: JPEG holds 8 bits a pixel, this frame has 16; write a PNG or TIFF"

@@ -134,3 +134,10 @@ def test_a_number_that_is_not_finite_is_refused(
 
 def test_the_epoch_0_is_not_the_default_one() -> None:
     assert "epoch" in refusal("features", "--ra", "83", "--dec", "0", "--epoch", "0")
+
+
+@pytest.mark.parametrize("arguments", ["identify gone.png", "render --ra 1 --dec 2 --profile gone.toml"])
+def test_a_name_that_no_image_can_have_is_refused_before_the_work(arguments: str, tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "out.bmp"
+    assert "suffix '.bmp' given" in refusal(*arguments.split(), "-o", str(path))
+    assert not path.parent.exists()
