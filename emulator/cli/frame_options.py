@@ -16,6 +16,7 @@ PLANAR_EPOCH: Final = 1991.25
 
 SPHERICAL_EPOCH: Final = 2026.0
 
+_WIDEST_FRAME_DEG: Final = 120.0
 _PLANAR_FOV_DEG: Final = 40.0
 _SPHERICAL_FOV_DEG: Final = 42.0
 
@@ -46,6 +47,10 @@ def frame_parameters(
     if not 1.0 < overlap_percent < 100.0:
         raise EmulatorError(
             f"--overlap {overlap_percent}: percent are needed, above 1 and below 100, such as 99.5"
+        )
+    if fov is not None and not 0.0 < fov <= _WIDEST_FRAME_DEG:
+        raise EmulatorError(
+            f"--fov {fov:g}: degrees are needed, above 0 and at most {_WIDEST_FRAME_DEG:g}, such as 40"
         )
     overlap = overlap_percent / 100.0
     if choice("geometry", geometry, ("planar", "spherical")) == "planar":

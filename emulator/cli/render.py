@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _NUMBERED_TO_MAGNITUDE = 3.6
 _TURN_DEG = 360.0
+_NARROWEST_DEG = 0.1
 _FASTEST_DEG_S = 1000.0
 
 
@@ -77,6 +78,8 @@ def command(
         )
     image_suffix(output)
     prepare_output(output, "-o")
+    if fov is not None and not fov >= _NARROWEST_DEG:
+        raise EmulatorError(f"--fov {fov:g}: at least {_NARROWEST_DEG:g} degrees are needed")
     scene = _scene(profile, fov, size, model)
     camera = scene.camera
     changes = {

@@ -141,3 +141,26 @@ def test_a_name_that_no_image_can_have_is_refused_before_the_work(arguments: str
     path = tmp_path / "folder" / "out.bmp"
     assert "suffix '.bmp' given" in refusal(*arguments.split(), "-o", str(path))
     assert not path.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("database build --overlap 99.9999999", "give less overlap or wider frames"),
+        ("database build --overlap 50 --fov 1e-5", "give less overlap or wider frames"),
+        ("features --ra 1 --dec 2 --fov 1e9", "--fov 1e+09: degrees are needed"),
+        ("features --ra 1e300 --dec 2", "right ascension 1e+300"),
+        ("render --ra 1 --dec 2 --fov 1e-9 -o out.png", "--fov 1e-09: at least 0.1"),
+        ("catalog --path /dev/zero", "cannot be read (not a regular file)"),
+        ("calibrate gone.png --fov 1 -o /proc/x/y", "its folder cannot be made"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    arguments: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    printed = capsys.readouterr()
+    assert (caught.value.code, printed.out, printed.err.count("\n")) == (2, "", 1)
+    assert said in printed.err
