@@ -164,7 +164,7 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
     if not (math.isfinite(fov_deg) and 0.0 < fov_deg <= 120.0):
         raise GridError(f"grid: a frame {fov_deg}° wide is not possible; give more than 0° and at most 120°")
     step = fov_deg * (1.0 - overlap)
-    if not _FULL_TURN * 180.0 <= MOST_CELLS * step**2:
+    if not MOST_CELLS * step**2 >= _FULL_TURN * 180.0:
         raise GridError(
             f"grid: frames {fov_deg}° wide that overlap by {100.0 * overlap:.9g} % are more than {MOST_CELLS} all over the "
             "sky; give less overlap or wider frames"
