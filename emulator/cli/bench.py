@@ -17,7 +17,8 @@ group = typer.Typer(help="Measure speed, latency and accuracy.", no_args_is_help
 @group.command("latency")
 def latency(
     rates: Annotated[
-        list[float] | None, typer.Option("--rate", help="Update rate, Hz; 0 is standby. May be repeated.")
+        list[float] | None,
+        typer.Option("--rate", min=0.0, help="Update rate, Hz; 0 is standby. May be repeated."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for each rate.")] = 15.0,
     workers: Annotated[

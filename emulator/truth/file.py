@@ -157,6 +157,13 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
         attitudes.append(_attitude(where, needed, row))
         if has_rates:
             rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
+        elif len(times) > 1:
+            rate = np.degrees(rate_between(attitudes[-2], attitudes[-1], times[-1] - times[-2]))
+            if np.abs(rate).max() > MAX_RATE_DEG_S:
+                raise EmulatorError(
+                    f"{where}: the turn from the row before is faster than {MAX_RATE_DEG_S:g} degrees a second; "
+                    f"give {', '.join(RATE_COLUMNS)} if the attitude jumps"
+                )
     if not times:
         raise EmulatorError(f"truth file {path}: no rows after the header; add at least one")
     rate_array = np.array(rates) if has_rates else None

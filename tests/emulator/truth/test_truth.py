@@ -147,6 +147,10 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,qx,qy,qz,qw\n0,0,0,0,2\n", "line 2: quaternion of length 2"),
         ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw = 'nan' is not a number"),
         ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg = 91 is outside"),
+        (
+            "t,qx,qy,qz,qw\n0,0,0,0,1\n0.001,1,0,0,0\n",
+            "line 3: the turn from the row before is faster than 600",
+        ),
         ("t,qx,qy,qz,qw\n0,0,0,0,1_0\n", "line 2: qw = '1_0' is not a number"),
         ("t,ra_deg,dec_deg,roll_deg\n0,1e300,0,0\n", "line 2: ra_deg = 1e+300 is outside ±1e+06"),
         ("t,ra_deg,dec_deg,roll_deg\n0,0,0,1e999\n", "line 2: roll_deg = '1e999' is not a number"),
