@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from emulator.errors import EmulatorError
+from starid.files import read_number
 
 NANOSECONDS: Final = 1_000_000_000
 """Nanoseconds in a second."""
@@ -93,7 +94,7 @@ def make_clock(text: str) -> RealClock | ScaledClock | SteppedClock:
         return SteppedClock()
     if kind == "scaled":
         try:
-            return ScaledClock(float(factor))
+            return ScaledClock(read_number(factor))
         except ValueError:
             pass
     raise EmulatorError(f"clock: {text!r} is none of real, scaled:FACTOR, stepped")

@@ -163,11 +163,12 @@ class Emulation:
             device.on_frame.append(truth_log.write)
             self._closers.append(truth_log.close)
         device.on_frame.append(_log_frame)
-        if self.options.scenario:
-            load_scenario(self.options.scenario).enter(self)
+        scenario = load_scenario(self.options.scenario) if self.options.scenario else None
         device.power_on()
         try:
             await self._open_links(device)
+            if scenario is not None:
+                scenario.enter(self)
             if self.options.control != "off":
                 self.control = ControlServer(self, self.ended.set, self.options.control_token)
                 self.ready_words["control"] = await self.control.start(self.options.control)

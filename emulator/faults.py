@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
@@ -38,13 +38,17 @@ Chance = Annotated[float, Field(ge=0.0, le=1.0)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
 
 
+NO_ERROR: Final = 0
+"""Value in the enumeration `device_error` that no error mode has."""
+
+
 class DeviceFault(Strict):
     """What goes wrong in the device."""
 
     stuck: bool = False
     """Requests are neither taken nor answered; frames go on."""
     error: str | None = None
-    """Enter the error mode for this cause, a name of the enumeration `device_error`."""
+    """Enter the error mode for this cause, a name of the enumeration `device_error` that is an error."""
     reset: str | None = None
     """Restart now for this cause, a name of the enumeration `reset_cause`."""
 
@@ -90,7 +94,7 @@ class Faults:
         EmulatorError
             A name is not known, or a link is not there.
         """
-        self._check(request)
+        self.check(request)
         device = self._emulation.device
         if request.optical is not None:
             self._optical = dict(request.optical)
@@ -107,19 +111,29 @@ class Faults:
             if request.device.error is not None:
                 device.modes.fail(request.device.error)
 
-    def _check(self, request: FaultRequest) -> None:
+    def check(self, request: FaultRequest) -> None:
+        """Check that this run can bring faults about.
+
+        Raises
+        ------
+        EmulatorError
+            A name is not known, or a link is not there.
+        """
         enums = self._emulation.device.icd.enums
         if request.device is not None:
-            for key, name, enum in (
-                ("error", request.device.error, enums["device_error"]),
-                ("reset", request.device.reset, enums["reset_cause"]),
+            errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
+            for key, name, known in (
+                ("error", request.device.error, errors),
+                ("reset", request.device.reset, list(enums["reset_cause"].values)),
             ):
-                if name is not None and name not in enum.values:
-                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(enum.values)}")
+                if name is not None and name not in known:
+                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
         there = {name for name, _ in self._wires()}
         for name, fault in (("serial", request.serial), ("can", request.can)):
             if fault is not None and name not in there:
-                raise EmulatorError(f"{name}: this run has no such link")
+                raise EmulatorError(
+                    f"{name}: this run has no such link; start it with --{name}, or leave this out"
+                )
 
     def _wires(self) -> Iterator[tuple[str, WireFaults[Any]]]:
         """Each wire of the run under the name of its faults: both users of the CAN bus have the same."""

@@ -14,15 +14,22 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, PrivateAttr, ValidationError
 
 from emulator.errors import EmulatorError
+from emulator.toml_file import read_toml
 from emulator.truth.config import FixedConfig, Strict, TruthConfig
 from emulator.wording import explain
-from protocol.user_file import read_user_text
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_DEPTH: Final = 8
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
+LATEST_UNIX_S: Final = 4_102_444_800.0
+"""2100-01-01: the telemetry's 32-bit seconds have six more years until they wrap."""
+
+FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
+"""What one stage of a frame may take."""
+
+FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
+PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
+DistortionTerm = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class RunConfig(Strict):
@@ -36,7 +43,7 @@ class RunConfig(Strict):
     """Where frames are made and solved."""
     state_dir: str = ""
     """Folder of what survives a restart; empty: kept until the process ends."""
-    start_unix_s: NotNegative = 1_767_225_600.0
+    start_unix_s: Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S)] = 1_767_225_600.0
     """The device's clock at run time zero, until it is set: 2026-01-01."""
 
 
@@ -55,10 +62,10 @@ class CameraConfig(Strict):
     width: Annotated[int, Field(ge=64, le=4096)] = 937
     height: Annotated[int, Field(ge=64, le=4096)] = 937
     fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
-    focal_px: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    centre_px: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
+    centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
-    distortion: list[float] = Field(default_factory=list, max_length=5)
+    distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
     """Brown–Conrady k1, k2, p1, p2, k3."""
 
     def values(self) -> dict[str, Any]:
@@ -76,7 +83,7 @@ class DeviceConfig(Strict):
     interface_version: Annotated[int, Field(ge=0, le=255)] = 1
     firmware_major: Annotated[int, Field(ge=0, le=255)] = 1
     firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
-    boot_s: NotNegative = 0.5
+    boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
     """Least time in boot mode."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Valid frames from which the body rate is estimated, where the identifier gives none."""
@@ -85,11 +92,11 @@ class DeviceConfig(Strict):
 class TimingConfig(Strict):
     """How long the unit takes for a frame; reported in telemetry and kept before a result is published."""
 
-    readout_s: NotNegative = 0.020
-    detect_s: NotNegative = 0.040
-    detect_per_star_s: NotNegative = 0.00005
-    identify_lost_s: NotNegative = 0.020
-    identify_tracking_s: NotNegative = 0.010
+    readout_s: FrameSeconds = 0.020
+    detect_s: FrameSeconds = 0.040
+    detect_per_star_s: Annotated[float, Field(ge=0.0, le=0.01)] = 0.00005
+    identify_lost_s: FrameSeconds = 0.020
+    identify_tracking_s: FrameSeconds = 0.010
 
 
 class SerialConfig(Strict):
@@ -112,7 +119,7 @@ class CanConfig(Strict):
     """`auto` (vcan0, else the TCP hub), a channel of python-can, or `off`."""
     address: Annotated[int, Field(ge=1, le=254)] = 4
     host_address: Annotated[int, Field(ge=1, le=254)] = 1
-    frame_gap_s: NotNegative = 0.0
+    frame_gap_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Least time between two frames of one message."""
 
 
@@ -247,14 +254,7 @@ def _culprit(path: Path, overrides: Sequence[str], why: str) -> str:
 
 
 def _read(path: Path, depth: int) -> dict[str, Any]:
-    try:
-        values = tomllib.loads(read_user_text(path))
-    except OSError as error:
-        raise EmulatorError(f"profile {path}: cannot be read ({error.strerror}); give a TOML file") from None
-    except UnicodeDecodeError as error:
-        raise EmulatorError(f"profile {path}: not UTF-8 ({error.reason}); give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise EmulatorError(f"profile {path}: not TOML ({error})") from None
+    values = read_toml(path, "profile")
     base = values.pop("extends", None)
     if base is None:
         return values
@@ -300,7 +300,7 @@ def _override(values: dict[str, Any], override: str) -> None:
         raise EmulatorError(f"--set {override}: write section.key=value, e.g. parameters.update_rate=5")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         value = text
     table = values
     for part in parts[:-1]:

@@ -13,28 +13,27 @@ TOML, one `[[at]]` table an event, in any order::
     clear_faults = true
 
 `fault` and `truth` take what the control channel's `fault` and `set_truth` take. Events happen in run time, so that
-they come at the same frames whatever the clock. Truth files are read when the run starts. A live feed cannot be set by a
-scenario: it needs a socket, which takes time.
+they come at the same frames whatever the clock. Names, links and truth files are checked when the run starts. A live feed
+cannot be set by a scenario: it needs a socket, which takes time.
 """
 
 from __future__ import annotations
 
 import logging
-import tomllib
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from emulator.clock import NANOSECONDS
+from emulator.device.scheduler import Action
 from emulator.errors import EmulatorError
 from emulator.faults import FaultRequest
 from emulator.profile import configs_folder
+from emulator.toml_file import read_toml
 from emulator.truth.config import LiveConfig, Strict, TruthConfig
-from emulator.truth.source import TruthSource
 from emulator.wording import explain
-from protocol.user_file import read_user_text
+from starid.errors import StaridError
 
 if TYPE_CHECKING:
     from emulator.emulation import Emulation
@@ -58,6 +57,25 @@ class ScenarioEvent(Strict):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
+    def prepare(self, emulation: Emulation) -> Action:
+        """Make what is to be done at the run time; whatever it needs is read and checked before."""
+        if self.fault is not None:
+            emulation.faults.check(self.fault)
+        folder = emulation.profile.folder
+        truth = None if self.truth is None else self.truth.build(self.run_time_s, folder)
+
+        def happen(_due_ns: int) -> None:
+            if self.clear_faults:
+                emulation.faults.clear()
+            if self.fault is not None:
+                emulation.faults.inject(self.fault)
+            if truth is not None:
+                emulation.device.cycle.truth = truth
+                emulation.close_feed()
+            log.info("scenario at %g s", self.run_time_s)
+
+        return happen
+
 
 class Scenario(Strict):
     """A whole scenario."""
@@ -66,19 +84,19 @@ class Scenario(Strict):
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
 
     def enter(self, emulation: Emulation) -> None:
-        """Enter all events into the run.
+        """Enter all events into a run whose links are open; what they need is read and checked now.
 
         Raises
         ------
         EmulatorError
-            A truth file cannot be read.
+            An event asks for what this run does not have, or names a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
-            due_ns = round(event.run_time_s * NANOSECONDS)
-            truth = None
-            if event.truth is not None:
-                truth = event.truth.build(event.run_time_s, emulation.profile.folder)
-            emulation.device.scheduler.at(due_ns, partial(_happen, emulation, event, truth))
+            try:
+                action = event.prepare(emulation)
+            except (EmulatorError, StaridError) as error:
+                raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
+            emulation.device.scheduler.at(round(event.run_time_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:
@@ -92,36 +110,11 @@ def load_scenario(name_or_path: str) -> Scenario:
     path = Path(name_or_path).expanduser()
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
         path = configs_folder() / "scenarios" / f"{name_or_path}.toml"
-    try:
-        values = tomllib.loads(read_user_text(path))
-    except FileNotFoundError:
+    if not path.exists():
         known = ", ".join(sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
-        raise EmulatorError(
-            f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}"
-        ) from None
-    except OSError as error:
-        raise EmulatorError(f"scenario {path}: cannot be read ({error.strerror}); give a TOML file") from None
-    except UnicodeDecodeError as error:
-        raise EmulatorError(f"scenario {path}: not UTF-8 ({error.reason}); give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise EmulatorError(f"scenario {path}: not TOML ({error})") from None
+        raise EmulatorError(f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}")
+    values = read_toml(path, "scenario")
     try:
         return Scenario.model_validate(values)
     except ValidationError as error:
         raise EmulatorError(f"scenario {path}: {explain(error, Scenario)}") from None
-
-
-def _happen(emulation: Emulation, event: ScenarioEvent, truth: TruthSource | None, _due_ns: int) -> None:
-    """Do an event; what this run cannot do is told in the log, and the run goes on."""
-    try:
-        if event.clear_faults:
-            emulation.faults.clear()
-        if event.fault is not None:
-            emulation.faults.inject(event.fault)
-        if truth is not None:
-            emulation.device.cycle.truth = truth
-            emulation.close_feed()
-    except EmulatorError as error:
-        log.warning("scenario at %g s: %s", event.run_time_s, error)
-    else:
-        log.info("scenario at %g s", event.run_time_s)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -28,15 +28,17 @@ def explain(
     """
     first = _telling_fault(error)
     loc = (*under, *first["loc"])
-    unknown = first["type"] == "extra_forbidden"  # its last part is what a user wrote, whatever it is called
-    path = [str(part) for part in (loc[:-1] if unknown else loc) if part not in _TAGS]
-    path += [str(loc[-1])] if unknown else []
-    where = ".".join(path) or "as a whole"
-    if unknown:
-        known = sorted([*_keys_at(model, loc[:-1]), *(also if len(loc) == 1 else ())])
-        near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=NEAR)
+    path, models = _along(model, loc)
+    if first["type"] == "extra_forbidden":
+        path, above = _along(model, loc[:-1])
+        unknown = str(loc[-1])  # what a user wrote, even where an alternative is called that
+        known = sorted(
+            {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
+        )
+        near = difflib.get_close_matches(unknown, known, n=1, cutoff=NEAR)
         remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-        return f"{where}: unknown key; {remedy}"
+        return f"{'.'.join([*path, unknown])}: unknown key; {remedy}"
+    where = ".".join(path) or "as a whole"
     context = first.get("ctx", {})
     if first["type"] == "missing":
         return f"{where}: missing; give it"
@@ -44,7 +46,7 @@ def explain(
         key = str(context["discriminator"]).strip("'")
         given = f" (given: {context['tag']!r})" if "tag" in context else ""
         expected = context.get("expected_tags") or ", ".join(
-            repr(tag) for tag in sorted(_tags_at(model, loc))
+            sorted(repr(tag) for each in models for tag in _tags_of(each))
         )
         return f"{'.'.join([*path, key])}: must be one of {expected}{given}"
     shown = "" if isinstance(first["input"], (dict, list)) else f" (given: {first['input']!r})"
@@ -78,51 +80,35 @@ _WORDS: Final = (
     ("less than or equal to", "at most"),
 )
 
-_TAGS: Final = frozenset({"fixed", "rate", "slew", "file", "live", "hold"})
-"""Names of the alternatives that pydantic puts between the keys of a place; no key has such a name."""
 
-
-def _keys_at(model: type[BaseModel], place: Sequence[Any]) -> list[str]:
-    """Return the keys that may stand at a place, which may hold the names of alternatives."""
+def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str], list[type[BaseModel]]]:
+    """Follow a field path of pydantic; return its keys without the tags of alternatives, and the models at its end."""
     models: list[type[BaseModel]] = [model]
-    for part in place:
-        if isinstance(part, int):
+    keys: list[str] = []
+    for part in loc:
+        chosen = [each for each in models if part in _tags_of(each)] if len(models) > 1 else []
+        if chosen:
+            models = chosen
             continue
-        if part in _TAGS:
-            models = [each for each in models if part in _tags_of(each)]
-        else:
-            models = [
-                below
-                for each in models
-                if part in each.model_fields
-                for below in _models_in(each.model_fields[part].annotation)
-            ]
-    return sorted({key for each in models for key in each.model_fields})
-
-
-def _tags_at(model: type[BaseModel], place: Sequence[Any]) -> set[str]:
-    """Return the values that the key that tells alternatives apart may have at a place."""
-    below = [
-        each
-        for part in place
-        if part in model.model_fields
-        for each in _models_in(model.model_fields[part].annotation)
-    ]
-    return {str(tag) for each in below for tag in _tags_of(each)}
+        keys.append(str(part))
+        if isinstance(part, str):
+            fields = [each.model_fields[part] for each in models if part in each.model_fields]
+            models = [below for field in fields for below in _models_in(field.annotation)]
+    return keys, models
 
 
 def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
-    """Return the values by which a model is told from its alternatives."""
-    return tuple(
-        value
-        for name in ("kind", "do")
-        if name in model.model_fields
-        for value in getattr(model.model_fields[name].annotation, "__args__", ())
+    """Return the values by which a model is told from its alternatives: those of its fields that can have but one."""
+    literals = (
+        get_args(field.annotation)
+        for field in model.model_fields.values()
+        if get_origin(field.annotation) is Literal
     )
+    return tuple(values[0] for values in literals if len(values) == 1)
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
     """Return the models that an annotation names, however deep."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]
+    return [model for inner in get_args(annotation) for model in _models_in(inner)]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from hil_tests.errors import BenchError
+from hil_tests.results import write_whole
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _GREY: Final = 0
@@ -44,6 +45,4 @@ def encode_png(pixels: bytes, width: int, height: int) -> bytes:
 def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
     """Write a grey picture of 8 bits a pixel to `path`, whole or not at all."""
     data = encode_png(pixels, width, height)
-    partial = path.with_name(path.name + ".part")
-    partial.write_bytes(data)
-    partial.replace(path)
+    write_whole(path, data)

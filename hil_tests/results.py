@@ -140,12 +140,12 @@ def prepare_report(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BenchError(f"{path}: its folder cannot be made: {error.strerror}") from None
-    if not os.access(path.parent, os.W_OK | os.X_OK):
+    if not _is_stream(path) and not os.access(path.parent, os.W_OK | os.X_OK):
         raise BenchError(f"{path}: cannot be written: its folder takes no new files")
 
 
 def write_report(path: Path, data: bytes) -> None:
-    """Write a report, whole or not at all; its folder is made if need be.
+    """Write a report, whole or not at all, or into a device or pipe; its folder is made if need be.
 
     Raises
     ------
@@ -153,14 +153,36 @@ def write_report(path: Path, data: bytes) -> None:
         No file can be written there.
     """
     prepare_report(path)
-    partial = path.with_name(path.name + ".part")
+    try:
+        write_whole(path, data)
+    except OSError as error:
+        raise BenchError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all; a device or pipe stays what it is and gets the data, a link stays a link.
+
+    Raises
+    ------
+    OSError
+        It cannot be written.
+    """
+    if _is_stream(path):
+        path.write_bytes(data)
+        return
+    target = path.resolve()
+    partial = target.with_name(target.name + ".part")
     try:
         partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
+        partial.replace(target)
+    except OSError:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        raise BenchError(f"{path}: cannot be written: {error.strerror}") from None
+        raise
+
+
+def _is_stream(path: Path) -> bool:
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float) -> None:

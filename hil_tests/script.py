@@ -97,7 +97,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ScriptError(f"{path}: cannot be read: {reason}") from None
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScriptError(f"{path}: not valid TOML: {error}") from None
     return _Checker(path, icd).script(table)
 

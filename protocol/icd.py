@@ -155,7 +155,7 @@ def _read(file: Path) -> FileModel:
         document = tomllib.loads(read_user_text(file))
     except OSError as error:
         raise IcdError(f"{file}: cannot read the interface definition: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise IcdError(f"{file}: not valid TOML: {error}") from None
     try:
         return FileModel.model_validate(document)

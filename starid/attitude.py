@@ -242,7 +242,13 @@ class Attitude:
         )
 
     def __str__(self) -> str:
-        return f"RA {self.ra_deg:.4f}° Dec {self.dec_deg:+.4f}° roll {self.roll_deg:.4f}°"
+        ra, roll = (turn_text(angle, 4) for angle in (self.ra_deg, self.roll_deg))
+        return f"RA {ra}° Dec {self.dec_deg:+.4f}° roll {roll}°"
+
+
+def turn_text(degrees: float, digits: int) -> str:
+    """Right ascension or roll as text with so many decimals, below 360 after rounding too."""
+    return f"{round(degrees % 360.0, digits) % 360.0:.{digits}f}"
 
 
 def random_attitude(rng: np.random.Generator) -> Attitude:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import math
 import os
 import re
+import shutil
 import sys
 import tempfile
 import zipfile
@@ -16,6 +18,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from starid.files import is_stream, open_stream
 
 _log = logging.getLogger(__name__)
 
@@ -125,7 +129,10 @@ def remove(file: CachedFile) -> bool:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file in the same folder, then move it onto `path` in one step.
+    """Let `write` fill a temporary file, then move it onto `path` in one step.
+
+    Where `path` is a link, the file that it leads to is replaced. What is no regular file (a device, a pipe, the
+    standard output) gets the content written into it when all of it is there.
 
     Parameters
     ----------
@@ -137,16 +144,26 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     Raises
     ------
     OSError
-        The folder cannot be written.
+        The folder cannot be written, or `path` is a folder itself.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    if is_stream(path):
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder, path.name)
+            write(whole)
+            with whole.open("rb") as content, open_stream(path) as stream:
+                shutil.copyfileobj(content, stream)
+        return
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    target = Path(os.path.realpath(path))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
     os.close(descriptor)
     part = Path(name)
     try:
         write(part)
         part.chmod(0o644)
-        part.replace(path)
+        part.replace(target)
     finally:
         part.unlink(missing_ok=True)
 

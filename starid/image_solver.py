@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 _FEW: Final = 8
 """Fewer matched stars leave the lens as it was taken to be."""
 
-_ROUNDS: Final = ((ALL_ROUNDS[:1], None), (ALL_ROUNDS[1:2], 4), (ALL_ROUNDS[2:], 1))
+_ROUNDS: Final = ((ALL_ROUNDS[:2], None), (ALL_ROUNDS[2:3], 4), (ALL_ROUNDS[3:], 1))
 """Rounds of the search, and how many of the looks at the image get them; None while they are still to be made."""
 
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.errors import StaridError
 from starid.geometric.identifier import Effort, Identifier, scaled_camera
 from starid.solution import Reason, Solution
 from starid.typical_camera import typical_camera
@@ -25,8 +26,8 @@ from starid.typical_camera import typical_camera
 DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
 """Relative displacements at the corner of the image, of lenses that are tried."""
 
-TRIANGLES: Final = (100, 1000, 5000)
-"""Triangles looked up in each round; the last one is without other distortions."""
+TRIANGLES: Final = (100, 100, 1000, 5000)
+"""Triangles looked up in each round; the first one has narrow windows, and it and the last one no distortions."""
 
 ALL_ROUNDS: Final = range(len(TRIANGLES))
 
@@ -35,6 +36,9 @@ SIZE_PX: Final = 1000.0
 
 CELLS: Final = 60
 """Parts of the image for an even choice of detections, about."""
+
+NARROWEST_DEG: Final = 1.0
+"""Narrowest field: a square one of this width has three stars of Hipparcos on average."""
 
 MOST_AT_ONCE: Final = 500
 """Brightest detections that take part."""
@@ -74,9 +78,18 @@ class RoughSearch:
         The stars.
     fov_tolerance : float
         Relative uncertainty of the focal length.
+
+    Raises
+    ------
+    StaridError
+        The field is so narrow that it has too few stars of the catalogue.
     """
 
     def __init__(self, camera: Camera, catalog: StarCatalog, *, fov_tolerance: float) -> None:
+        if camera.fov_deg < NARROWEST_DEG:
+            raise StaridError(
+                f"camera fov_deg: {camera.fov_deg:g} given, at least {NARROWEST_DEG:g} needed: a narrower field has too few stars"
+            )
         self._tolerance = fov_tolerance
         self._scale = max(math.sqrt(camera.width * camera.height) / SIZE_PX, 0.75)
         self._first = Identifier(
@@ -137,16 +150,13 @@ class RoughSearch:
         choices = [brightest[:MOST_AT_ONCE]]
         choices += [even_choice(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
         known_lens = any(self._first.camera.distortion)
-        if 0 in rounds:
-            strict = dataclasses.replace(_STRICT, max_triangles=TRIANGLES[0])
+        for number in rounds:
+            plain = known_lens or number in (ALL_ROUNDS[0], ALL_ROUNDS[-1])
+            windows = _STRICT if number == ALL_ROUNDS[0] else _LENIENT
+            effort = self._scaled(dataclasses.replace(windows, max_triangles=TRIANGLES[number]))
             for rows in choices:
-                yield _Chance(rows, 0.0, self._scaled(strict))
-        for triangles in (TRIANGLES[number] for number in rounds):
-            lenses = DISTORTIONS[:1] if known_lens or triangles == TRIANGLES[-1] else DISTORTIONS
-            lenient = self._scaled(dataclasses.replace(_LENIENT, max_triangles=triangles))
-            for rows in choices:
-                for distortion in lenses:
-                    yield _Chance(rows, distortion, lenient)
+                for distortion in DISTORTIONS[:1] if plain else DISTORTIONS:
+                    yield _Chance(rows, distortion, effort)
 
     def _scaled(self, effort: Effort) -> Effort:
         """Effort with its windows grown to the size of the image."""

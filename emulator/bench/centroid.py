@@ -21,6 +21,7 @@ import numpy.typing as npt
 from emulator.errors import EmulatorError
 from emulator.imaging.sensor import Frame, Renderer, SensorModel
 from starid.attitude import random_attitude
+from starid.cache import write_atomically
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.imaging.centroid import star_model
@@ -272,7 +273,8 @@ def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
     panels[0, 0].set_ylabel("error per axis, px (root mean square)")
     panels[0, 0].legend(loc="upper left", fontsize=8)
     try:
-        figure.savefig(path, dpi=150)
+        form = path.suffix.removeprefix(".").lower() or "png"
+        write_atomically(path, lambda part: figure.savefig(part, dpi=150, format=form))
     except (OSError, ValueError) as error:
         raise EmulatorError(f"{path}: cannot write the plot: {error}") from None
     finally:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import math
 import sys
 from typing import Annotated, Any, Final, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
+from emulator.cli.output import show_every_character
 from emulator.errors import EmulatorError
 from emulator.wording import plain
 from hil_tests.errors import BenchError
@@ -53,6 +56,26 @@ def _print_version(value: bool) -> None:
         raise typer.Exit
 
 
+class FiniteCommand(TyperCommand):
+    """A command none of whose options is infinite or no number at all: nan lies within every bound."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Call the command with its options.
+
+        Raises
+        ------
+        typer.BadParameter
+            An option is not finite.
+        """
+        params: list[Any] = list(self.params)
+        for param in params:
+            value = ctx.params.get(param.name)
+            values = value if isinstance(value, (list, tuple)) else (value,)
+            if not all(math.isfinite(each) for each in values if isinstance(each, float)):
+                raise typer.BadParameter("must be finite", ctx=ctx, param=param)
+        return super().invoke(ctx)
+
+
 def build_app() -> typer.Typer:
     """Assemble the command line from the modules named in `COMMANDS`."""
     app = typer.Typer(
@@ -66,9 +89,11 @@ def build_app() -> typer.Typer:
     for name, module_name in COMMANDS.items():
         module = importlib.import_module(f"emulator.cli.{module_name}")
         if hasattr(module, "group"):
+            for each in module.group.registered_commands:
+                each.cls = FiniteCommand
             app.add_typer(module.group, name=name)
         else:
-            app.command(name)(module.command)
+            app.command(name, cls=FiniteCommand)(module.command)
     return app
 
 
@@ -99,12 +124,15 @@ def describe_refusal(error: Any) -> str:
 
 def main() -> None:
     """Run the command line; refused input ends in one line on stderr and exit status 2."""
+    show_every_character()
     try:
         status = build_app()(prog_name="starhil", standalone_mode=False)
     except (StaridError, ProtocolError, EmulatorError, BenchError) as error:
         refuse(str(error))
     except OSError as error:
         refuse(describe_os_error(error))
+    except MemoryError as error:
+        refuse(f"not enough memory: {error}" if str(error) else "not enough memory")
     except (KeyboardInterrupt, typer.Abort):
         raise SystemExit(EXIT_INTERRUPTED) from None
     except USAGE_ERROR as error:

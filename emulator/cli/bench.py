@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output
+
 _TABLE_WIDTH = 134
 
 group = typer.Typer(help="Measure speed, latency and accuracy.", no_args_is_help=True)
@@ -15,7 +17,8 @@ group = typer.Typer(help="Measure speed, latency and accuracy.", no_args_is_help
 @group.command("latency")
 def latency(
     rates: Annotated[
-        list[float] | None, typer.Option("--rate", help="Update rate, Hz; 0 is standby. May be repeated.")
+        list[float] | None,
+        typer.Option("--rate", min=0.0, help="Update rate, Hz; 0 is standby. May be repeated."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for each rate.")] = 15.0,
     workers: Annotated[
@@ -72,7 +75,8 @@ def centroid(
     seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
     bits: Annotated[int, typer.Option(help="8, 12 or 16.")] = 8,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Plot to write: .png, .svg or .pdf.")
+        Path | None,
+        typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf.")),
     ] = None,
     json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -86,6 +90,8 @@ def centroid(
     from emulator.bench.centroid import DEFAULT_RATES_DEG_S, measure_centroids, plot_centroids
     from emulator.imaging.sensor_model import SensorModel
 
+    if output is not None:
+        prepare_output(output, "-o")
     progress = Console(stderr=True)
     sensor = SensorModel(bits=bits)
     rows = measure_centroids(rates or DEFAULT_RATES_DEG_S, frames, seed, sensor, progress=progress.print)

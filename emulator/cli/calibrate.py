@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output, report_stream
 from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
@@ -20,7 +21,9 @@ def command(
     images: Annotated[
         list[Path], typer.Argument(help="PNG, TIFF or JPEG frames from one camera, all of one size.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Camera profile (TOML) to write.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=output_help("Camera profile (TOML) to write."))
+    ],
     fov: Annotated[float, typer.Option(help="Rough horizontal field of view, edge to edge, degrees.")],
     fov_tolerance: Annotated[
         float, typer.Option(min=0.0, max=0.3, help="Relative uncertainty of that field.")
@@ -48,13 +51,14 @@ def command(
     from starid.catalog import DEFAULT_EPOCH, load_catalog
     from starid.self_calibration import self_calibrate
 
+    prepare_output(output, "-o")
     frames, (height, width) = _stars(images, allow_colour=allow_colour)
     start = Camera.from_dict({"fov_deg": fov, "width": width, "height": height, "model": model})
     catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)
     result = self_calibrate(frames, start, catalog, fov_tolerance=fov_tolerance, estimate=estimate)
     save_camera(output, result.calibration.camera, result.calibration)
     if as_json:
-        print(json.dumps(_report(images, result)))
+        print(json.dumps(_report(images, result)), file=report_stream(output))
     else:
         _show(images, output, result)
     if result.refused:
@@ -117,8 +121,10 @@ def _show(images: list[Path], output: Path, result: SelfCalibration) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from starid.attitude import turn_text
+
     report, calibration = _report(images, result), result.calibration
-    console = Console()
+    console = Console(file=report_stream(output))
     table = Table(title=f"camera, {calibration.camera.fov_deg:.4f}° wide", box=SIMPLE)
     for head in ("parameter", "value", "±"):
         table.add_column(head, justify="left" if head == "parameter" else "right")
@@ -134,7 +140,8 @@ def _show(images: list[Path], output: Path, result: SelfCalibration) -> None:
             head, justify="left" if head == "image" else "right", no_wrap=head != "image", overflow="fold"
         )
     for frame in report["frames"]:
-        angles = (f"{frame[key]:.4f}" for key in ("ra_deg", "dec_deg", "roll_deg"))
+        ra, roll = (turn_text(frame[key], 4) for key in ("ra_deg", "roll_deg"))
+        angles = (ra, f"{frame['dec_deg']:.4f}", roll)
         table.add_row(Path(frame["image"]).name, *angles, str(frame["stars"]), f"{frame['rms_px']:.3f}")
     console.print(table)
     for image, reason in report["refused"].items():

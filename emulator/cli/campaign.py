@@ -43,7 +43,11 @@ def lost_in_space(
     ] = "clear",
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Folder that keeps finished chunks; a second run goes on there."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder that keeps finished chunks; made if it is missing. A second run goes on there.",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

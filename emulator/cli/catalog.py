@@ -104,12 +104,19 @@ def _show(catalog: StarCatalog, rows: int, *, as_json: bool) -> None:
     for head, _ in _TABLE.values():
         table.add_column(head, justify="right", no_wrap=True)
     for record in records[:rows]:
-        values = [(record[name], digits) for name, (_, digits) in _TABLE.items()]
-        table.add_row(*("–" if value is None else f"{value:.{digits}f}" for value, digits in values))
+        table.add_row(*(_cell(name, record[name], digits) for name, (_, digits) in _TABLE.items()))
     console = Console()
     console.print(table)
     if len(records) > rows:
         console.print(f"… and {len(records) - rows} fainter ones (--rows, --limit or --json)")
+
+
+def _cell(name: str, value: float | None, digits: int) -> str:
+    from starid.attitude import turn_text
+
+    if value is None:
+        return "–"
+    return turn_text(value, digits) if name == "ra_deg" else f"{value:.{digits}f}"
 
 
 def _summarise(catalog: StarCatalog, *, as_json: bool) -> None:

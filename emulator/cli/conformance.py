@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.output import output_help
+
 
 def command(
     patterns: Annotated[
@@ -46,9 +48,10 @@ def command(
         bool, typer.Option("--safe-only", help="Only cases that change nothing: for a unit in use.")
     ] = False,
     list_only: Annotated[bool, typer.Option("--list", help="List the cases and end.")] = False,
-    junit: Annotated[Path | None, typer.Option(help="Write a JUnit XML file.")] = None,
+    junit: Annotated[Path | None, typer.Option(help=output_help("Write a JUnit XML file."))] = None,
     html: Annotated[
-        Path | None, typer.Option(help="Write a page with all that was sent, expected and seen.")
+        Path | None,
+        typer.Option(help=output_help("Write a page with all that was sent, expected and seen.")),
     ] = None,
     dialect: Annotated[str, typer.Option(help="Form of serial replies: a, b or c.")] = "b",
     baud: Annotated[

@@ -6,11 +6,12 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import typer
 
 from emulator.cli.frame_options import frame_catalog, frame_parameters
+from emulator.cli.output import output_help, prepare_output, report_stream
 
 group = typer.Typer(help="Feature databases of the LSI and RSI algorithms.", no_args_is_help=True)
 
@@ -22,7 +23,8 @@ def build(
         str, typer.Option(help="planar (the thesis) or spherical (a real camera).")
     ] = "planar",
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="File to write; without it nothing is kept.")
+        Path | None,
+        typer.Option("-o", "--output", help=output_help("File to write; without it nothing is kept.")),
     ] = None,
     kappa: Annotated[
         float | None, typer.Option(help="Brightness limit κ; default 11.5 planar, 5.0 spherical.")
@@ -54,6 +56,8 @@ def build(
     from starid.thesis.database import build_database
     from starid.thesis.database_file import save_database
 
+    if output is not None:
+        prepare_output(output, "-o")
     planar = geometry == "planar"
     parameters = frame_parameters(
         geometry,
@@ -86,7 +90,7 @@ def build(
     if output is not None:
         result["bytes_file"] = save_database(database, output)
         result["file"] = str(output)
-    _print(result, as_json=as_json)
+    _print(result, as_json=as_json, to=report_stream(output))
 
 
 @group.command("info")
@@ -112,13 +116,13 @@ def info(
             "maximum": database.maximum.tolist(),
         },
         as_json=as_json,
+        to=sys.stdout,
     )
 
 
-def _print(values: dict[str, object], *, as_json: bool) -> None:
+def _print(values: dict[str, object], *, as_json: bool, to: TextIO) -> None:
     if as_json:
-        sys.stdout.write(json.dumps(values) + "\n")
+        to.write(json.dumps(values) + "\n")
         return
     width = max(len(key) for key in values)
-    for key, value in values.items():
-        sys.stdout.write(f"{key:<{width}}  {value}\n")
+    to.writelines(f"{key:<{width}}  {value}\n" for key, value in values.items())

@@ -71,6 +71,10 @@ def command(
         raise EmulatorError(
             "features: give --ra and --dec of the centre, or (planar) --ra-corner and --dec-corner"
         )
+    if not -360.0 <= centre[0] <= 360.0:
+        raise EmulatorError(
+            f"features: the frame's centre is at right ascension {centre[0]:g}°; −360 to 360 is needed"
+        )
     if not -90.0 <= centre[1] <= 90.0:
         raise EmulatorError(
             f"features: the frame's centre is at declination {centre[1]}°; −90 to 90 is needed"

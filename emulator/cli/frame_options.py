@@ -16,6 +16,7 @@ PLANAR_EPOCH: Final = 1991.25
 
 SPHERICAL_EPOCH: Final = 2026.0
 
+_WIDEST_FRAME_DEG: Final = 120.0
 _PLANAR_FOV_DEG: Final = 40.0
 _SPHERICAL_FOV_DEG: Final = 42.0
 
@@ -47,6 +48,10 @@ def frame_parameters(
         raise EmulatorError(
             f"--overlap {overlap_percent}: percent are needed, above 1 and below 100, such as 99.5"
         )
+    if fov is not None and not 0.0 < fov <= _WIDEST_FRAME_DEG:
+        raise EmulatorError(
+            f"--fov {fov:g}: degrees are needed, above 0 and at most {_WIDEST_FRAME_DEG:g}, such as 40"
+        )
     overlap = overlap_percent / 100.0
     if choice("geometry", geometry, ("planar", "spherical")) == "planar":
         width = _PLANAR_FOV_DEG if fov is None else fov
@@ -61,4 +66,5 @@ def frame_catalog(geometry: str, epoch: float | None) -> StarCatalog:
     """Catalogue at the epoch asked for, or at the geometry's own."""
     from starid.catalog import load_catalog
 
-    return load_catalog(epoch=epoch or (PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH))
+    own = PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH
+    return load_catalog(epoch=own if epoch is None else epoch)

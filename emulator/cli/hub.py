@@ -7,11 +7,15 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output
+
 
 def command(
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")] = 29536,
-    log: Annotated[Path | None, typer.Option(help="Write all frames to this file as a candump log.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help=output_help("Write all frames to this file as a candump log."))
+    ] = None,
 ) -> None:
     """Serve a CAN bus over TCP (socketcand text protocol) where the kernel has no CAN.
 
@@ -22,6 +26,9 @@ def command(
     import signal
 
     from protocol.hub import DEFAULT_BUS, CanHub
+
+    if log is not None:
+        prepare_output(log, "--log")
 
     async def serve() -> None:
         hub = CanHub(host, port, log=log)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from emulator.cli.output import output_help, prepare_output, print_text
 
 group = typer.Typer(help="The interface definition: list it, export it.", no_args_is_help=True)
 
@@ -29,7 +30,8 @@ def export(
         Format, typer.Argument(metavar="FORMAT", help="markdown, html, dbc, eds, xtce or cosmos.")
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write; stdout without it.")
+        Path | None,
+        typer.Option("--output", "-o", help=output_help("File to write; stdout without it.")),
     ] = None,
     icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
 ) -> None:
@@ -42,7 +44,7 @@ def export(
 
     text = render(load_icd(icd), format_.value)
     if output is None:
-        print(text, end="")
+        print_text(text)
     else:
         _write(output, text)
 
@@ -50,16 +52,15 @@ def export(
 def _write(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     from emulator.errors import EmulatorError
+    from starid.cache import write_atomically
 
-    if path.is_dir():
-        raise EmulatorError(f"{path}: is a folder; name a file with -o")
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    prepare_output(path, "-o")
     try:
-        fresh.write_text(text, encoding="utf-8")
-        fresh.replace(path)
+        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
     except OSError as error:
-        fresh.unlink(missing_ok=True)
-        raise EmulatorError(f"{path}: cannot write: {error.strerror}; choose another file with -o") from None
+        raise EmulatorError(
+            f"{path}: cannot be written ({error.strerror}); choose another file with -o"
+        ) from None
 
 
 @group.command("list")

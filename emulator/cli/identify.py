@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output, report_stream
+
 if TYPE_CHECKING:
     from starid.camera import Camera, Model
     from starid.catalog import StarCatalog
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 _NUMBERED_TO_MAGNITUDE = 3.0
 _SHOWN_STARS = 12
 _ANY_FIELD = "auto"
+_TOLERANCE = 0.1
 _MODELS: dict[str, Model] = {"pinhole": "pinhole", "equidistant": "equidistant"}
 
 
@@ -35,8 +38,11 @@ def command(
         ),
     ] = None,
     fov_tolerance: Annotated[
-        float, typer.Option(min=0.0, max=0.3, help="Relative uncertainty of --fov.")
-    ] = 0.1,
+        float | None,
+        typer.Option(
+            min=0.0, max=0.3, help="Relative uncertainty of --fov in degrees; default 0.1. Not with auto."
+        ),
+    ] = None,
     model: Annotated[str, typer.Option(help="With --fov: pinhole or equidistant.")] = "pinhole",
     epoch: Annotated[float | None, typer.Option(help="Julian year of the image; default 2026.")] = None,
     allow_colour: Annotated[
@@ -48,7 +54,9 @@ def command(
     ] = None,
     annotate: Annotated[
         Path | None,
-        typer.Option("--annotate", "-o", help="Write the image with its identified stars marked."),
+        typer.Option(
+            "--annotate", "-o", help=output_help("Write the image with its identified stars marked.")
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -59,8 +67,11 @@ def command(
     a negative; field and distortion are measured on it.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
-    from starid.imaging.image_io import read_image, write_image
+    from starid.imaging.image_io import image_suffix, read_image, write_image
 
+    if annotate is not None:
+        image_suffix(annotate)
+        prepare_output(annotate, "-o")
     pixels = read_image(image, allow_colour=fov is not None if allow_colour is None else allow_colour)
     catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)
     result = _solved(pixels, catalog, profile, fov, fov_tolerance, model)
@@ -68,9 +79,9 @@ def command(
     if annotate is not None:
         write_image(annotate, _marked(pixels, result))
     if as_json:
-        typer.echo(json.dumps(report))
+        typer.echo(json.dumps(report), file=report_stream(annotate))
     else:
-        _show(report)
+        _show(report, annotate)
     if not result.solution.valid:
         raise typer.Exit(1)
 
@@ -80,13 +91,14 @@ def _solved(
     catalog: StarCatalog,
     profile: str | None,
     fov: str | None,
-    fov_tolerance: float,
+    fov_tolerance: float | None,
     model: str,
 ) -> ImageSolution:
     """What is found on the image with the camera that the options name."""
     from emulator.errors import EmulatorError
     from starid.camera import Camera
     from starid.field_sweep import solve_any_field
+    from starid.files import read_number
     from starid.image_solver import solve_image
 
     if fov is None:
@@ -96,13 +108,19 @@ def _solved(
     if model not in _MODELS:
         raise EmulatorError(f"identify --model: {model!r} given, {' or '.join(_MODELS)} needed")
     if fov == _ANY_FIELD:
+        if fov_tolerance is not None:
+            raise EmulatorError(
+                "identify: --fov auto has its own tolerance: leave --fov-tolerance out, or give degrees"
+            )
         return solve_any_field(pixels, catalog, model=_MODELS[model])
     try:
-        width_deg = float(fov)
+        width_deg = read_number(fov)
     except ValueError:
         raise EmulatorError(f"identify --fov: {fov!r} given, degrees or {_ANY_FIELD} needed") from None
     camera = Camera.from_fov(width_deg, pixels.shape[1], pixels.shape[0], _MODELS[model])
-    return solve_image(pixels, camera, catalog, fov_tolerance=fov_tolerance)
+    return solve_image(
+        pixels, camera, catalog, fov_tolerance=_TOLERANCE if fov_tolerance is None else fov_tolerance
+    )
 
 
 def _camera(profile: str | None) -> Camera:
@@ -213,13 +231,15 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
     return annotate(pixels, xy[solution.detection_index], labels, missed_xy_px=others)
 
 
-def _show(report: dict[str, Any]) -> None:
+def _show(report: dict[str, Any], annotated: Path | None) -> None:
     """The answer for people."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(soft_wrap=True)
+    from starid.attitude import turn_text
+
+    console = Console(file=report_stream(annotated), soft_wrap=True)
     if not report["valid"]:
         console.print(
             f"{report['image']}: not identified ({report['reason']}); {report['stars_detected']} stars found; "
@@ -227,7 +247,8 @@ def _show(report: dict[str, Any]) -> None:
         )
         return
     console.print(
-        f"{report['image']}: RA {report['ra_deg']:.4f}°, Dec {report['dec_deg']:.4f}°, roll {report['roll_deg']:.3f}°, "
+        f"{report['image']}: RA {turn_text(report['ra_deg'], 4)}°, Dec {report['dec_deg']:.4f}°, "
+        f"roll {turn_text(report['roll_deg'], 3)}°, "
         f"field {report['fov_deg']:.3f}° wide"
     )
     console.print(

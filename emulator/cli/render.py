@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output, report_stream
 from emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
 
 _NUMBERED_TO_MAGNITUDE = 3.6
 _TURN_DEG = 360.0
+_NARROWEST_DEG = 0.1
 _FASTEST_DEG_S = 1000.0
 
 
 def command(
     ra: Annotated[float, typer.Option(help="Right ascension of the boresight, degrees.")],
     dec: Annotated[float, typer.Option(help="Declination of the boresight, degrees.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Image to write: .png, or .tiff.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=output_help("Image to write: .png, or .tiff."))
+    ],
     roll: Annotated[
         float, typer.Option(help="Celestial north counter-clockwise from image up, degrees.")
     ] = 0.0,
@@ -61,7 +65,7 @@ def command(
     from emulator.imaging.sensor import Renderer
     from starid.attitude import Attitude
     from starid.catalog import load_catalog
-    from starid.imaging.image_io import write_image
+    from starid.imaging.image_io import image_suffix, write_image
 
     for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
         if not -_TURN_DEG <= value <= _TURN_DEG:
@@ -72,6 +76,10 @@ def command(
         raise EmulatorError(
             f"--rate {' '.join(f'{value:g}' for value in rate)}: at most {_FASTEST_DEG_S:g} degrees/s in all are needed"
         )
+    image_suffix(output)
+    prepare_output(output, "-o")
+    if fov is not None and not fov >= _NARROWEST_DEG:
+        raise EmulatorError(f"--fov {fov:g}: at least {_NARROWEST_DEG:g} degrees are needed")
     scene = _scene(profile, fov, size, model)
     camera = scene.camera
     changes = {
@@ -86,12 +94,13 @@ def command(
     frame = renderer.render(Attitude.from_radec_roll(ra, dec, roll), [math.radians(value) for value in rate])
     write_image(output, _marked(frame) if as_annotated else frame.image)
     if as_json:
-        typer.echo(json.dumps(_truth(frame, camera, sensor, output)))
+        text = json.dumps(_truth(frame, camera, sensor, output))
     else:
-        typer.echo(
+        text = (
             f"{output}: {camera.width}×{camera.height} of {sensor.bits} bits, {len(frame.stars.hip)} stars "
             f"to V {sensor.limiting_magnitude:g}, {frame.exposure_s:g} s"
         )
+    typer.echo(text, file=report_stream(output))
 
 
 @dataclass(frozen=True)

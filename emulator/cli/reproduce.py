@@ -16,7 +16,10 @@ def command(
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments; without any, all of them.")
     ] = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for report.md, tables and figures.")
+        Path,
+        typer.Option(
+            "-o", "--output", help="Folder for report.md, tables and figures; made if it is missing."
+        ),
     ] = Path("out/reproduce"),
     quick: Annotated[
         bool, typer.Option("--quick", help="A subset in a few minutes, with its checks.")
@@ -66,7 +69,7 @@ def command(
         **summary(results),
     }
     if as_json:
-        print(json.dumps(figures, ensure_ascii=False))
+        print(json.dumps(figures))
     else:
         for result in results:
             state = "missed" if result.outcome.failed else "ok"

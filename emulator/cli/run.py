@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.output import output_help, prepare_output
+
 
 def command(
     profile: Annotated[
@@ -49,7 +51,7 @@ def command(
         ),
     ] = None,
     truth_log: Annotated[
-        Path | None, typer.Option(help="CSV file of truth and measurement, a row a frame.")
+        Path | None, typer.Option(help=output_help("CSV file of truth and measurement, a row a frame."))
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a truth log that exists.")] = False,
     scenario: Annotated[
@@ -111,6 +113,8 @@ def command(
     if control_token is not None and not control_token:
         raise EmulatorError("--control-token: is empty; give a text, or leave it out")
     options = RunOptions(truth_log, overwrite, control, control_token or "", scenario)
+    if truth_log is not None:
+        prepare_output(truth_log, "--truth-log")
 
     async def run() -> None:
         import signal

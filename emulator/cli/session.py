@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.output import output_help
+
 
 def command(
     script: Annotated[
@@ -30,7 +32,7 @@ def command(
     log: Annotated[
         Path | None, typer.Option(help="Folder for logs, samples and pictures; default out/session/NAME.")
     ] = None,
-    junit: Annotated[Path | None, typer.Option(help="Write a JUnit XML file.")] = None,
+    junit: Annotated[Path | None, typer.Option(help=output_help("Write a JUnit XML file."))] = None,
     truth: Annotated[
         Path | None, typer.Option(help="File of true attitudes that the emulator writes (--truth-log).")
     ] = None,

@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 
 from emulator.errors import EmulatorError
 
-_ANGLE: Final = (-1e6, 1e6)
+_ANGLE: Final = (-360.0, 360.0)
 _MOST_OBJECTS: Final = 100_000
 
 

@@ -105,4 +105,4 @@ class CanLink(DeviceLink[CanFrame, int]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:
             self._receiver = self._new_receiver()
-            self._address.take(self._transport.description, self._style())
+            self._address.take(self.transport.description, self._style())

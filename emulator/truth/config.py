@@ -28,6 +28,9 @@ AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
 """Body rate in the sensor frame, degrees a second."""
 
+Turn: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
+"""Right ascension or roll, degrees."""
+
 SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
@@ -40,9 +43,9 @@ class Strict(BaseModel):
 class AttitudeConfig(Strict):
     """An attitude: right ascension, declination and roll in degrees, or a quaternion."""
 
-    ra_deg: float | None = None
+    ra_deg: Turn | None = None
     dec_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
-    roll_deg: float | None = None
+    roll_deg: Turn | None = None
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
 
     @model_validator(mode="after")

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.errors import EmulatorError
-from emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
-from protocol.user_file import read_user_text
+from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
 from starid.attitude import Attitude, interpolate, rate_between
+from starid.files import MEGABYTE, read_number, read_text
 
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
 ANGLE_COLUMNS: Final = ("ra_deg", "dec_deg", "roll_deg")
@@ -38,11 +38,21 @@ LOG_COLUMNS: Final = {
 }
 """Columns of a truth log → what they are here."""
 
-MAX_BYTES: Final = 256_000_000
-"""Largest truth file that is read, bytes: a day of a truth log at 5 frames a second."""
-
 NORM_TOLERANCE: Final = 0.01
 """A quaternion whose length is off by more than this is taken for a mistake, not for rounding."""
+
+MAX_BYTES: Final = 500 * MEGABYTE
+"""Largest truth file that is read: a day at 50 rows a second."""
+
+BOUNDS: Final = {
+    "t": 1e9,
+    **dict.fromkeys(QUATERNION_COLUMNS, 1e9),
+    "ra_deg": 1e6,
+    "dec_deg": 90.0,
+    "roll_deg": 1e6,
+    **dict.fromkeys(RATE_COLUMNS, MAX_RATE_DEG_S),
+}
+"""Largest absolute value in each column; right ascension and roll may count whole turns."""
 
 
 class FileTruth:
@@ -121,13 +131,9 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
         The file is missing, has not the columns of this module's head, or a row is not numbers, not a rotation, or not later than the row before.
     """
     try:
-        text = read_user_text(path, MAX_BYTES)
-    except (OSError, ValueError) as error:  # a path that no file can have is a ValueError
-        reason = str(error)
-        if isinstance(error, OSError):
-            reason = error.strerror or reason
-        elif isinstance(error, UnicodeDecodeError):
-            reason = f"not UTF-8, {error.reason}"
+        text = read_text(path, MAX_BYTES)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else f"not UTF-8, {error.reason}"
         raise EmulatorError(
             f"truth file {path}: cannot be read ({reason}); give a CSV file of times and attitudes"
         ) from None
@@ -153,6 +159,13 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
         attitudes.append(_attitude(where, needed, row))
         if has_rates:
             rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
+        elif len(times) > 1:
+            rate = np.degrees(rate_between(attitudes[-2], attitudes[-1], times[-1] - times[-2]))
+            if np.abs(rate).max() > MAX_RATE_DEG_S:
+                raise EmulatorError(
+                    f"{where}: the turn from the row before is faster than {MAX_RATE_DEG_S:g} degrees a second; "
+                    f"give {', '.join(RATE_COLUMNS)} if the attitude jumps"
+                )
     if not times:
         raise EmulatorError(f"truth file {path}: no rows after the header; add at least one")
     rate_array = np.array(rates) if has_rates else None
@@ -180,6 +193,11 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
         raise EmulatorError(
             f"{where}: column {missing[0]} is missing; give {', '.join(RATE_COLUMNS)} or none"
         )
+    both = [[name for name in names if name in columns] for names in (QUATERNION_COLUMNS, ANGLE_COLUMNS)]
+    if all(both):
+        raise EmulatorError(
+            f"{where}: columns {', '.join(both[0])} and {', '.join(both[1])} both give the attitude; leave out one set"
+        )
     for needed in (QUATERNION_COLUMNS, ANGLE_COLUMNS):
         if "t" in columns and all(name in columns for name in needed):
             return needed
@@ -195,19 +213,17 @@ def _row(where: str, columns: list[str], line: str) -> dict[str, float]:
         if not name:
             continue
         try:
-            row[name] = float(cell)
+            row[name] = read_number(cell)
         except ValueError:
             raise EmulatorError(f"{where}: {name} is not a number") from None
-        if not math.isfinite(row[name]):
-            raise EmulatorError(f"{where}: {name} is not finite")
+        if abs(row[name]) > BOUNDS[name]:
+            raise EmulatorError(f"{where}: {name} is outside ±{BOUNDS[name]:g}")
     return row
 
 
 def _attitude(where: str, needed: tuple[str, ...], row: dict[str, float]) -> Attitude:
     values = [row[name] for name in needed]
     if needed is ANGLE_COLUMNS:
-        if abs(row["dec_deg"]) > 90.0:
-            raise EmulatorError(f"{where}: dec_deg is outside ±90")
         return Attitude.from_radec_roll(*values)
     norm = math.sqrt(sum(v * v for v in values))
     if abs(norm - 1.0) > NORM_TOLERANCE:

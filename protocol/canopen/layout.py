@@ -130,5 +130,5 @@ def _load(path: Path) -> CanopenModel:
         first = error.errors()[0]
         place = ".".join(str(step) for step in first["loc"])
         raise IcdError(f"{path}: {place}: {first['msg']}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise IcdError(f"{path}: not valid TOML: {error}") from None

@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 
 from starid.cache import write_atomically
 from starid.errors import StaridError
+from starid.files import MEGABYTE, is_stream, read_bytes
+
+IMAGE_LIMIT: Final = 1000 * MEGABYTE
+"""Largest image file that is read, bytes: a colour TIFF of 16 bits of the largest cameras has some 900 MB."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
@@ -44,7 +48,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
     """
     source = Path(path)
     try:
-        content = source.read_bytes()
+        content = read_bytes(source, IMAGE_LIMIT)
     except FileNotFoundError:
         raise StaridError(f"image {source}: no such file; give a PNG, TIFF or JPEG") from None
     except OSError as error:
@@ -70,13 +74,28 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
     return np.ascontiguousarray(pixels)
 
 
+def image_suffix(path: Path) -> str:
+    """Return the suffix that chooses the format of an image to write: that of its name, .png for a device or pipe without.
+
+    Raises
+    ------
+    StaridError
+        The suffix is that of no format known here.
+    """
+    suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
+    if suffix not in _SUFFIXES:
+        raise StaridError(f"image {path}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    return suffix
+
+
 def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write a grey or colour image, whole or not at all.
 
     Parameters
     ----------
     path : path
-        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy).
+        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy); a device or pipe
+        without one gets a PNG.
     image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
         Colour in the order blue, green, red.
 
@@ -88,9 +107,7 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
     import cv2
 
     target = Path(path)
-    suffix = target.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise StaridError(f"image {target}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    suffix = image_suffix(target)
     if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
         raise StaridError(
             f"image {target}: JPEG holds 8 bits a pixel, this frame has 16; write a PNG or TIFF"

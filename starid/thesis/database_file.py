@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.cache import write_atomically
+from starid.files import open_regular
 from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDatabase
 from starid.thesis.features import FEATURE_COUNT
 from starid.thesis.frame_grid import make_grid
@@ -83,7 +84,7 @@ def save_database(database: FeatureDatabase, path: Path) -> int:
         write_atomically(path, write)
     except OSError as error:
         raise DatabaseError(f"database: {path} cannot be written ({error.strerror or error})") from error
-    return path.stat().st_size
+    return len(head) + features.nbytes + theta.nbytes + stars.nbytes
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -95,7 +96,7 @@ def read_header(path: Path) -> dict[str, Any]:
         If there is no such file or it is not a feature database of this version.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(len(MAGIC) + _LENGTH.size)
             if start[: len(MAGIC)] != MAGIC:
                 raise DatabaseError(

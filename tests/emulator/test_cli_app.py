@@ -19,10 +19,12 @@ from emulator.cli import app
         (PermissionError(13, "Permission denied", "a", None, "b"), "a -> b: Permission denied"),
         (OSError("two\nlines"), "two lines"),
         (TimeoutError(), "TimeoutError"),
+        (MemoryError("Unable to allocate 26.1 GiB"), "not enough memory: Unable to allocate 26.1 GiB"),
+        (MemoryError(), "not enough memory"),
     ],
 )
 def test_what_the_system_refuses_is_one_line_and_status_2(
-    error: OSError, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     built = typer.Typer()
 

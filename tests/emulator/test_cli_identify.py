@@ -137,3 +137,10 @@ def test_colour_is_refused_but_where_the_image_may_come_from_any_camera(tmp_path
     assert found["reason"] == "too_few_stars"
     assert "expose longer" in found["advice"]
     assert "channels" in str(starhil("identify", str(image), "--fov", "11", "--refuse-colour").exception)
+
+
+def test_a_tolerance_of_the_automatic_field_is_refused(tmp_path):
+    image = tmp_path / "sky.png"
+    cv2.imwrite(str(image), np.arange(64 * 64, dtype=np.uint16).reshape(64, 64))
+    result = starhil("identify", str(image), "--fov", "auto", "--fov-tolerance", "0")
+    assert "--fov auto has its own tolerance" in str(result.exception)

@@ -121,7 +121,8 @@ def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
     ("arguments", "text"),
     [
         (("--dec", "95"), "--dec 95.0: degrees from -90 to 90"),
-        (("--ra", "nan"), "--ra nan: degrees from -360 to 360"),
+        (("--ra", "361"), "--ra 361: degrees from -360 to 360"),
+        (("--ra", "nan"), "'--ra': must be finite"),
         (("--bits", "9"), "bits: 9 given, 8, 12 or 16 needed"),
         (("--exposure", "-1"), "exposure_s: -1.0 given"),
         (("--size", "3"), "--size 3: 16 to 8192"),

@@ -137,9 +137,6 @@ def test_a_scenario_happens_at_its_run_times(run, tmp_path):
         [[at]]
         run_time_s = 2.0
         fault = { device = { stuck = true }, optical = { false_stars = 3 } }
-        [[at]]
-        run_time_s = 4.0
-        fault = { can = { drop = 1.0 } }
         """
     )
 
@@ -151,9 +148,59 @@ def test_a_scenario_happens_at_its_run_times(run, tmp_path):
         await emulation.stepper.step(1.0)
         assert emulation.faults.describe() == {}
         assert emulation.device.cycle.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
-        await emulation.stepper.step(2.0)  # there is no CAN link to break: told in the log, and no more
 
     run(scenario, options=RunOptions(scenario=str(path)))
+
+
+@pytest.mark.parametrize(
+    ("event", "said"),
+    [
+        ('fault = { device = { reset = "foo" } }', "device.reset: 'foo' is not one of unknown, power_on"),
+        ('fault = { device = { error = "foo" } }', "device.error: 'foo' is not one of catalogue, "),
+        ('fault = { device = { error = "none" } }', "device.error: 'none' is not one of catalogue, "),
+        ("fault = { can = { drop = 1.0 } }", "can: this run has no such link"),
+        ('truth = { kind = "file", path = "gone.csv" }', "gone.csv: cannot be read"),
+    ],
+)
+def test_what_a_scenario_cannot_do_is_refused_at_the_start_and_not_counted(run, tmp_path, event, said):
+    path = tmp_path / "day.toml"
+    path.write_text(f"[[at]]\nrun_time_s = 90.0\n{event}\n")
+    started = []
+
+    async def scenario(emulation, _line):
+        started.append(emulation)
+
+    with pytest.raises(EmulatorError) as refusal:
+        run(scenario, options=RunOptions(scenario=str(path)))
+    assert "scenario at 90 s: " in str(refusal.value)
+    assert said in str(refusal.value)
+    assert not started
+
+
+def test_a_truth_file_of_a_scenario_is_read_at_the_start_and_begins_at_its_run_time(run, tmp_path):
+    path, table = tmp_path / "day.toml", tmp_path / "table.csv"
+    table.write_text("t,ra_deg,dec_deg,roll_deg\n0,10,0,0\n1,20,0,0\n")
+    path.write_text(
+        f'[[at]]\nrun_time_s = 3.0\ntruth = {{ kind = "file", path = "{table}", start = "now" }}\n'
+    )
+
+    async def scenario(emulation, _line):
+        table.unlink()
+        await emulation.stepper.step(4.0)
+        return emulation.device.cycle.truth.state(3.5).attitude.ra_deg
+
+    assert run(scenario, options=RunOptions(scenario=str(path))) == pytest.approx(15.0)
+
+
+def test_no_error_is_not_a_fault(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Control(emulation) as control:
+            answer = await control.do("fault", device={"error": "none"})
+        assert "device.error: 'none' is not one of" in answer["error"]
+        assert emulation.device.modes.mode is Mode.STANDBY
+
+    run(scenario)
 
 
 @pytest.mark.parametrize("name", sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))

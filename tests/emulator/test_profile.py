@@ -1,7 +1,8 @@
 import pytest
 
 from emulator.errors import EmulatorError
-from emulator.profile import configs_folder, load_profile
+from emulator.profile import Profile, configs_folder, load_profile
+from emulator.scenario import Scenario
 from emulator.truth.config import SlewConfig
 
 
@@ -96,6 +97,10 @@ def test_overrides_are_toml_or_text():
         ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),
         ("[truth]\nkind = 'slew'\nsegments = [{do = 'hold', secs = 1.0}]\n", "truth.segments.0.sec"),
         ("[parameters]\nserial_baud = 9600\n", "parameters.serial_baud: set links.serial.baud instead"),
+        (
+            "[truth]\nkind = 'slew'\nsegments = [{seconds = 1.0}]\n",
+            "do: must be one of 'hold', 'rate', 'slew'",
+        ),
         ("[run\n", "not TOML"),
         ('extends = "no_such"\n', "no_such"),
         ("extends = 3\n", "extends"),
@@ -131,3 +136,73 @@ def test_an_override_that_is_wrong_is_blamed_itself(tmp_path):
     assert refusal(path, ["camera=3"]).startswith("--set camera=3: camera: must be a table")
     bad = write(tmp_path, "[run]\nseed = -1\n")
     assert path in refusal(bad, ["run.clock=real"])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "run.start_unix_s=1e300",
+        "run.start_unix_s=5e9",
+        "device.boot_s=1e12",
+        "timing.readout_s=1e9",
+        "timing.detect_s=100.0",
+        "timing.detect_per_star_s=1.0",
+        "timing.identify_lost_s=1e300",
+        "timing.identify_tracking_s=1e300",
+        "links.can.frame_gap_s=1e9",
+        "camera.focal_px=[1e300, 1e300]",
+        "camera.centre_px=[1e300, 0.0]",
+        "camera.distortion=[1e300]",
+        "truth.attitude={ra_deg=1e300, dec_deg=0.0}",
+        "truth.attitude={ra_deg=0.0, dec_deg=0.0, roll_deg=-1e6}",
+    ],
+)
+def test_a_value_that_no_unit_can_have_is_named_with_its_bound(override):
+    message = refusal("cubestar", [override])
+    key = override.partition("=")[0]
+    assert message.startswith(f"--set {override}: {key}")
+    assert "must be at " in message
+
+
+def _numbers(schema, path=(), definitions=None):
+    """Path and schema of every number in a JSON schema."""
+    definitions = definitions or schema.get("$defs", {})
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    if schema.get("type") in ("number", "integer"):
+        yield ".".join(path), schema
+    for key, below in schema.get("properties", {}).items():
+        yield from _numbers(below, (*path, key), definitions)
+    for below in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
+        yield from _numbers(below, path, definitions)
+    if isinstance(schema.get("items"), dict):
+        yield from _numbers(schema["items"], path, definitions)
+
+
+BOUNDED_BY_LENGTH_1 = "quaternion_xyzw"
+
+
+@pytest.mark.parametrize("model", [Profile, Scenario])
+def test_every_number_of_a_profile_and_a_scenario_has_both_bounds(model):
+    found = dict(_numbers(model.model_json_schema()))
+    assert len(found) > 10
+    unbounded = [
+        path
+        for path, schema in found.items()
+        if not ({"minimum", "exclusiveMinimum"} & schema.keys() and "maximum" in schema)
+        and not path.endswith(BOUNDED_BY_LENGTH_1)
+    ]
+    assert unbounded == []
+
+
+def test_a_byte_order_mark_is_accepted(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_bytes(b'\xef\xbb\xbfextends = "cubestar"\nname = "mine"\n')
+    assert load_profile(str(path)).name == "mine"
+
+
+def test_a_device_in_place_of_a_profile_is_refused(tmp_path):
+    path = tmp_path / "zero.toml"
+    path.symlink_to("/dev/zero")
+    with pytest.raises(EmulatorError, match="no such file"):
+        load_profile(str(path))

@@ -17,6 +17,7 @@ from hil_tests.conformance import conformance_run
 from hil_tests.emulator_process import EmulatorProcess
 from hil_tests.errors import BenchError
 from hil_tests.own_hub import OwnHub
+from hil_tests.results import write_report
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
 
@@ -76,3 +77,23 @@ def test_a_port_where_nothing_answers_ends_the_conformance_run_with_its_reports(
     suite = ET.parse(junit).getroot()
     assert (suite.get("failures"), int(suite.get("skipped"))) == ("1", int(suite.get("tests")) - 1)
     assert f"not run: nothing answers on {port}" in html.read_text(encoding="utf-8")
+
+
+def test_a_report_into_a_device_leaves_the_device(tmp_path):
+    null, full = tmp_path / "null", tmp_path / "full"
+    null.symlink_to("/dev/null")
+    full.symlink_to("/dev/full")
+    write_report(null, b"<report/>")
+    with pytest.raises(BenchError, match="No space left"):
+        write_report(full, b"<report/>")
+    assert null.is_char_device()
+    assert full.is_char_device()
+    assert sorted(tmp_path.iterdir()) == [full, null]
+
+
+def test_a_report_over_a_link_replaces_the_file_that_it_leads_to(tmp_path):
+    target, link = tmp_path / "file.xml", tmp_path / "link.xml"
+    link.symlink_to(target)
+    write_report(link, b"<report/>")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"<report/>"

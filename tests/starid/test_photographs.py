@@ -10,6 +10,7 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.field_sweep import solve_any_field
+from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.image_looks import Look, has_dark_tail, looks
 from starid.image_solver import ImageSolution, solve_image
@@ -173,3 +174,21 @@ def test_pattern_stars_are_those_of_the_plain_rule() -> None:
     for star in range(1500):
         taken[star] = np.count_nonzero(near[star] & taken) < quota
     np.testing.assert_array_equal(pick_pattern_stars(vectors, area, quota), np.flatnonzero(taken))
+
+
+def test_no_wrong_field_gets_a_wide_window_before_the_right_one_had_its_narrow_one(sky, monkeypatch) -> None:
+    image, _, camera = photograph(sky, 1)
+    windows: list[tuple[float, float]] = []
+    identify = Identifier.identify
+
+    def noted(self, *arguments, **options):
+        windows.append((self.camera.fov_deg, self._effort.window_px))
+        return identify(self, *arguments, **options)
+
+    monkeypatch.setattr(Identifier, "identify", noted)
+    monkeypatch.setattr(field_sweep, "FIELDS_DEG", (40.0, 20.0, FOV_DEG * (HEIGHT / WIDTH) ** 0.5))
+    found = solve_any_field(image, sky)
+    assert found.solution.valid
+    assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
+    sweep = windows[: 1 + next(n for n, (fov, _) in enumerate(windows) if abs(fov / FOV_DEG - 1.0) < 0.1)]
+    assert {window for _, window in sweep} == {sweep[0][1]}

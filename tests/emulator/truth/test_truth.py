@@ -145,8 +145,25 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n# c\n1,0,0,1\n", "line 4: 4 values for 5 columns"),
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n0,0,0,0,1\n", "line 3: t is not later"),
         ("t,qx,qy,qz,qw\n0,0,0,0,2\n", "line 2: the quaternion is not of length 1"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw is not finite"),
+        ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw is not a number"),
         ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg is outside"),
+        (
+            "t,qx,qy,qz,qw\n0,0,0,0,1\n0.001,1,0,0,0\n",
+            "line 3: the turn from the row before is faster than 600",
+        ),
+        ("t,qx,qy,qz,qw\n0,0,0,0,1_0\n", "line 2: qw is not a number"),
+        ("t,ra_deg,dec_deg,roll_deg\n0,1e300,0,0\n", "line 2: ra_deg is outside ±1e+06"),
+        ("t,ra_deg,dec_deg,roll_deg\n0,0,0,1e999\n", "line 2: roll_deg is not a number"),
+        ("t,ra_deg,dec_deg,roll_deg\n1e300,0,0,0\n", "line 2: t is outside ±1e+09"),
+        (
+            "t,qx,qy,qz,qw,wx_deg_s,wy_deg_s,wz_deg_s\n0,0,0,0,1,0,0,601\n",
+            "line 2: wz_deg_s is outside ±600",
+        ),
+        (
+            "t,qx,qy,qz,qw,ra_deg,dec_deg,roll_deg\n0,0,0,0,1,0,0,0\n",
+            "line 1: columns qx, qy, qz, qw and ra_deg, dec_deg, roll_deg both give the attitude",
+        ),
+        ("t,qx,qy,qz,qw,roll_deg\n0,0,0,0,1,0\n", "line 1: columns qx, qy, qz, qw and roll_deg both give"),
         ("# c\nt,t,qx,qy,qz,qw\n0,1,0,0,0,1\n", "line 2: column t stands there twice"),
         ("t,qx,qy,qz,qw,wx_deg_s,wz_deg_s\n0,0,0,0,1,3,3\n", "line 1: column wy_deg_s is missing"),
         ("t,qx,qy,qz,qw\n0,0,0,0," + "1" * 200_000 + "\n", "line 2: not CSV"),
@@ -473,3 +490,9 @@ def test_any_line_is_taken_or_refused_by_name(text):
     assert live.receive(text, 0.0) == (live.refused == 0)
     assert live.accepted + live.refused == 1
     assert bool(live.last_fault) == bool(live.refused)
+
+
+def test_a_byte_order_mark_before_a_truth_file_is_accepted(tmp_path):
+    path = tmp_path / "truth.csv"
+    path.write_bytes(b"\xef\xbb\xbft,ra_deg,dec_deg,roll_deg\n0,370,20,30\n")
+    assert read_truth_file(path).state(0.0).attitude.ra_deg == pytest.approx(10.0)

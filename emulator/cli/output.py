@@ -1,0 +1,94 @@
+"""What commands write: one rule for the paths of files, and text that any terminal can show."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import sys
+from pathlib import Path
+from typing import Final, TextIO
+
+from emulator.errors import EmulatorError
+
+_PLAIN: Final = {
+    "°": " deg",
+    "″": '"',
+    "′": "'",
+    "×": "x",
+    "±": "+/-",
+    "÷": "/",
+    "−": "-",
+    "–": "-",
+    "—": "-",
+    "…": "...",
+    "·": "*",
+    "≤": "<=",
+    "≥": ">=",
+    "→": "->",
+    "²": "^2",
+    "⁻": "^-",
+    "√": "sqrt",
+    "σ": "sigma",
+    "κ": "kappa",
+    "μ": "mu",
+    "µ": "u",
+    "π": "parallax",
+}
+"""How an output that does not hold a character shows it."""
+
+_HANDLER: Final = "starhil-plain"
+
+
+def output_help(what: str) -> str:
+    """Help of an option that names a file to write."""
+    return f"{what} Missing folders are made; /dev/stdout is standard output."
+
+
+def prepare_output(path: Path, option: str) -> Path:
+    """Make the folders of a file that is to be written, before the work whose outcome goes there.
+
+    Raises
+    ------
+    EmulatorError
+        They cannot be made, or the path is a folder.
+    """
+    if path.is_dir():
+        raise EmulatorError(f"{path}: is a folder; name a file with {option}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EmulatorError(
+            f"{path}: its folder cannot be made ({error.strerror}); choose another file with {option}"
+        ) from None
+    return path
+
+
+def report_stream(output: Path | None) -> TextIO:
+    """Where a command prints its report: standard error where its file itself goes to standard output."""
+    from starid.files import is_stdout
+
+    return sys.stderr if output is not None and is_stdout(output) else sys.stdout
+
+
+def print_text(text: str) -> None:
+    """Print a document as UTF-8, whatever the locale: its readers know no other encoding."""
+    sys.stdout.flush()
+    sys.stdout.buffer.write(text.encode())
+    sys.stdout.buffer.flush()
+
+
+def show_every_character() -> None:
+    """Let both standard streams spell out what their encoding does not hold, instead of failing."""
+    codecs.register_error(_HANDLER, _spell_out)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=_HANDLER)
+
+
+def _spell_out(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    missing = error.object[error.start : error.end]
+    return "".join(
+        _PLAIN.get(c) or c.encode("ascii", "backslashreplace").decode() for c in missing
+    ), error.end

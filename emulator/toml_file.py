@@ -1,0 +1,37 @@
+"""TOML files that a user names."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from emulator.errors import EmulatorError
+from starid.files import read_text
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        How messages name it: `profile`, `scenario`.
+
+    Raises
+    ------
+    EmulatorError
+        One line: the file, what is wrong with it, and the remedy.
+    """
+    try:
+        return tomllib.loads(read_text(path))
+    except OSError as error:
+        raise EmulatorError(f"{what} {path}: cannot be read ({error.strerror}); give a TOML file") from None
+    except UnicodeDecodeError as error:
+        raise EmulatorError(f"{what} {path}: not UTF-8 ({error.reason}); give a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise EmulatorError(f"{what} {path}: not TOML ({error})") from None
+    except RecursionError:
+        raise EmulatorError(f"{what} {path}: nested too deeply; write it flatter") from None

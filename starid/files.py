@@ -1,0 +1,129 @@
+"""Files that a user names.
+
+They are read only where they are regular files of a sane size, text with or without a byte order mark. What is written
+under the name of a device, a pipe or the standard output goes into that, and leaves it what it is.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import re
+import stat
+import sys
+from pathlib import Path
+from typing import BinaryIO, Final
+
+MEGABYTE: Final = 1_000_000
+
+STDOUT: Final = 1
+"""Descriptor of the standard output."""
+
+_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+TEXT_LIMIT: Final = 10 * MEGABYTE
+"""Largest configuration file that is read, bytes."""
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a regular file for reading, without waiting for the writer that a pipe would need.
+
+    Raises
+    ------
+    OSError
+        The file cannot be opened, or is a folder, device, pipe or socket.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except ValueError as error:  # a name that no file can have
+        raise OSError(errno.EINVAL, str(error), str(path)) from None
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "not a regular file", str(path))
+
+
+def read_bytes(path: str | Path, limit: int) -> bytes:
+    """Return the content of a regular file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    limit : int
+        Largest size that is read, bytes.
+
+    Raises
+    ------
+    OSError
+        As `open_regular`, or the file is larger than `limit`.
+    """
+    with open_regular(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        content = b"" if size > limit else stream.read(limit + 1)
+    if max(size, len(content)) > limit:
+        raise OSError(errno.EFBIG, f"larger than {limit / MEGABYTE:g} MB", str(path))
+    return content
+
+
+def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
+    """Return the content of a regular UTF-8 file, without its byte order mark if it has one.
+
+    Raises
+    ------
+    OSError
+        As `read_bytes`.
+    UnicodeDecodeError
+        The file is not UTF-8.
+    """
+    return read_bytes(path, limit).decode("utf-8-sig")
+
+
+def read_number(text: str) -> float:
+    """Return the finite number that a text is, as other programs write and read it.
+
+    Raises
+    ------
+    ValueError
+        It is none, or has underscores or digits of another script, which Python alone reads.
+    """
+    value = float(text) if _NUMBER.fullmatch(text.strip()) else math.inf
+    if not math.isfinite(value):
+        raise ValueError(f"{text.strip()!r} is not a number")
+    return value
+
+
+def is_stdout(path: str | Path) -> bool:
+    """Whether a path names what the standard output of this process goes to."""
+    try:
+        return os.path.samestat(Path(path).stat(), os.fstat(STDOUT))
+    except (OSError, ValueError):
+        return False
+
+
+def is_stream(path: str | Path) -> bool:
+    """Whether a path names something to write into as it is: a device, a pipe, a socket or the standard output."""
+    try:
+        mode = Path(path).stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+
+
+def open_stream(path: str | Path) -> BinaryIO:
+    """Open what `is_stream` names for writing, behind what this process has printed already.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened.
+    """
+    if not is_stdout(path):
+        return Path(path).open("wb")
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    return os.fdopen(os.dup(STDOUT), "wb")
