@@ -7,6 +7,7 @@ import resource
 import pytest
 
 from emulator.clock import SteppedClock
+from emulator.device.modes import Mode
 from emulator.emulation import Emulation, RunOptions
 from emulator.errors import EmulatorError
 from emulator.imaging.frames import Warm
