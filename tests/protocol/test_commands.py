@@ -44,8 +44,8 @@ def test_list_tells_every_row_and_parameter() -> None:
     ("arguments", "message"),
     [
         (
-            ("icd", "export", "html", "-o", "/does/not/exist/icd.html"),
-            "starhil: /does/not/exist/icd.html: cannot write",
+            ("icd", "export", "html", "-o", "/proc/does/not/exist/icd.html"),
+            "starhil: /proc/does/not/exist/icd.html: its folder cannot be made",
         ),
         (
             ("icd", "export", "html", "--icd", "/does/not/exist"),
