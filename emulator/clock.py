@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError
 from starid.files import read_number
 
 NANOSECONDS: Final = 1_000_000_000

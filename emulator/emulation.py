@@ -13,36 +13,36 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from emulator.claim import claim_symlink
-from emulator.clock import Clock, SteppedClock, make_clock
-from emulator.control import ControlServer
-from emulator.device.cycle import Measurement
-from emulator.device.device import Background, Device, do_at_once, outcome
-from emulator.device.modes import Mode
-from emulator.device.state_store import FileStore, MemoryStore, StateStore
-from emulator.errors import EmulatorError
-from emulator.faults import Faults
-from emulator.guard import one_line
-from emulator.imaging.frames import PipelineSetup, Warm
-from emulator.imaging.imager import ProcessImager, ThreadImager
-from emulator.imaging.worker_process import WorkerProcess
-from emulator.links.can import CanLink
-from emulator.links.serial import SerialLink
-from emulator.profile import Profile
-from emulator.pump import ClockPump, StepPump
-from emulator.revival import PipelineRevival
-from emulator.scenario import load_scenario
-from emulator.truth.config import FileConfig, LiveConfig, TruthConfig
-from emulator.truth.file import FileTruth
-from emulator.truth.live import LiveFeed, LiveTruth
-from emulator.truth.log import TruthLog
-from emulator.truth.source import TruthSource
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition, load_icd
-from protocol.values import Value
+from starhil.emulator.symlink_lock import claim_symlink
+from starhil.emulator.clock import Clock, SteppedClock, make_clock
+from starhil.emulator.control.channel import ControlServer
+from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.device import Background, Device, do_at_once, outcome
+from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.control.faults import Faults
+from starhil.emulator.guard import one_line
+from starhil.emulator.pipeline.frames import PipelineSetup, Warm
+from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.worker_process import WorkerProcess
+from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.profile import Profile
+from starhil.emulator.pump import ClockPump, StepPump
+from starhil.emulator.revival import PipelineRevival
+from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.truth.config import FileConfig, LiveConfig, TruthConfig
+from starhil.emulator.truth.file import FileTruth
+from starhil.emulator.truth.live import LiveFeed, LiveTruth
+from starhil.emulator.truth_log import TruthLog
+from starhil.emulator.truth.source import TruthSource
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.values import Value
 
 if TYPE_CHECKING:
-    from emulator.links.canopen import CanopenLink
+    from starhil.emulator.links.canopen import CanopenLink
 
 log = logging.getLogger("starhil.run")
 
@@ -247,7 +247,7 @@ class Emulation:
         links, seed = self.profile.links, self.profile.run.seed
         stepped = isinstance(self.clock, SteppedClock)  # what leaves at one run time leaves at once
         if links.serial.port != "off":
-            from protocol.transports.serial import open_serial
+            from starhil.protocol.transports.serial import open_serial
 
             baud = int(device.parameters["serial_baud"])
             symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
@@ -259,7 +259,7 @@ class Emulation:
             self.ready_words["serial"] = await self.serial.start()
             self.ready_words["dialect"] = str(device.parameters["serial_dialect"])
         if links.can.channel != "off":
-            from protocol.transports.can import open_can
+            from starhil.protocol.transports.can import open_can
 
             self.can = CanLink(
                 device, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
@@ -270,8 +270,8 @@ class Emulation:
 
     async def _open_canopen(self, device: Device) -> None:
         """Let the CANopen node join the bus of the CAN link, or the one that it would have."""
-        from emulator.links.canopen import open_canopen
-        from protocol.transports.can import open_can
+        from starhil.emulator.links.canopen import open_canopen
+        from starhil.protocol.transports.can import open_can
 
         channel = self.profile.links.can.channel
         bus = self.ready_words.get("can") or ("auto" if channel == "off" else channel)

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, PrivateAttr, ValidationError
 
-from emulator.errors import EmulatorError
-from emulator.toml_file import read_toml
-from emulator.truth.config import FixedConfig, Strict, TruthConfig
-from emulator.wording import explain
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.toml_file import read_toml
+from starhil.emulator.truth.config import FixedConfig, Strict, TruthConfig
+from starhil.emulator.validation_messages import explain
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_DEPTH: Final = 8
@@ -146,9 +146,9 @@ class Profile(Strict):
     catalog: CatalogConfig = CatalogConfig()
     camera: CameraConfig = CameraConfig()
     sensor: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `emulator.imaging.sensor_model.SensorModel`, but for those that are parameters of the device."""
+    """Fields of `starhil.emulator.sensor.model.SensorModel`, but for those that are parameters of the device."""
     sky: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `emulator.imaging.sky_objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
+    """Fields of `starhil.emulator.sky.objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")

@@ -7,12 +7,12 @@ import logging
 from collections.abc import Sequence
 from typing import Any, Final
 
-from emulator.clock import NANOSECONDS, Clock, SteppedClock
-from emulator.device.scheduler import Scheduler
-from emulator.errors import EmulatorError
-from emulator.guard import call_guarded
-from emulator.imaging.imager import Imager
-from protocol.transports.base import Transport
+from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
+from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import call_guarded
+from starhil.emulator.pipeline.imager import Imager
+from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")
 

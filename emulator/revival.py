@@ -11,11 +11,11 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
-from emulator.device.device import PIPELINE_ENDED, Device
-from emulator.errors import EmulatorError
-from emulator.guard import one_line
-from emulator.imaging.frames import Warm
-from emulator.imaging.imager import ProcessImager, ThreadImager
+from starhil.emulator.device.device import PIPELINE_ENDED, Device
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import one_line
+from starhil.emulator.pipeline.frames import Warm
+from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
 
 log = logging.getLogger("starhil.run")
 

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError
 from starid.files import read_text
 
 

@@ -8,16 +8,16 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
-from hil_tests.images import Image, download_by_bursts, download_by_frames
-from hil_tests.links import (
+from starhil.hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
+from starhil.hil_tests.images import Image, download_by_bursts, download_by_frames
+from starhil.hil_tests.links import (
     HostLink,
 )
-from hil_tests.readings import Ack, Reading, Transaction
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition, load_icd
-from protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from protocol.values import Value
+from starhil.hil_tests.readings import Ack, Reading, Transaction
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.values import Value
 
 DEFAULT_TIMEOUT_S: Final = 1.0
 """Time-out of a transaction, that of current public flight software."""

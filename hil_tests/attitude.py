@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from hil_tests.errors import BenchError
+from starhil.hil_tests.errors import BenchError
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02

@@ -8,14 +8,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from hil_tests.async_client import DEFAULT_TIMEOUT_S
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess
-from hil_tests.errors import BenchError
-from hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
-from hil_tests.wire_log import CandumpLog, SerialLog, WireLog
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition
+from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
+from starhil.hil_tests.wire_log import CandumpLog, SerialLog, WireLog
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
 
 SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 

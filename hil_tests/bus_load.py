@@ -15,14 +15,14 @@ from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Final
 
-from hil_tests.errors import BenchError
-from hil_tests.load_figures import CanLoad, Spread
-from hil_tests.realtime import give_realtime
-from protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition, load_icd
-from protocol.messages import LinkFault, Reply, ReplyKind, Request
-from protocol.transports import open_can
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.load_figures import CanLoad, Spread
+from starhil.hil_tests.realtime import give_realtime
+from starhil.protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.transports import open_can
 
 HOST: Final = 1
 DEVICE: Final = 4

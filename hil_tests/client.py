@@ -7,10 +7,10 @@ from collections.abc import Callable, Coroutine, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
-from hil_tests.errors import BenchError
-from hil_tests.images import Image
-from hil_tests.links import (
+from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.images import Image
+from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
     DEFAULT_HOST_ADDRESS,
@@ -18,13 +18,13 @@ from hil_tests.links import (
     HostLink,
     SerialLink,
 )
-from hil_tests.loop_thread import LoopThread
-from hil_tests.readings import Ack, Reading, Transaction
-from hil_tests.wire_log import WireLog
-from protocol.icd import InterfaceDefinition
-from protocol.messages import LinkFault, Reply, Request, RequestKind
-from protocol.serial_framing import Dialect
-from protocol.values import Value
+from starhil.hil_tests.loop_thread import LoopThread
+from starhil.hil_tests.readings import Ack, Reading, Transaction
+from starhil.hil_tests.wire_log import WireLog
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.values import Value
 
 T = TypeVar("T")
 

@@ -15,12 +15,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self
 
-from hil_tests.errors import EmulatorProcessError
+from starhil.hil_tests.errors import EmulatorProcessError
 
-STARHIL: Final = "from emulator.cli.app import main; main()"
+STARHIL: Final = "from starhil.emulator.cli.app import main; main()"
 """What the command `starhil` does, for a Python whose script folder is not known."""
 _ENDS_WITH_PARENT: Final = (
-    "from emulator.parent_death_signal import end_with_parent; end_with_parent({}, {:d}); "
+    "from starhil.emulator.parent_death_signal import end_with_parent; end_with_parent({}, {:d}); "
 )
 READY_WITHIN_S: Final = 300.0
 """A first start on a machine compiles for minutes; a warm one takes about 3 s."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from hil_tests.attitude import (
+from starhil.hil_tests.attitude import (
     AttitudeError,
     Quaternion,
     attitude_error,
@@ -17,9 +17,9 @@ from hil_tests.attitude import (
     unit,
     wrapped_difference,
 )
-from hil_tests.errors import BenchError, ScriptError, near_matches
-from hil_tests.script_reader import TableReader
-from protocol.values import Value
+from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
+from starhil.hil_tests.script_reader import TableReader
+from starhil.protocol.values import Value
 
 RELATIVE_ROUNDING: Final = 1e-6
 """Numbers given without a tolerance may differ by the rounding of a 32-bit float."""

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from hil_tests.errors import BadReplyError, BenchError, NackError
-from hil_tests.readings import Reading
-from protocol.image_transfer import (
+from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
+from starhil.hil_tests.readings import Reading
+from starhil.protocol.image_transfer import (
     FRAME_SIZE,
     MAP_PARTS,
     MAX_BLOCK,
@@ -21,8 +21,8 @@ from protocol.image_transfer import (
     packet_count,
     parse_burst_packet,
 )
-from protocol.messages import ErrorCode
-from protocol.values import Value
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import Value
 
 
 class Downloader(Protocol):

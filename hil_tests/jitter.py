@@ -11,12 +11,12 @@ from math import inf
 from statistics import fmean
 from typing import Final
 
-from hil_tests.errors import BenchError
-from hil_tests.load_figures import Jitter, Spread
-from protocol.can_framing import MAX_STANDARD_ID, CanFrame, CanHostReceiver, encode_request_frames
-from protocol.icd import load_icd
-from protocol.messages import Reply, ReplyKind, Request
-from protocol.transports import CanTransport, open_can
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.load_figures import Jitter, Spread
+from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame, CanHostReceiver, encode_request_frames
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import Reply, ReplyKind, Request
+from starhil.protocol.transports import CanTransport, open_can
 
 HOST: Final = 1
 WARM_UP: Final = 3

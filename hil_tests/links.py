@@ -7,13 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Final
 
-from hil_tests.errors import LinkLostError
-from hil_tests.wire_log import WireLog
-from protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
-from protocol.errors import ProtocolError
-from protocol.messages import LinkFault, Reply, Request
-from protocol.serial_framing import Dialect, HostReceiver, encode_request
-from protocol.transports import open_can, open_serial
+from starhil.hil_tests.errors import LinkLostError
+from starhil.hil_tests.wire_log import WireLog
+from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import LinkFault, Reply, Request
+from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.transports import open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
 """CAN address of the OBC, as public flight software has it."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Self
 
-from hil_tests.loop_thread import LoopThread
-from protocol.hub import DEFAULT_BUS, CanHub
-from protocol.transports.can import kernel_can_is_up
+from starhil.hil_tests.loop_thread import LoopThread
+from starhil.protocol.hub import DEFAULT_BUS, CanHub
+from starhil.protocol.transports.can import kernel_can_is_up
 
 
 class OwnHub:

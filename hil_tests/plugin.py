@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from hil_tests.client import ObcClient
-    from hil_tests.emulator_process import EmulatorProcess
+    from starhil.hil_tests.client import ObcClient
+    from starhil.hil_tests.emulator_process import EmulatorProcess
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -50,8 +50,8 @@ def starhil_emulator(
     `.ready` holds its ready line. It is ended by SIGTERM after the module's last test; another end than status 0 is
     an error.
     """
-    from hil_tests.emulator_process import EmulatorProcess, emulator_command
-    from hil_tests.own_hub import OwnBus
+    from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+    from starhil.hil_tests.own_hub import OwnBus
 
     folder: Path = tmp_path_factory.mktemp("starhil")
     with OwnBus() as channel:
@@ -68,7 +68,7 @@ def starhil_emulator(
 
 
 def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
-    from hil_tests.client import ObcClient
+    from starhil.hil_tests.client import ObcClient
 
     spec = request.config.getoption(f"--starhil-{link}")
     if spec is None:

@@ -7,8 +7,8 @@ import zlib
 from pathlib import Path
 from typing import Final
 
-from hil_tests.errors import BenchError
-from hil_tests.results import write_whole
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.results import write_whole
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _GREY: Final = 0

@@ -7,11 +7,11 @@ import re
 import time
 from typing import Final
 
-from hil_tests.client import ObcClient
-from hil_tests.errors import BenchError
-from hil_tests.links import CanLink, SerialLink
-from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.links import CanLink, SerialLink
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
 
 _FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8})")
 _LOOK_S: Final = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from protocol.values import Value
+from starhil.protocol.values import Value
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from hil_tests.errors import BenchError
+from starhil.hil_tests.errors import BenchError
 
 PRIORITY = 1
 

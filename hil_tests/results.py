@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree as ET
 
-from hil_tests.errors import BenchError
-from hil_tests.expect import show
-from hil_tests.interruption import Interrupted
-from protocol.values import Value
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.expect import show
+from starhil.hil_tests.interruption import Interrupted
+from starhil.protocol.values import Value
 
 PASSED: Final = "passed"
 FAILED: Final = "failed"

@@ -38,8 +38,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from hil_tests.errors import BenchError, ScriptError, near_matches
-from hil_tests.expect import (
+from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
+from starhil.hil_tests.expect import (
     AttitudeCheck,
     Expectation,
     Operand,
@@ -50,8 +50,8 @@ from hil_tests.expect import (
     read_stated_attitude,
     show,
 )
-from hil_tests.raw_exchange import parse_frame, pattern
-from hil_tests.script_model import (
+from starhil.hil_tests.raw_exchange import parse_frame, pattern
+from starhil.hil_tests.script_model import (
     LINKS,
     SIGNALS,
     Action,
@@ -70,12 +70,12 @@ from hil_tests.script_model import (
     Truth,
     Wait,
 )
-from hil_tests.script_reader import TableReader
-from protocol.codec import Field, Row
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition
-from protocol.user_file import read_user_text
-from protocol.values import Parameter, Value
+from starhil.hil_tests.script_reader import TableReader
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.values import Parameter, Value
 
 LISTED: Final = "; `starhil icd list` lists all"
 """Where names are found that nothing known is near."""

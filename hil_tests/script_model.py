@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from hil_tests.attitude import Quaternion
-from hil_tests.expect import AttitudeCheck, Expectation, Operand
-from protocol.codec import Row
-from protocol.values import Parameter
+from starhil.hil_tests.attitude import Quaternion
+from starhil.hil_tests.expect import AttitudeCheck, Expectation, Operand
+from starhil.protocol.codec import Row
+from starhil.protocol.values import Parameter
 
 LINKS: Final = ("serial", "can", "both")
 SIGNALS: Final = ("term", "kill")

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from hil_tests.errors import ScriptError, near_matches
+from starhil.hil_tests.errors import ScriptError, near_matches
 
 
 @dataclass

@@ -10,12 +10,12 @@ import time
 from collections import deque
 from typing import Final
 
-from hil_tests.load_figures import SerialLoad
-from protocol.icd import InterfaceDefinition, load_icd
-from protocol.image_transfer import MAP_PART_SIZE
-from protocol.messages import LinkFault, Reply, ReplyKind, Request
-from protocol.serial_framing import Dialect, HostReceiver, encode_request
-from protocol.transports import SerialTransport, open_serial
+from starhil.hil_tests.load_figures import SerialLoad
+from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.image_transfer import MAP_PART_SIZE
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.transports import SerialTransport, open_serial
 
 REPLY_WITHIN_S: Final = 2.0
 MAPS_BETWEEN_STARS: Final = (6, 6, 6, 7)

@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from hil_tests.bench import Bench
-from hil_tests.client import ObcClient
-from hil_tests.errors import BenchError, NackError
-from hil_tests.expect import resolve, show
-from hil_tests.interruption import Interrupted
-from hil_tests.png import write_png
-from hil_tests.raw_exchange import matches, pattern, send_and_listen
-from hil_tests.readings import Reading
-from hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, percentile, summarize
-from hil_tests.script_model import (
+from starhil.hil_tests.bench import Bench
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.errors import BenchError, NackError
+from starhil.hil_tests.expect import resolve, show
+from starhil.hil_tests.interruption import Interrupted
+from starhil.hil_tests.png import write_png
+from starhil.hil_tests.raw_exchange import matches, pattern, send_and_listen
+from starhil.hil_tests.readings import Reading
+from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, percentile, summarize
+from starhil.hil_tests.script_model import (
     Command,
     DownloadImage,
     GetParameter,
@@ -32,9 +32,9 @@ from hil_tests.script_model import (
     Step,
     Wait,
 )
-from hil_tests.truth_file import TruthFile
-from protocol.errors import ProtocolError
-from protocol.values import Value
+from starhil.hil_tests.truth_file import TruthFile
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.values import Value
 
 MS_PER_S: Final = 1e3
 CLOCK_GRAIN_S: Final = 1e-6

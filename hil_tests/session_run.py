@@ -11,12 +11,12 @@ from typing import Final
 from rich.console import Console
 from rich.text import Text
 
-from hil_tests.bench import Bench, LinkOptions
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
-from hil_tests.interruption import Interrupted
-from hil_tests.own_hub import OwnBus
-from hil_tests.results import (
+from starhil.hil_tests.bench import Bench, LinkOptions
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
+from starhil.hil_tests.interruption import Interrupted
+from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.results import (
     FAILED,
     PASSED,
     SKIPPED,
@@ -26,12 +26,12 @@ from hil_tests.results import (
     prepare_report,
     write_junit,
 )
-from hil_tests.scratch import scratch_folder
-from hil_tests.script import load_script
-from hil_tests.script_model import Script
-from hil_tests.session import SessionRunner
-from protocol.icd import load_icd
-from protocol.serial_framing import Dialect
+from starhil.hil_tests.scratch import scratch_folder
+from starhil.hil_tests.script import load_script
+from starhil.hil_tests.script_model import Script
+from starhil.hil_tests.session import SessionRunner
+from starhil.protocol.icd import load_icd
+from starhil.protocol.serial_framing import Dialect
 
 SCRIPT_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "sessions"
 DEFAULT_FOLDER: Final = Path("out") / "session"

@@ -8,9 +8,9 @@ import io
 from pathlib import Path
 from typing import Final
 
-from hil_tests.attitude import Quaternion, interpolate, unit
-from hil_tests.errors import BenchError
-from protocol.user_file import read_user_text
+from starhil.hil_tests.attitude import Quaternion, interpolate, unit
+from starhil.hil_tests.errors import BenchError
+from starhil.protocol.user_file import read_user_text
 
 TIME_COLUMN: Final = "time_of_exposure_s"
 QUATERNION_COLUMNS: Final = ("true_qx", "true_qy", "true_qz", "true_qw")

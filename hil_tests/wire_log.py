@@ -9,8 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from protocol.can_framing import CanFrame
-from protocol.candump import format_candump
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.candump import format_candump
 
 
 class WireLog(ABC):

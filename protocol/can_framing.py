@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Generic, TypeVar
 
-from protocol.errors import ProtocolError
-from protocol.messages import (
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import (
     BURST_ID,
     FIRST_TELEMETRY_ID,
     FaultKind,

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
 
 _LINE: Final = re.compile(
     r"\((?P<time>\d+\.\d+)\)\s+(?P<channel>\S+)\s+(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(?P<data>R\d?|[0-9A-Fa-f.]*)"

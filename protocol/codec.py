@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 
 import construct
 
-from protocol.values import (
+from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
     EnumDefinition,

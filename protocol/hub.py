@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TextIO, cast
 
-from protocol.can_framing import CanFrame
-from protocol.candump import format_candump
-from protocol.errors import ProtocolError, reason
-from protocol.flow import WINDOW, FairQueue, TurnProtocol, limit_buffers
-from protocol.keepalive import notice_a_lost_peer
-from protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.candump import format_candump
+from starhil.protocol.errors import ProtocolError, reason
+from starhil.protocol.flow import WINDOW, FairQueue, TurnProtocol, limit_buffers
+from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
 _LOGGER: Final = logging.getLogger("starhil.hub")
 

@@ -13,9 +13,9 @@ from typing import Final, TypeVar
 
 from pydantic import ValidationError
 
-from protocol.codec import Field, FieldKind, Row, RowKind, Slot
-from protocol.errors import ProtocolError
-from protocol.icd_schema import (
+from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd_schema import (
     BitModel,
     EnumModel,
     FieldModel,
@@ -24,9 +24,9 @@ from protocol.icd_schema import (
     RowModel,
     SectionModel,
 )
-from protocol.messages import FIRST_TELEMETRY_ID
-from protocol.user_file import read_user_text
-from protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
+from starhil.protocol.messages import FIRST_TELEMETRY_ID
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
 __all__ = ["IcdError", "InterfaceDefinition", "Names", "UnknownNameError", "default_icd_path", "load_icd"]
 

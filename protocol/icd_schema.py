@@ -121,4 +121,4 @@ class FileModel(_Model):
     parameter: list[ParameterModel] = []
     section: list[SectionModel] = []
     canopen: dict[str, object] | None = None
-    """The CANopen mapping, read by `protocol.canopen`; no part of the rows."""
+    """The CANopen mapping, read by `starhil.protocol.canopen`; no part of the rows."""

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from protocol.errors import ProtocolError
+from starhil.protocol.errors import ProtocolError
 
 FRAME_SIZE: Final = 128
 """Bytes of one image frame."""

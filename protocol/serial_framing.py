@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from typing import Final
 
-from protocol.errors import ProtocolError
-from protocol.messages import (
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import (
     BURST_ID,
     FIRST_TELEMETRY_ID,
     FaultKind,

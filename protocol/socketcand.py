@@ -11,8 +11,8 @@ import math
 import re
 from typing import Final
 
-from protocol.can_framing import MAX_EXTENDED_ID, MAX_STANDARD_ID, CanFrame
-from protocol.errors import ProtocolError
+from starhil.protocol.can_framing import MAX_EXTENDED_ID, MAX_STANDARD_ID, CanFrame
+from starhil.protocol.errors import ProtocolError
 
 EXTENDED_FLAG: Final = 0x80000000
 REMOTE_FLAG: Final = 0x40000000

@@ -10,8 +10,8 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Final
 
-from protocol.errors import ProtocolError
-from protocol.messages import ErrorCode
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import ErrorCode
 
 Value = bool | int | float | str | bytes
 """A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw bytes."""

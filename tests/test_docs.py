@@ -16,17 +16,17 @@ from pathlib import Path
 import can
 import pytest
 
-from emulator.device.parameters import Parameters
-from emulator.errors import EmulatorError
-from emulator.imaging.sensor_model import SensorModel
-from emulator.profile import load_profile
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.own_hub import OwnBus
-from hil_tests.raw_exchange import format_frame
-from protocol.can_framing import CanFrame, MessageType
-from protocol.canopen import build_dictionary
-from protocol.export import export
-from protocol.icd import load_icd
+from starhil.emulator.device.parameters import Parameters
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.profile import load_profile
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.raw_exchange import format_frame
+from starhil.protocol.can_framing import CanFrame, MessageType
+from starhil.protocol.canopen import build_dictionary
+from starhil.protocol.export import export
+from starhil.protocol.icd import load_icd
 
 DOCS = Path(__file__).parents[1] / "docs"
 PATIENCE_S = 20.0

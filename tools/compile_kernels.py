@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from emulator.emulation import pipeline_setup
-from emulator.imaging.frames import Failure
-from emulator.imaging.picture import make_picture
-from emulator.profile import Profile
+from starhil.emulator.emulation import pipeline_setup
+from starhil.emulator.pipeline.frames import Failure
+from starhil.emulator.pipeline.pipeline import make_picture
+from starhil.emulator.profile import Profile
 
 
 def main() -> int:

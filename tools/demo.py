@@ -19,8 +19,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.errors import BenchError
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.errors import BenchError
 from starid.attitude import Attitude
 
 CROSS_LIMIT_ARCSEC = 60.0

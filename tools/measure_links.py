@@ -20,10 +20,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from protocol.can_framing import CanFrame
-from protocol.hub import CanHub
-from protocol.socketcand import format_send
-from protocol.transports import open_can, open_serial
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.hub import CanHub
+from starhil.protocol.socketcand import format_send
+from starhil.protocol.transports import open_can, open_serial
 
 PING = CanFrame(0x08AA0401, bytes(range(8)))
 SERIAL_PING = b"\x1f\x7f\x80\x1f\xff"

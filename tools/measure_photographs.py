@@ -75,7 +75,7 @@ def _solve(seed: int, defects: dict[str, Any]) -> tuple[float | None, float]:
     from starid.attitude import ARCSEC_PER_RAD
     from starid.camera import Camera
     from starid.catalog import load_catalog
-    from starid.image_solver import solve_image
+    from starid.photograph.solver import solve_image
     from tests.starid.photograph import photograph
 
     sky = load_catalog()

@@ -35,12 +35,12 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from hil_tests.bench import LinkOptions
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from hil_tests.errors import BenchError, DeviceError
-from hil_tests.results import percentile
-from hil_tests.session_run import SessionRequest, run_session
+from starhil.hil_tests.bench import LinkOptions
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.errors import BenchError, DeviceError
+from starhil.hil_tests.results import percentile
+from starhil.hil_tests.session_run import SessionRequest, run_session
 
 WARM_UP_SHARE = 0.25
 MEMORY_GROWTH_MB = 8.0

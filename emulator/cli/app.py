@@ -11,11 +11,11 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 from typer.core import TyperCommand
 
-from emulator.cli.output import show_every_character
-from emulator.errors import EmulatorError
-from emulator.wording import plain
-from hil_tests.errors import BenchError
-from protocol.errors import ProtocolError
+from starhil.emulator.cli.output import show_every_character
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.validation_messages import plain
+from starhil.hil_tests.errors import BenchError
+from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 
 EXIT_BAD_INPUT: Final = 2
@@ -44,7 +44,7 @@ COMMANDS: Final[dict[str, str]] = {
     "reproduce": "reproduce",
     "cache": "cache",
 }
-"""Sub-command → module under `emulator.cli`: its `command` function, or its `group` of sub-commands.
+"""Sub-command → module under `starhil.emulator.cli`: its `command` function, or its `group` of sub-commands.
 
 These modules import at the top only what is quick; numerics come in inside the function.
 """
@@ -87,7 +87,7 @@ def build_app() -> typer.Typer:
     )
     app.callback()(_options)
     for name, module_name in COMMANDS.items():
-        module = importlib.import_module(f"emulator.cli.{module_name}")
+        module = importlib.import_module(f"starhil.emulator.cli.{module_name}")
         if hasattr(module, "group"):
             for each in module.group.registered_commands:
                 each.cls = FiniteCommand

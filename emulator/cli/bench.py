@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output
+from starhil.emulator.cli.output import output_help, prepare_output
 
 _TABLE_WIDTH = 134
 
@@ -33,8 +33,8 @@ def latency(
     from rich.console import Console
     from rich.table import Table
 
-    from emulator.errors import EmulatorError
-    from emulator.latency_bench import measure
+    from starhil.emulator.errors import EmulatorError
+    from starhil.hil_tests.latency import measure
 
     chosen = workers or ["process"]
     if unknown := sorted(set(chosen) - {"process", "thread"}):
@@ -87,8 +87,8 @@ def centroid(
     from rich.console import Console
     from rich.table import Table
 
-    from emulator.bench.centroid import DEFAULT_RATES_DEG_S, measure_centroids, plot_centroids
-    from emulator.imaging.sensor_model import SensorModel
+    from starhil.emulator.benchmarks.centroid import DEFAULT_RATES_DEG_S, measure_centroids, plot_centroids
+    from starhil.emulator.sensor.model import SensorModel
 
     if output is not None:
         prepare_output(output, "-o")
@@ -130,7 +130,7 @@ def frame(
     from rich.console import Console
     from rich.table import Table
 
-    from emulator.bench.frame import measure_frames
+    from starhil.emulator.benchmarks.frame import measure_frames
 
     progress = Console(stderr=True)
     rows = measure_frames(frames, seed, rate, progress=progress.print)
@@ -175,10 +175,10 @@ def bus(
 
     from rich.console import Console
 
-    from emulator.cli.bench_bus import Target, measure, own_device, print_figures
-    from emulator.errors import EmulatorError
-    from hil_tests.realtime import give_realtime
-    from protocol.serial_framing import Dialect
+    from starhil.emulator.cli.bench_bus import Target, measure, own_device, print_figures
+    from starhil.emulator.errors import EmulatorError
+    from starhil.hil_tests.realtime import give_realtime
+    from starhil.protocol.serial_framing import Dialect
 
     if dialect not in set(Dialect):
         raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
@@ -222,7 +222,7 @@ def identify(
     from rich.console import Console
     from rich.table import Table
 
-    from emulator.bench.identify import ROWS, STANDARD, run
+    from starhil.emulator.benchmarks.identify import ROWS, STANDARD, run
 
     rows = list(STANDARD if not row else ROWS if "all" in row else row)
     progress = Console(stderr=True)

@@ -10,14 +10,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from hil_tests.bus_load import DEVICE, load_can
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
-from hil_tests.load_figures import CanLoad, Jitter, SerialLoad
-from hil_tests.realtime import give_realtime
-from hil_tests.serial_load import load_serial
-from protocol.serial_framing import Dialect
+from starhil.hil_tests.bus_load import DEVICE, load_can
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
+from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
+from starhil.hil_tests.realtime import give_realtime
+from starhil.hil_tests.serial_load import load_serial
+from starhil.protocol.serial_framing import Dialect
 
 UPDATE_RATE_HZ = 10.0
 NODE = 44

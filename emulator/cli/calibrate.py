@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output, report_stream
-from emulator.errors import EmulatorError
+from starhil.emulator.cli.output import output_help, prepare_output, report_stream
+from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
-    from starid.self_calibration import SelfCalibration, Stars
+    from starid.photograph.self_calibration import SelfCalibration, Stars
 
 _UNITS = {"fx": "px", "fy": "px", "cx": "px", "cy": "px"}
 
@@ -49,7 +49,7 @@ def command(
     from starid.camera import Camera
     from starid.camera_file import save_camera
     from starid.catalog import DEFAULT_EPOCH, load_catalog
-    from starid.self_calibration import self_calibrate
+    from starid.photograph.self_calibration import self_calibrate
 
     prepare_output(output, "-o")
     frames, (height, width) = _stars(images, allow_colour=allow_colour)
@@ -69,7 +69,7 @@ def _stars(images: list[Path], *, allow_colour: bool) -> tuple[list[Stars], tupl
     """Detections of each image, and the size (height, width) that all of them must have."""
     from starid.imaging.detection import detect
     from starid.imaging.image_io import read_image
-    from starid.self_calibration import Stars
+    from starid.photograph.self_calibration import Stars
 
     frames: list[Stars] = []
     size: tuple[int, int] | None = None

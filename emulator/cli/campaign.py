@@ -57,7 +57,7 @@ def lost_in_space(
     """
     import numpy as np
 
-    from emulator.campaign import CampaignPlan, run_campaign, summarise
+    from starhil.emulator.benchmarks.campaign import CampaignPlan, run_campaign, summarise
 
     plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm, sky=sky)
     with _backend(dask, jobs):
@@ -78,7 +78,7 @@ def _backend(dask: str | None, jobs: int) -> Iterator[None]:
     if dask is None:
         yield
         return
-    from emulator.errors import EmulatorError
+    from starhil.emulator.errors import EmulatorError
 
     try:
         from distributed import Client, LocalCluster

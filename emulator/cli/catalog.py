@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
     from starid.catalog import StarCatalog

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.output import output_help
+from starhil.emulator.cli.output import output_help
 
 
 def command(
@@ -75,13 +75,13 @@ def command(
     """
     from rich.console import Console
 
-    from hil_tests.conformance import report
-    from hil_tests.conformance.conformance_run import ConformanceRequest, all_cases, run_conformance
-    from hil_tests.conformance.link_probe import ProbeTimes
-    from hil_tests.errors import BenchError
-    from hil_tests.interruption import interruptible
-    from hil_tests.results import prepare_report
-    from protocol.icd import load_icd
+    from starhil.hil_tests.conformance import report
+    from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, all_cases, run_conformance
+    from starhil.hil_tests.conformance.link_probe import ProbeTimes
+    from starhil.hil_tests.errors import BenchError
+    from starhil.hil_tests.interruption import interruptible
+    from starhil.hil_tests.results import prepare_report
+    from starhil.protocol.icd import load_icd
 
     if dialect not in ("a", "b", "c"):
         raise BenchError(f"--dialect {dialect}: must be a, b or c")

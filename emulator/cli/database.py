@@ -10,8 +10,8 @@ from typing import Annotated, TextIO
 
 import typer
 
-from emulator.cli.frame_options import frame_catalog, frame_parameters
-from emulator.cli.output import output_help, prepare_output, report_stream
+from starhil.emulator.cli.frame_options import frame_catalog, frame_parameters
+from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 
 group = typer.Typer(help="Feature databases of the LSI and RSI algorithms.", no_args_is_help=True)
 

@@ -8,8 +8,8 @@ from typing import Annotated, Final
 
 import typer
 
-from emulator.cli.frame_options import frame_catalog, frame_parameters
-from emulator.errors import EmulatorError
+from starhil.emulator.cli.frame_options import frame_catalog, frame_parameters
+from starhil.emulator.errors import EmulatorError
 
 _KEYS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
 

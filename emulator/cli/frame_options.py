@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, cast
 
-from emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
     from starid.catalog import Band, StarCatalog

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output
+from starhil.emulator.cli.output import output_help, prepare_output
 
 
 def command(
@@ -25,7 +25,7 @@ def command(
     import asyncio
     import signal
 
-    from protocol.hub import DEFAULT_BUS, CanHub
+    from starhil.protocol.hub import DEFAULT_BUS, CanHub
 
     if log is not None:
         prepare_output(log, "--log")

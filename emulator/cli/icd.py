@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output, print_text
+from starhil.emulator.cli.output import output_help, prepare_output, print_text
 
 group = typer.Typer(help="The interface definition: list it, export it.", no_args_is_help=True)
 
@@ -39,8 +39,8 @@ def export(
 
     markdown and html are for people; dbc, eds, xtce and cosmos for CAN tools, CANopen masters and ground software.
     """
-    from protocol.export import export as render
-    from protocol.icd import load_icd
+    from starhil.protocol.export import export as render
+    from starhil.protocol.icd import load_icd
 
     text = render(load_icd(icd), format_.value)
     if output is None:
@@ -51,7 +51,7 @@ def export(
 
 def _write(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
-    from emulator.errors import EmulatorError
+    from starhil.emulator.errors import EmulatorError
     from starid.cache import write_atomically
 
     prepare_output(path, "-o")
@@ -71,7 +71,7 @@ def list_rows(
     """List telecommands, telemetry and parameters, one a line."""
     import json
 
-    from protocol.icd import load_icd
+    from starhil.protocol.icd import load_icd
 
     definition = load_icd(icd)
     if as_json:

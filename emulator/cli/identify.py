@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output, report_stream
+from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 
 if TYPE_CHECKING:
     from starid.camera import Camera, Model
     from starid.catalog import StarCatalog
-    from starid.image_solver import ImageSolution
+    from starid.photograph.solver import ImageSolution
 
 _NUMBERED_TO_MAGNITUDE = 3.0
 _SHOWN_STARS = 12
@@ -95,11 +95,11 @@ def _solved(
     model: str,
 ) -> ImageSolution:
     """What is found on the image with the camera that the options name."""
-    from emulator.errors import EmulatorError
+    from starhil.emulator.errors import EmulatorError
     from starid.camera import Camera
-    from starid.field_sweep import solve_any_field
+    from starid.photograph.field_sweep import solve_any_field
     from starid.files import read_number
-    from starid.image_solver import solve_image
+    from starid.photograph.solver import solve_image
 
     if fov is None:
         return solve_image(pixels, _camera(profile), catalog)
@@ -132,7 +132,7 @@ def _camera(profile: str | None) -> Camera:
         return Camera.from_fov()
     if Path(profile).suffix == ".toml":
         return load_camera(profile)
-    from emulator.profile import load_profile
+    from starhil.emulator.profile import load_profile
 
     return Camera.from_dict(load_profile(profile).camera.values())
 
@@ -217,7 +217,7 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
     """The image with circles at identified stars, and other ones at detections without an identity."""
     import numpy as np
 
-    from emulator.imaging.annotate import annotate, star_label
+    from starhil.emulator.cli.annotate import annotate, star_label
     from starid.catalog import load_catalog
 
     solution, found = result.solution, result.detections

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Final, TextIO
 
-from emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError
 
 _PLAIN: Final = {
     "°": " deg",

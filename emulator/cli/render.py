@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output, report_stream
-from emulator.errors import EmulatorError
+from starhil.emulator.cli.output import output_help, prepare_output, report_stream
+from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
-    from emulator.imaging.sensor import Frame
-    from emulator.imaging.sensor_model import SensorModel
-    from emulator.imaging.sky_objects import SkyObjects
+    from starhil.emulator.sensor.renderer import Frame
+    from starhil.emulator.sensor.model import SensorModel
+    from starhil.emulator.sky.objects import SkyObjects
     from starid.camera import Camera
 
 _NUMBERED_TO_MAGNITUDE = 3.6
@@ -62,7 +62,7 @@ def command(
     ] = False,
 ) -> None:
     """Render one frame of the sky; the same options give the same bytes."""
-    from emulator.imaging.sensor import Renderer
+    from starhil.emulator.sensor.renderer import Renderer
     from starid.attitude import Attitude
     from starid.catalog import load_catalog
     from starid.imaging.image_io import image_suffix, write_image
@@ -116,19 +116,19 @@ class _Scene:
 
 def _scene(profile: str | None, fov: float | None, size: str | None, model: str | None) -> _Scene:
     """Scene of a profile, as its device sees it, or of the defaults, with the options put over it."""
-    from emulator.imaging.sensor_model import SensorModel
-    from emulator.imaging.sky_objects import SkyObjects
+    from starhil.emulator.sensor.model import SensorModel
+    from starhil.emulator.sky.objects import SkyObjects
     from starid.camera import Camera
     from starid.catalog import DEFAULT_EPOCH
 
     if profile is None:
         scene = _Scene(Camera.from_fov(), SensorModel(), SkyObjects(), "", DEFAULT_EPOCH)
     else:
-        from emulator.device.device import profile_defaults
-        from emulator.device.parameters import Parameters
-        from emulator.emulation import pipeline_setup
-        from emulator.profile import load_profile
-        from protocol.icd import load_icd
+        from starhil.emulator.device.device import profile_defaults
+        from starhil.emulator.device.parameters import Parameters
+        from starhil.emulator.emulation import pipeline_setup
+        from starhil.emulator.profile import load_profile
+        from starhil.protocol.icd import load_icd
 
         loaded, icd = load_profile(profile), load_icd()
         parameters = Parameters(icd, profile_defaults(loaded, icd))
@@ -170,7 +170,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _marked(frame: Frame) -> Any:
     """Mark the stars of a frame: names and Hipparcos numbers for the bright ones."""
-    from emulator.imaging.annotate import annotate, star_label
+    from starhil.emulator.cli.annotate import annotate, star_label
 
     stars = frame.stars
     labels = [

@@ -37,9 +37,9 @@ def command(
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from emulator.reproduce.registry import experiments, select
-    from emulator.reproduce.report import summary, write_report
-    from emulator.reproduce.runner import finished_in, run
+    from starid.thesis.experiments.registry import experiments, select
+    from starid.thesis.experiments.report import summary, write_report
+    from starid.thesis.experiments.runner import finished_in, run
 
     if list_them:
         _list(as_json=as_json, known={n: (e.title, e.quick is not None) for n, e in experiments().items()})

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.output import output_help, prepare_output
+from starhil.emulator.cli.output import output_help, prepare_output
 
 
 def command(
@@ -67,7 +67,7 @@ def command(
 
     One line on stdout, `ready serial=… dialect=… can=… seed=…`, tells that it takes commands and where.
     """
-    from emulator.imaging.worker_process import take_worker
+    from starhil.emulator.pipeline.worker_process import take_worker
 
     worker = take_worker()  # first of all: it imports and warms up while this process does the rest
 
@@ -75,10 +75,10 @@ def command(
     import gc
     import logging
 
-    from emulator.emulation import Emulation, RunOptions
-    from emulator.errors import EmulatorError
-    from emulator.profile import load_profile
-    from protocol.serial_framing import Dialect
+    from starhil.emulator.emulation import Emulation, RunOptions
+    from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.profile import load_profile
+    from starhil.protocol.serial_framing import Dialect
 
     levels = ("debug", "info", "warning", "error")
     if log not in levels:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.output import output_help
+from starhil.emulator.cli.output import output_help
 
 
 def command(
@@ -50,9 +50,9 @@ def command(
     SIGINT, SIGTERM and SIGHUP end it and the emulator that it started; the steps left are reported as not run (exit
     status 128 and the number of the signal).
     """
-    from hil_tests.bench import LinkOptions
-    from hil_tests.interruption import interruptible
-    from hil_tests.session_run import SessionRequest, run_session
+    from starhil.hil_tests.bench import LinkOptions
+    from starhil.hil_tests.interruption import interruptible
+    from starhil.hil_tests.session_run import SessionRequest, run_session
 
     options = LinkOptions(
         serial=serial,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from protocol.messages import ErrorCode, FaultKind, LinkFault
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault
 
 _FLAG_OF_FAULT: Final[dict[FaultKind, str]] = {
     FaultKind.UART_PROTOCOL: "uart_protocol_error",

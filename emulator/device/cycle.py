@@ -17,12 +17,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from emulator.clock import NANOSECONDS, DeviceTime
-from emulator.device.modes import Mode
-from emulator.device.parameters import Parameters, exposure_period_s
-from emulator.device.rate import RateEstimator
-from emulator.device.scheduler import Event, Scheduler
-from emulator.imaging.frames import (
+from starhil.emulator.clock import NANOSECONDS, DeviceTime
+from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.rate import RateEstimator
+from starhil.emulator.device.scheduler import Event, Scheduler
+from starhil.emulator.pipeline.frames import (
     ZERO,
     Failure,
     FrameRequest,
@@ -31,9 +31,9 @@ from emulator.imaging.frames import (
     SolverSettings,
     Triple,
 )
-from emulator.imaging.imager import Answer, Imager
-from emulator.profile import TimingConfig
-from emulator.truth.source import FixedTruth, TruthSource, TruthState
+from starhil.emulator.pipeline.imager import Answer, Imager
+from starhil.emulator.profile import TimingConfig
+from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
 
 log = logging.getLogger("starhil.device")

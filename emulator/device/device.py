@@ -6,28 +6,28 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
-from emulator.clock import NANOSECONDS, Clock, DeviceTime
-from emulator.device.counters import Acknowledge, Counters
-from emulator.device.cycle import FrameCycle, Measurement
-from emulator.device.file_download import FileDownload
-from emulator.device.images import ImageStore
-from emulator.device.modes import Mode, Modes, Transition
-from emulator.device.parameters import Parameters, ParameterValue
-from emulator.device.refusal import Refused
-from emulator.device.scheduler import Event, Scheduler
-from emulator.device.state_store import StateStore
-from emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
-from emulator.device.telemetry import TELEMETRY
-from emulator.errors import EmulatorError
-from emulator.guard import call_guarded, one_line
-from emulator.imaging.frames import FrameRequest
-from emulator.imaging.imager import Imager
-from emulator.profile import LINK_PARAMETERS, Profile
-from emulator.truth.source import TruthSource
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition
-from protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from protocol.values import MessageError, Value
+from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
+from starhil.emulator.device.counters import Acknowledge, Counters
+from starhil.emulator.device.cycle import FrameCycle, Measurement
+from starhil.emulator.device.file_download import FileDownload
+from starhil.emulator.device.images import ImageStore
+from starhil.emulator.device.modes import Mode, Modes, Transition
+from starhil.emulator.device.parameters import Parameters, ParameterValue
+from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.scheduler import Event, Scheduler
+from starhil.emulator.device.state_store import StateStore
+from starhil.emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
+from starhil.emulator.device.telemetry import TELEMETRY
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import call_guarded, one_line
+from starhil.emulator.pipeline.frames import FrameRequest
+from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.profile import LINK_PARAMETERS, Profile
+from starhil.emulator.truth.source import TruthSource
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.values import MessageError, Value
 
 log = logging.getLogger("starhil.device")
 

@@ -10,13 +10,13 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from emulator.device.images import ImageStore
-from protocol.image_transfer import HoleMap, block_checksum, burst_packet, packet_count
-from protocol.messages import BURST_ID, Reply, ReplyKind
-from protocol.values import Value
+from starhil.emulator.device.images import ImageStore
+from starhil.protocol.image_transfer import HoleMap, block_checksum, burst_packet, packet_count
+from starhil.protocol.messages import BURST_ID, Reply, ReplyKind
+from starhil.protocol.values import Value
 
 if TYPE_CHECKING:
-    from emulator.device.device import Device
+    from starhil.emulator.device.device import Device
 
 BMP_TYPE: Final = 4
 INDEX_ENTRY: Final = struct.Struct("<BBHII")

@@ -13,13 +13,13 @@ from typing import Final
 
 import numpy as np
 
-from emulator.clock import NANOSECONDS
-from emulator.device.cycle import FrameCycle
-from emulator.device.scheduler import Scheduler
-from emulator.imaging.binning import mean_over_squares
-from emulator.imaging.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
-from emulator.imaging.imager import Answer, Imager
-from protocol.image_transfer import FRAME_SIZE
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.cycle import FrameCycle
+from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.pipeline.binning import mean_over_squares
+from starhil.emulator.pipeline.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
+from starhil.emulator.pipeline.imager import Answer, Imager
+from starhil.protocol.image_transfer import FRAME_SIZE
 
 STORE_S: Final = 0.1
 """Time that the device takes to store an image, seconds."""

@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
-from emulator.errors import EmulatorError
-from protocol.icd import InterfaceDefinition
-from protocol.values import FieldError, MessageError, Parameter, Value
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import FieldError, MessageError, Parameter, Value
 
 ParameterValue = bool | int | float | str
 

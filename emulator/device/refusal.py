@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.messages import ErrorCode
+from starhil.protocol.messages import ErrorCode
 
 
 class Refused(Exception):  # noqa: N818 (an answer on the bus, not an error of the program)

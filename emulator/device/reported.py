@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from emulator.clock import NANOSECONDS
-from emulator.device.cycle import as_quaternion
-from emulator.device.modes import Mode
-from emulator.imaging.frames import ZERO, Quaternion, Triple
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.device.modes import Mode
+from starhil.emulator.pipeline.frames import ZERO, Quaternion, Triple
 from starid.attitude import Attitude
 
 if TYPE_CHECKING:
-    from emulator.device.device import Device
-    from emulator.device.parameters import Parameters
+    from starhil.emulator.device.device import Device
+    from starhil.emulator.device.parameters import Parameters
 
 
 @dataclass(frozen=True)

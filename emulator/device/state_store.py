@@ -15,8 +15,8 @@ import os
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from emulator.errors import EmulatorError
-from protocol.user_file import UnsuitableFileError, read_user_file
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.user_file import UnsuitableFileError, read_user_file
 
 FORMAT: Final = 1
 STATE_FILE: Final = "device.json"

@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from emulator.clock import NANOSECONDS
-from emulator.device.counters import Acknowledge
-from emulator.device.images import edge_of
-from emulator.device.modes import Mode
-from emulator.device.refusal import Refused
-from emulator.errors import EmulatorError
-from protocol.messages import FIRST_TELEMETRY_ID, ErrorCode, Reply
-from protocol.values import MessageError, Value
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.counters import Acknowledge
+from starhil.emulator.device.images import edge_of
+from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.refusal import Refused
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.messages import FIRST_TELEMETRY_ID, ErrorCode, Reply
+from starhil.protocol.values import MessageError, Value
 
 if TYPE_CHECKING:
-    from emulator.device.device import Device
+    from starhil.emulator.device.device import Device
 
 Values: TypeAlias = dict[str, Value]
 Handler: TypeAlias = "Callable[[Device, Values, Acknowledge], list[Reply] | None]"

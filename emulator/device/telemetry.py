@@ -6,17 +6,17 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from emulator.clock import NANOSECONDS, split_unix
-from emulator.device.file_download import hole_map_values
-from emulator.device.refusal import Refused
-from emulator.device.reported import Reported, reported
-from emulator.imaging.frames import MatchedStar
-from protocol.image_transfer import frame_checksum
-from protocol.messages import ErrorCode
-from protocol.values import Value
+from starhil.emulator.clock import NANOSECONDS, split_unix
+from starhil.emulator.device.file_download import hole_map_values
+from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.reported import Reported, reported
+from starhil.emulator.pipeline.frames import MatchedStar
+from starhil.protocol.image_transfer import frame_checksum
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import Value
 
 if TYPE_CHECKING:
-    from emulator.device.device import Device
+    from starhil.emulator.device.device import Device
 
 Values: TypeAlias = dict[str, Value]
 

@@ -7,13 +7,13 @@ import logging
 from abc import ABC, abstractmethod
 from typing import Final, Generic, Protocol, TypeVar
 
-from emulator.clock import NANOSECONDS
-from emulator.device.device import Device
-from emulator.device.scheduler import Event
-from emulator.links.wire_faults import Pieces, WireFaults
-from protocol.errors import ProtocolError
-from protocol.messages import LinkFault, Reply, Request
-from protocol.transports.base import Transport
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.scheduler import Event
+from starhil.emulator.links.wire_faults import Pieces, WireFaults
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import LinkFault, Reply, Request
+from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
 Arriving_contra = TypeVar("Arriving_contra", contravariant=True)

@@ -6,7 +6,7 @@ import logging
 import socket
 from typing import Final
 
-from emulator.claim import NameTakenError, claim_name
+from starhil.emulator.symlink_lock import NameTakenError, claim_name
 
 log = logging.getLogger("starhil.link")
 

@@ -7,10 +7,10 @@ import random
 from collections import deque
 from collections.abc import Sequence
 
-from emulator.device.device import Device
-from emulator.links.base import DeviceLink
-from emulator.links.bus_address import BusAddress
-from protocol.can_framing import (
+from starhil.emulator.device.device import Device
+from starhil.emulator.links.base import DeviceLink
+from starhil.emulator.links.bus_address import BusAddress
+from starhil.protocol.can_framing import (
     MAX_EXTENDED_ID,
     MAX_FRAME_DATA,
     CanDeviceReceiver,
@@ -18,8 +18,8 @@ from protocol.can_framing import (
     CanIdentifier,
     encode_reply_frames,
 )
-from protocol.messages import Reply
-from protocol.transports.base import Transport
+from starhil.protocol.messages import Reply
+from starhil.protocol.transports.base import Transport
 
 
 class CanPieces:

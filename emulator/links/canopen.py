@@ -1,4 +1,4 @@
-"""The CANopen link: binds the slave of `protocol.canopen` to a device, its clock and a CAN transport."""
+"""The CANopen link: binds the slave of `starhil.protocol.canopen` to a device, its clock and a CAN transport."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from emulator.clock import NANOSECONDS
-from emulator.device.cycle import Measurement
-from emulator.device.device import Device
-from emulator.device.modes import Mode, Transition
-from emulator.device.refusal import Refused
-from emulator.errors import EmulatorError
-from emulator.links.bus_address import BusAddress
-from emulator.links.wire_faults import WireFaults
-from protocol.can_framing import MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.application import Picture, abort_of, check_status
-from protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
-from protocol.canopen.device_dictionary import build_dictionary
-from protocol.canopen.dictionary import Deferred
-from protocol.canopen.emergency import ErrorCode, ErrorRegister
-from protocol.canopen.slave import CanopenSlave
-from protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
-from protocol.codec import Row
-from protocol.messages import Reply, Request, RequestKind
-from protocol.transports.base import Transport
-from protocol.values import MessageError, Value
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.modes import Mode, Transition
+from starhil.emulator.device.refusal import Refused
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.bus_address import BusAddress
+from starhil.emulator.links.wire_faults import WireFaults
+from starhil.protocol.can_framing import MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.application import Picture, abort_of, check_status
+from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.dictionary import Deferred
+from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
+from starhil.protocol.canopen.slave import CanopenSlave
+from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
+from starhil.protocol.codec import Row
+from starhil.protocol.messages import Reply, Request, RequestKind
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.values import MessageError, Value
 
 if TYPE_CHECKING:
-    from emulator.device.scheduler import Event
-    from protocol.errors import ProtocolError
+    from starhil.emulator.device.scheduler import Event
+    from starhil.protocol.errors import ProtocolError
 
 log = logging.getLogger("starhil.canopen")
 

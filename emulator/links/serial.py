@@ -6,13 +6,13 @@ import random
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from emulator.device.device import Device
-from emulator.links.base import DeviceLink
-from protocol.messages import Reply
-from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from starhil.emulator.device.device import Device
+from starhil.emulator.links.base import DeviceLink
+from starhil.protocol.messages import Reply
+from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
 
 if TYPE_CHECKING:
-    from protocol.transports.serial import SerialTransport
+    from starhil.protocol.transports.serial import SerialTransport
 
 JUNK_BYTES: Final = 8
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from emulator.clock import NANOSECONDS, Clock
-from emulator.device.scheduler import Scheduler
+from starhil.emulator.clock import NANOSECONDS, Clock
+from starhil.emulator.device.scheduler import Scheduler
 
 Item = TypeVar("Item")
 

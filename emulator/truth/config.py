@@ -9,9 +9,9 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from emulator.truth.file import read_truth_file
-from emulator.truth.live import LiveTruth
-from emulator.truth.source import (
+from starhil.emulator.truth.file import read_truth_file
+from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
     FixedTruth,
     HoldSegment,
@@ -169,7 +169,7 @@ class FileConfig(Strict):
 
 
 class LiveConfig(Strict):
-    """A feed of JSON lines, the message of `emulator.truth.live`."""
+    """A feed of JSON lines, the message of `starhil.emulator.truth.live`."""
 
     kind: Literal["live"]
     protocol: Literal["udp", "tcp"] = "udp"

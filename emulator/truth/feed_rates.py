@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from emulator.errors import EmulatorError
-from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, Vector
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, Vector
 from starid.attitude import Attitude, rate_between
 
 SHORTEST_S: Final = 1e-9

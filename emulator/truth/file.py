@@ -23,8 +23,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.errors import EmulatorError
-from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
 from starid.attitude import Attitude, interpolate, rate_between
 from starid.files import MEGABYTE, read_number, read_text
 

@@ -11,10 +11,10 @@ One message a line (TCP) or one or more lines a datagram (UDP)::
 ``rate``
     Body rate in the sensor frame, degrees a second, at most `MAX_RATE_DEG_S` an axis. May be left out: then it is taken from the
     last two messages, without ``t`` from messages at least `RECEIPT_BASELINE_S` apart. One that contradicts the attitudes makes
-    a bad message (`emulator.truth.feed_rates`).
+    a bad message (`starhil.emulator.truth.feed_rates`).
 
 The sender's clock is tied to run time by its first message, what came first is taken to hold at its receipt, and followed where
-it slips (`emulator.truth.sender_clock`); rates are those of run time. With ``timeline = "run"`` in the profile, ``t`` is run time
+it slips (`starhil.emulator.truth.sender_clock`); rates are those of run time. With ``timeline = "run"`` in the profile, ``t`` is run time
 as it stands. Between two messages the attitude is interpolated, after the last one it is carried on at the last rate, for at
 most ``stale_s``; when the feed has been silent for that long the attitude stands still and is flagged ``stale``. On
 ``timeline = "run"`` it is so too when the last ``t`` is older than that. A bad message is counted, logged (the 1st, 10th, 100th …),
@@ -34,12 +34,12 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from emulator.errors import EmulatorError
-from emulator.json_lines import RepeatedKeyError, parse_json, read_lines
-from emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
-from emulator.truth.sender_clock import SenderClock
-from emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
-from protocol.errors import reason
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
+from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
+from starhil.emulator.truth.sender_clock import SenderClock
+from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
+from starhil.protocol.errors import reason
 from starid.attitude import Attitude, interpolate, propagate
 
 log = logging.getLogger("starhil.truth")

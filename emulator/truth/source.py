@@ -15,7 +15,7 @@ from typing import Final, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude, propagate
 
 Vector: TypeAlias = NDArray[np.float64]

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal, rule
-from hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
-from hil_tests.conformance.unit_settings import save_parameters
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal, rule
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
+from starhil.hil_tests.conformance.unit_settings import save_parameters
 
 ACKNOWLEDGE: Final = "CubeComputer TLM 240: last telecommand, processed, error, index (AlbertaSat, CTS)"
 COUNTERS: Final = "CubeComputer TLM 144: counts of telecommands and telemetry (AlbertaSat, CTS)"

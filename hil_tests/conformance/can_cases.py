@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from hil_tests.conformance.can_probe import (
+from starhil.hil_tests.conformance.can_probe import (
     TELECOMMAND_SEGMENT,
     TELEMETRY_REQUEST,
     CanProbe,
     identifier_of,
     segments,
 )
-from hil_tests.conformance.case import Case, case, check, check_equal, rule
-from hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
-from hil_tests.errors import BenchError
-from hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
-from protocol.can_framing import CanFrame
+from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
+from starhil.protocol.can_framing import CanFrame
 
 LAYOUT: Final = "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
 TYPES: Final = "message types 0 to 12 (libCubeObc)"

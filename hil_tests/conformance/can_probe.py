@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.link_probe import (
+from starhil.hil_tests.conformance.link_probe import (
     BURST_ID,
     FIRST_TELEMETRY,
     Answer,
@@ -12,10 +12,10 @@ from hil_tests.conformance.link_probe import (
     LinkProbe,
     ProbeTimes,
 )
-from hil_tests.conformance.ports import Port
-from hil_tests.raw_exchange import format_frame
-from protocol.can_framing import CanFrame
-from protocol.icd import InterfaceDefinition
+from starhil.hil_tests.conformance.ports import Port
+from starhil.hil_tests.raw_exchange import format_frame
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.icd import InterfaceDefinition
 
 TELECOMMAND: Final = 1
 ACK: Final = 2

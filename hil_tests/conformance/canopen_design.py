@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hil_tests.conformance.canopen_pdo import EVENT, SYNCHRONOUS, entry, first, send_sync, set_up, writable
-from hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe, size_of
-from hil_tests.conformance.case import Case, case, check, check_equal
+from starhil.hil_tests.conformance.canopen_pdo import EVENT, SYNCHRONOUS, entry, first, send_sync, set_up, writable
+from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe, size_of
+from starhil.hil_tests.conformance.case import Case, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 

@@ -8,9 +8,9 @@ from typing import Final
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
-from hil_tests.conformance.canopen_sdo_block import upload_blocks
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
+from starhil.hil_tests.conformance.canopen_sdo_block import upload_blocks
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_GENERAL,
     ABORT_NO_DATA,
     ABORT_NO_SUBINDEX,
@@ -17,7 +17,7 @@ from hil_tests.conformance.canopen_probe import (
     CanopenProbe,
     multiplexer,
 )
-from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_INCOMPATIBLE,
     NOBODY,
     PRE_OPERATIONAL,
@@ -15,7 +15,7 @@ from hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 NMT_CLAUSE: Final = "CiA 301 7.3.2.2"

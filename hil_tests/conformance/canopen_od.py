@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_DEVICE_STATE,
     ABORT_GENERAL,
     ABORT_LENGTH,
@@ -24,7 +24,7 @@ from hil_tests.conformance.canopen_probe import (
     multiplexer,
     size_of,
 )
-from hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 NOT_NOW = {ABORT_NO_DATA, ABORT_GENERAL, ABORT_DEVICE_STATE, ABORT_NOT_STORED}

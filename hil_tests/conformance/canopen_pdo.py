@@ -7,7 +7,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_ACCESS,
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
@@ -19,7 +19,7 @@ from hil_tests.conformance.canopen_probe import (
     is_integer,
     size_of,
 )
-from hil_tests.conformance.case import CaseSkipped
+from starhil.hil_tests.conformance.case import CaseSkipped
 
 REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
 FIXED: Final = (ABORT_ACCESS, ABORT_DEVICE_STATE, ABORT_VALUE)

@@ -7,8 +7,8 @@ from typing import Final, Protocol
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from hil_tests.conformance.case import CaseFailed, CaseSkipped
-from protocol.can_framing import CanFrame
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
+from starhil.protocol.can_framing import CanFrame
 
 NMT: Final = 0x000
 SYNC: Final = 0x080

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil_tests.conformance.canopen_pdo import (
+from starhil.hil_tests.conformance.canopen_pdo import (
     FIXED,
     FORBIDDEN,
     REFUSED,
@@ -13,7 +13,7 @@ from hil_tests.conformance.canopen_pdo import (
     set_up,
     writable,
 )
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_NOT_MAPPABLE,
     PDO_OFF,
     PRE_OPERATIONAL,
@@ -22,7 +22,7 @@ from hil_tests.conformance.canopen_probe import (
     CanopenProbe,
     size_of,
 )
-from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 

@@ -6,7 +6,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_COMMAND,
     ABORT_LENGTH,
     ABORT_LENGTH_HIGH,
@@ -19,7 +19,7 @@ from hil_tests.conformance.canopen_probe import (
     multiplexer,
     size_of,
 )
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 CLAUSE: Final = "CiA 301 7.2.4.3"

@@ -7,7 +7,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_BLOCK_SIZE,
     ABORT_COMMAND,
     ABORT_CRC,
@@ -22,14 +22,14 @@ from hil_tests.conformance.canopen_probe import (
     CanopenProbe,
     multiplexer,
 )
-from hil_tests.conformance.canopen_sdo import (
+from starhil.hil_tests.conformance.canopen_sdo import (
     LONGEST_TIMEOUT_S,
     expect_no_transfer,
     long_text,
     mux,
     writable_number,
 )
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 CLAUSE: Final = "CiA 301 7.2.4.3"

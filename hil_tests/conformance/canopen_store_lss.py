@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_NOT_STORED,
     LSS_FROM_SLAVE,
     LSS_TO_SLAVE,
@@ -14,7 +14,7 @@ from hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 SIGNATURE_REFUSED: Final = (ABORT_NOT_STORED, 0x08000021, 0x08000022)

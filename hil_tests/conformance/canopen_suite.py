@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance import (
+from starhil.hil_tests.conformance import (
     canopen_design,
     canopen_eds,
     canopen_emcy,
@@ -17,9 +17,9 @@ from hil_tests.conformance import (
     canopen_sync_time,
     canopen_tpdo,
 )
-from hil_tests.conformance.canopen_probe import CanopenProbe
-from hil_tests.conformance.case import Case
-from hil_tests.conformance.runner import Outcome, run_case
+from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.runner import Outcome, run_case
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_eds.CASES,

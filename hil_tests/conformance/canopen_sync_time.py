@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
     ABORT_VALUE_HIGH,
@@ -13,7 +13,7 @@ from hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from hil_tests.conformance.case import Case, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)

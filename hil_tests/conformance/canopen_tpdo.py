@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ODVariable
 
-from hil_tests.conformance.canopen_pdo import (
+from starhil.hil_tests.conformance.canopen_pdo import (
     EVENT,
     FIXED,
     FORBIDDEN,
@@ -18,7 +18,7 @@ from hil_tests.conformance.canopen_pdo import (
     set_up,
     writable,
 )
-from hil_tests.conformance.canopen_probe import (
+from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_NO_OBJECT,
     ABORT_NO_SUBINDEX,
     ABORT_NOT_MAPPABLE,
@@ -33,7 +33,7 @@ from hil_tests.conformance.canopen_probe import (
     is_integer,
     size_of,
 )
-from hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
 
 _CASES: list[Case[CanopenProbe]] = []
 

@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from hil_tests.conformance.can_probe import CanProbe
-from hil_tests.conformance.case import Case
-from hil_tests.conformance.link_probe import ProbeTimes
-from hil_tests.conformance.ports import live_can, live_serial
-from hil_tests.conformance.runner import Outcome, not_run, run_cases, select_cases
-from hil_tests.conformance.serial_probe import SerialProbe
-from hil_tests.conformance.suites import can_suite, serial_suite
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.errors import BenchError, EmulatorProcessError
-from hil_tests.interruption import Interrupted
-from hil_tests.own_hub import OwnBus
-from hil_tests.results import FAILED
-from hil_tests.scratch import scratch_folder
-from protocol.icd import InterfaceDefinition, load_icd
+from starhil.hil_tests.conformance.can_probe import CanProbe
+from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.link_probe import ProbeTimes
+from starhil.hil_tests.conformance.ports import live_can, live_serial
+from starhil.hil_tests.conformance.runner import Outcome, not_run, run_cases, select_cases
+from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.errors import BenchError, EmulatorProcessError
+from starhil.hil_tests.interruption import Interrupted
+from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.results import FAILED
+from starhil.hil_tests.scratch import scratch_folder
+from starhil.protocol.icd import InterfaceDefinition, load_icd
 
 DEFAULT_BAUD: Final = 115200
 
@@ -60,7 +60,7 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     if request.can is not None:
         cases += can_suite(icd)
     if request.canopen_node is not None:
-        from hil_tests.conformance.canopen_suite import CANOPEN_CASES
+        from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 
         cases += CANOPEN_CASES
     if not cases:
@@ -190,7 +190,7 @@ def _run_canopen(
     import canopen
     from canopen.objectdictionary import import_od
 
-    from hil_tests.conformance.canopen_probe import CanopenProbe
+    from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
     node = int(request.canopen_node or 0)
     text = _data_sheet(request.eds)
@@ -208,7 +208,7 @@ def _run_canopen(
 
 def _data_sheet(path: Path | None) -> str:
     if path is None:
-        from protocol.canopen import build_dictionary, build_eds
+        from starhil.protocol.canopen import build_dictionary, build_eds
 
         return build_eds(build_dictionary())
     try:

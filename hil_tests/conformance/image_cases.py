@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
-from hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
-from hil_tests.images import bmp_file_size, decode_bmp
-from protocol.values import Value
+from starhil.hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
+from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
+from starhil.hil_tests.images import bmp_file_size, decode_bmp
+from starhil.protocol.values import Value
 
 FRAMES: Final = "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)"
 BURSTS: Final = "CubeComputer TC 112, 119 to 127 and TLM 242 (AlbertaSat, CTS)"

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from hil_tests.conformance.case import CaseFailed, CaseSkipped
-from hil_tests.conformance.unit_settings import UnitSettings
-from protocol.codec import Row
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition
-from protocol.values import Value
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.unit_settings import UnitSettings
+from starhil.protocol.codec import Row
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Value
 
 OK: Final = 0
 INVALID_ID: Final = 1

@@ -8,11 +8,11 @@ import time
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
-from hil_tests.errors import LinkLostError
-from hil_tests.loop_thread import LoopThread
-from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
-from protocol.transports import Transport, open_can, open_serial
+from starhil.hil_tests.errors import LinkLostError
+from starhil.hil_tests.loop_thread import LoopThread
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.transports import Transport, open_can, open_serial
 
 Item = TypeVar("Item")
 

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from hil_tests.conformance.runner import Outcome
-from hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
+from starhil.hil_tests.conformance.runner import Outcome
+from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
 
 STYLES: Final = {
     PASSED: ("✓", "green"),

@@ -7,18 +7,18 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from hil_tests.conformance.case import Case, case, check, check_equal, rule
-from hil_tests.conformance.link_probe import (
+from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
+from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
     INVALID_PARAMETER,
     LinkProbe,
     checked_values,
 )
-from hil_tests.conformance.unit_settings import LINK_PARAMETERS
-from protocol.codec import Field, Row
-from protocol.icd import InterfaceDefinition
-from protocol.values import Parameter
+from starhil.hil_tests.conformance.unit_settings import LINK_PARAMETERS
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Parameter
 
 CODES: Final = "published error codes 0 to 4 (AlbertaSat, CTS)"
 IDENTIFIERS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"

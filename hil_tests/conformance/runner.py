@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
-from hil_tests.errors import BenchError, LinkLostError
-from hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
-from protocol.errors import ProtocolError
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
+from starhil.hil_tests.errors import BenchError, LinkLostError
+from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
+from starhil.protocol.errors import ProtocolError
 
 
 @dataclass(frozen=True)

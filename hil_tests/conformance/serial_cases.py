@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal, rule
-from hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, INVALID_PARAMETER
-from hil_tests.conformance.serial_probe import SerialProbe, framed
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal, rule
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, INVALID_PARAMETER
+from starhil.hil_tests.conformance.serial_probe import SerialProbe, framed
 
 FRAMING: Final = "serial framing 1F 7F … 1F FF (libCubeObc, AlbertaSat adcs_io.c)"
 STUFFING: Final = "1F in the data is doubled (libCubeObc, CTS)"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from hil_tests.conformance.case import CaseFailed
-from hil_tests.conformance.link_probe import BURST_ID, FIRST_TELEMETRY, Answer, LinkProbe, ProbeTimes
-from hil_tests.conformance.ports import Port
-from protocol.icd import InterfaceDefinition
+from starhil.hil_tests.conformance.case import CaseFailed
+from starhil.hil_tests.conformance.link_probe import BURST_ID, FIRST_TELEMETRY, Answer, LinkProbe, ProbeTimes
+from starhil.hil_tests.conformance.ports import Port
+from starhil.protocol.icd import InterfaceDefinition
 
 SHOWN_BYTES: Final = 48
 BURST_BODY: Final = 23

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from hil_tests.conformance import behaviour_cases, can_cases, image_cases, serial_cases, traffic_cases
-from hil_tests.conformance.can_probe import CanProbe
-from hil_tests.conformance.case import Case
-from hil_tests.conformance.row_cases import row_cases
-from hil_tests.conformance.serial_probe import SerialProbe
-from protocol.icd import InterfaceDefinition
+from starhil.hil_tests.conformance import behaviour_cases, can_cases, image_cases, serial_cases, traffic_cases
+from starhil.hil_tests.conformance.can_probe import CanProbe
+from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.row_cases import row_cases
+from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.protocol.icd import InterfaceDefinition
 
 
 def serial_suite(icd: InterfaceDefinition) -> tuple[Case[SerialProbe], ...]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 from typing import Final
 
-from hil_tests.conformance.can_probe import CanProbe
-from hil_tests.conformance.case import Case, case, check, check_equal, rule
-from hil_tests.conformance.link_probe import INVALID_PARAMETER, Answer, LinkProbe, checked_values
-from hil_tests.conformance.serial_probe import SerialProbe
-from protocol.can_framing import CanFrame
+from starhil.hil_tests.conformance.can_probe import CanProbe
+from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
+from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, Answer, LinkProbe, checked_values
+from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.protocol.can_framing import CanFrame
 
 HOST_TIMEOUT_S: Final = 0.3
 """Time-out of the most impatient published flight software (AlbertaSat, first version)."""

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from hil_tests.conformance.case import CaseFailed, check_equal
+from starhil.hil_tests.conformance.case import CaseFailed, check_equal
 
 if TYPE_CHECKING:
-    from hil_tests.conformance.link_probe import LinkProbe
+    from starhil.hil_tests.conformance.link_probe import LinkProbe
 
 LINK_PARAMETERS: Final = frozenset(
     {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}

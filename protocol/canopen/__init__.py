@@ -5,15 +5,15 @@ own clocks and lack parts that a slave must have (block transfer with repetition
 restore, node guarding, event-driven PDOs that obey the NMT state), so the state machines here are our own.
 """
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.application import Application, Picture, StandInApplication, check_status
-from protocol.canopen.context import UNCONFIGURED, EventKind, NmtState, SlaveEvent
-from protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
-from protocol.canopen.dictionary import Deferred
-from protocol.canopen.eds import build_eds
-from protocol.canopen.emergency import ErrorCode, ErrorRegister
-from protocol.canopen.slave import CanopenSlave
-from protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.application import Application, Picture, StandInApplication, check_status
+from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, NmtState, SlaveEvent
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from starhil.protocol.canopen.dictionary import Deferred
+from starhil.protocol.canopen.eds import build_eds
+from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
+from starhil.protocol.canopen.slave import CanopenSlave
+from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 
 __all__ = [
     "UNCONFIGURED",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-from protocol.errors import ProtocolError
+from starhil.protocol.errors import ProtocolError
 
 
 class AbortCode(IntEnum):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.dictionary import Deferred
-from protocol.codec import Row
-from protocol.icd import InterfaceDefinition
-from protocol.messages import ErrorCode
-from protocol.values import LengthError, MessageError, Value
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.dictionary import Deferred
+from starhil.protocol.codec import Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import LengthError, MessageError, Value
 
 STATUS_ABORTS = {
     ErrorCode.INVALID_ID: AbortCode.NO_OBJECT,

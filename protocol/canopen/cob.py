@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 
 NMT: Final = 0x000
 SYNC: Final = 0x080

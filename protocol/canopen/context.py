@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from protocol.can_framing import CanFrame
-from protocol.canopen.dictionary import Dictionary
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen.dictionary import Dictionary
 
 UNCONFIGURED: int = 0xFF
 """Node-ID of a node that LSS has to give one."""

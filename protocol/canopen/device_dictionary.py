@@ -9,9 +9,9 @@ from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.application import Application, Picture, StandInApplication, abort_of
-from protocol.canopen.communication import (
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.application import Application, Picture, StandInApplication, abort_of
+from starhil.protocol.canopen.communication import (
     Identity,
     PdoDefault,
     add_communication,
@@ -19,11 +19,11 @@ from protocol.canopen.communication import (
     set_limits,
     variable,
 )
-from protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, load_layout
-from protocol.codec import Field, Row, Slot
-from protocol.icd import InterfaceDefinition, load_icd
-from protocol.values import IcdError, MessageError, Parameter, Value, to_f32
+from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
+from starhil.protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, load_layout
+from starhil.protocol.codec import Field, Row, Slot
+from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.values import IcdError, MessageError, Parameter, Value, to_f32
 
 DATA_TYPES: Final[dict[str, int]] = {
     "u8": datatypes.UNSIGNED8,

@@ -14,7 +14,7 @@ from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 
 Value = int | float | bool | str | bytes
 

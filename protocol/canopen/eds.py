@@ -11,8 +11,8 @@ from typing import Final
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from protocol.canopen.dictionary import Dictionary, encode
-from protocol.canopen.pdo_mapping import FIRST_DUMMY, LAST_DUMMY
+from starhil.protocol.canopen.dictionary import Dictionary, encode
+from starhil.protocol.canopen.pdo_mapping import FIRST_DUMMY, LAST_DUMMY
 
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 MANUFACTURER: Final = range(0x2000, 0x6000)

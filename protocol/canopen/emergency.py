@@ -7,9 +7,9 @@ from enum import IntEnum, IntFlag
 from functools import partial
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.cob import ID_MASK, INVALID, check_identifier, check_replacement
-from protocol.canopen.context import Context, EventKind
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.cob import ID_MASK, INVALID, check_identifier, check_replacement
+from starhil.protocol.canopen.context import Context, EventKind
 
 ERROR_REGISTER: Final = (0x1001, 0)
 HISTORY: Final = 0x1003

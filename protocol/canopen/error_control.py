@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.cob import ERROR_CONTROL
-from protocol.canopen.context import Context, EventKind, NmtState
-from protocol.canopen.dictionary import Entry
-from protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.cob import ERROR_CONTROL
+from starhil.protocol.canopen.context import Context, EventKind, NmtState
+from starhil.protocol.canopen.dictionary import Entry
+from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
 
 GUARD_TIME: Final = (0x100C, 0)
 LIFE_FACTOR: Final = (0x100D, 0)

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from protocol.icd import default_icd_path
-from protocol.user_file import read_user_text
-from protocol.values import IcdError
+from starhil.protocol.icd import default_icd_path
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.values import IcdError
 
 Index = Annotated[int, Field(ge=0x2000, le=0xFFFF)]
 PackedType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u48"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final, Protocol
 
-from protocol.canopen.cob import LSS_SLAVE
-from protocol.canopen.context import UNCONFIGURED, Context, EventKind
-from protocol.errors import ProtocolError
+from starhil.protocol.canopen.cob import LSS_SLAVE
+from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind
+from starhil.protocol.errors import ProtocolError
 
 LENGTH: Final = 8
 IDENTITY: Final = 0x1018

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from protocol.canopen.abort import SdoAbortError
-from protocol.canopen.context import Context, EventKind, NmtState
-from protocol.canopen.dictionary import check_value
-from protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
-from protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedObject, PdoRecords
+from starhil.protocol.canopen.abort import SdoAbortError
+from starhil.protocol.canopen.context import Context, EventKind, NmtState
+from starhil.protocol.canopen.dictionary import check_value
+from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedObject, PdoRecords
 
 
 class ReceivePdo:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.cob import BIT_30, ID_MASK, INVALID, check_identifier, check_replacement
-from protocol.canopen.dictionary import Dictionary, Entry, type_size
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, INVALID, check_identifier, check_replacement
+from starhil.protocol.canopen.dictionary import Dictionary, Entry, type_size
 
 LARGEST_MAPPING: Final = 8
 """Objects of a PDO, at most: the granularity is 8 bits."""

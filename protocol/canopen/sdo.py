@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.dictionary import Deferred, Dictionary, check_length
-from protocol.canopen.sdo_transfer import (
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.dictionary import Deferred, Dictionary, check_length
+from starhil.protocol.canopen.sdo_transfer import (
     MAXIMUM_BLOCK,
     BlockDownload,
     BlockUpload,
@@ -19,7 +19,7 @@ from protocol.canopen.sdo_transfer import (
     Transfer,
     valid_block_size,
 )
-from protocol.errors import ProtocolError
+from starhil.protocol.errors import ProtocolError
 
 LENGTH: Final = 8
 """Data bytes of every SDO frame; others are no SDO."""

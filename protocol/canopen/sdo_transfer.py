@@ -10,8 +10,8 @@ from binascii import crc_hqx
 from collections.abc import Callable
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.dictionary import Deferred
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.dictionary import Deferred
 
 SEGMENT: Final = 7
 """Data bytes of a segment."""

@@ -9,22 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from protocol.can_framing import CanFrame
-from protocol.canopen.abort import SdoAbortError
-from protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE, SDO_TRANSMIT
-from protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent
-from protocol.canopen.dictionary import Deferred, Dictionary
-from protocol.canopen.eds import build_eds
-from protocol.canopen.emergency import EmergencyProducer
-from protocol.canopen.error_control import ErrorControl
-from protocol.canopen.lss import BIT_RATES, LssSlave
-from protocol.canopen.pdo import PdoService
-from protocol.canopen.sdo import SdoServer
-from protocol.canopen.storage import APPLICATION, COMMUNICATION, MemoryStorage, ParameterStorage
-from protocol.canopen.store import ParameterStore
-from protocol.canopen.sync import SyncService
-from protocol.canopen.timestamp import TimeConsumer
-from protocol.errors import ProtocolError
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen.abort import SdoAbortError
+from starhil.protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE, SDO_TRANSMIT
+from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent
+from starhil.protocol.canopen.dictionary import Deferred, Dictionary
+from starhil.protocol.canopen.eds import build_eds
+from starhil.protocol.canopen.emergency import EmergencyProducer
+from starhil.protocol.canopen.error_control import ErrorControl
+from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
+from starhil.protocol.canopen.pdo import PdoService
+from starhil.protocol.canopen.sdo import SdoServer
+from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, MemoryStorage, ParameterStorage
+from starhil.protocol.canopen.store import ParameterStore
+from starhil.protocol.canopen.sync import SyncService
+from starhil.protocol.canopen.timestamp import TimeConsumer
+from starhil.protocol.errors import ProtocolError
 
 STATE_COMMANDS: Final = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
 """NMT command specifier → state that it asks for."""

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, Protocol
 
-from protocol.errors import ProtocolError
-from protocol.user_file import read_user_file
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.user_file import read_user_file
 
 COMMUNICATION: Final = "communication"
 APPLICATION: Final = "application"

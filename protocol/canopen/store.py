@@ -6,11 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.context import Context, EventKind
-from protocol.canopen.dictionary import COMMUNICATION as COMMUNICATION_INDICES
-from protocol.canopen.dictionary import Deferred, Entry, default_bytes
-from protocol.canopen.storage import APPLICATION, COMMUNICATION, LSS, ParameterStorage, StorageError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.context import Context, EventKind
+from starhil.protocol.canopen.dictionary import COMMUNICATION as COMMUNICATION_INDICES
+from starhil.protocol.canopen.dictionary import Deferred, Entry, default_bytes
+from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, LSS, ParameterStorage, StorageError
 
 STORE: Final = 0x1010
 RESTORE: Final = 0x1011

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
-from protocol.canopen.context import Context
-from protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
+from starhil.protocol.canopen.context import Context
+from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
 
 COB_ID: Final = (0x1005, 0)
 PERIOD: Final = (0x1006, 0)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from protocol.canopen.abort import AbortCode, SdoAbortError
-from protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
-from protocol.canopen.context import Context, EventKind
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
+from starhil.protocol.canopen.context import Context, EventKind
 
 COB_ID: Final = (0x1012, 0)
 CONSUMES: Final = 1 << 31

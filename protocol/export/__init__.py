@@ -7,8 +7,8 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Final, cast
 
-from protocol.errors import ProtocolError
-from protocol.icd import InterfaceDefinition
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
 
 FORMATS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -27,5 +27,5 @@ def export(icd: InterfaceDefinition, name: str) -> str:
     """Return the interface definition in the named format. Raises ProtocolError for a name that is none."""
     if name not in FORMATS:
         raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(FORMATS)}")
-    module = import_module(f"protocol.export.{name}")
+    module = import_module(f"starhil.protocol.export.{name}")
     return cast("Callable[[InterfaceDefinition], str]", module.render)(icd)

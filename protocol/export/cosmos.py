@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from protocol.codec import Field, Row
-from protocol.export.describe import meaning, number
-from protocol.icd import InterfaceDefinition
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.export.describe import meaning, number
+from starhil.protocol.icd import InterfaceDefinition
 
 TARGET: Final = "STARHIL"
 IDENTIFIER: Final = "PACKET_ID"

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-from protocol.can_framing import MAX_FRAME_DATA, CanIdentifier, MessageType
-from protocol.codec import Field, Row
-from protocol.export.describe import meaning, number
-from protocol.icd import InterfaceDefinition
+from starhil.protocol.can_framing import MAX_FRAME_DATA, CanIdentifier, MessageType
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.export.describe import meaning, number
+from starhil.protocol.icd import InterfaceDefinition
 
 EXTENDED: Final = 0x80000000
 """Flag of 29-bit identifiers in DBC files."""

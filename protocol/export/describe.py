@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from protocol.codec import Field, Row
-from protocol.icd import InterfaceDefinition
-from protocol.values import EnumDefinition, Parameter
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import EnumDefinition, Parameter
 
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
 PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")

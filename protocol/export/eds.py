@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from protocol.canopen.device_dictionary import build_dictionary
-from protocol.canopen.eds import build_eds
-from protocol.icd import InterfaceDefinition
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.eds import build_eds
+from starhil.protocol.icd import InterfaceDefinition
 
 
 def render(icd: InterfaceDefinition) -> str:

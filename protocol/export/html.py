@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import Final
 
-from protocol.export import describe, wire
-from protocol.icd import InterfaceDefinition
-from protocol.values import Section
+from starhil.protocol.export import describe, wire
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Section
 
 _STYLE: Final = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 72em; padding: 0 1em; color: #1a1a1a; }

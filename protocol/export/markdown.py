@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from protocol.codec import Row
-from protocol.export import describe, wire
-from protocol.icd import InterfaceDefinition
-from protocol.values import Section
+from starhil.protocol.codec import Row
+from starhil.protocol.export import describe, wire
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Section
 
 
 def render(icd: InterfaceDefinition) -> str:

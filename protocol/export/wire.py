@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from protocol.can_framing import SEGMENT_DATA, MessageType
-from protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, load_layout
-from protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from protocol.serial_framing import Dialect, encode_reply, encode_request
-from protocol.values import Section
+from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
+from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, load_layout
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
+from starhil.protocol.values import Section
 
 _TELEMETRY: Final = 0x80
 _TELECOMMAND: Final = 0x60

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from protocol.codec import Field, Row
-from protocol.export.describe import meaning, number
-from protocol.icd import InterfaceDefinition
-from protocol.values import IcdError
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.export.describe import meaning, number
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import IcdError
 
 NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
 PACKET: Final = "Packet"

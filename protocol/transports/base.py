@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final, Generic, TypeVar
 
-from protocol.errors import ProtocolError, reason
+from starhil.protocol.errors import ProtocolError, reason
 
 _LOGGER: Final = logging.getLogger("starhil.transport")
 

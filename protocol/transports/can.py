@@ -14,12 +14,12 @@ from typing import Any, Final
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
-from protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT, CanHub
-from protocol.transports.base import Transport, TransportError
-from protocol.transports.hub_client import HubTransport
-from protocol.transports.python_can import OpenBus, PythonCanTransport
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT, CanHub
+from starhil.protocol.transports.base import Transport, TransportError
+from starhil.protocol.transports.hub_client import HubTransport
+from starhil.protocol.transports.python_can import OpenBus, PythonCanTransport
 
 _LOGGER: Final = logging.getLogger("starhil.transport")
 

@@ -7,12 +7,12 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Final, cast
 
-from protocol.can_framing import CanFrame
-from protocol.errors import reason
-from protocol.flow import WINDOW, TurnProtocol, limit_buffers
-from protocol.keepalive import notice_a_lost_peer
-from protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
-from protocol.transports.base import ReturningTransport, TransportError
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import reason
+from starhil.protocol.flow import WINDOW, TurnProtocol, limit_buffers
+from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
+from starhil.protocol.transports.base import ReturningTransport, TransportError
 
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
 """Bytes that wait for a hub that does not read at most."""

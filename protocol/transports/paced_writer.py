@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from protocol.serial_framing import PacingSchedule
-from protocol.transports.base import Statistics
+from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.transports.base import Statistics
 
 BACKLOG_LIMIT: Final = 64 * 1024
 """Bytes that wait at most, for the line or for a peer that does not read."""

@@ -13,8 +13,8 @@ from typing import Final
 
 import can
 
-from protocol.can_framing import CanFrame
-from protocol.transports.base import ReturningTransport, TransportError
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.transports.base import ReturningTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000
 """Frames that wait for the bus at most."""

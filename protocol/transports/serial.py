@@ -18,13 +18,13 @@ from urllib.parse import urlsplit
 
 import serial
 
-from protocol.errors import reason
-from protocol.flow import TURN, TurnProtocol
-from protocol.keepalive import notice_a_lost_peer
-from protocol.serial_framing import PacingSchedule
-from protocol.transports.base import ReturningTransport, Transport, TransportError
-from protocol.transports.paced_writer import PacedWriter
-from protocol.transports.pty_peers import PtyPeers
+from starhil.protocol.errors import reason
+from starhil.protocol.flow import TURN, TurnProtocol
+from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.transports.base import ReturningTransport, Transport, TransportError
+from starhil.protocol.transports.paced_writer import PacedWriter
+from starhil.protocol.transports.pty_peers import PtyPeers
 
 STREAM_LIMIT: Final = 65536
 """Bytes that wait in a TCP connection for a peer that does not read, above which no more are written."""

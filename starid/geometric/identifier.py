@@ -22,7 +22,7 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.answer import Answer
-from starid.geometric.given import checked_detections
+from starid.geometric.validation import checked_detections
 from starid.geometric.index_choice import (
     default_limiting_magnitude,
     index_settings,

@@ -23,7 +23,7 @@ from starid.geometric.answer import (
     new_candidate,
 )
 from starid.geometric.jit_kernels import entry, inner
-from starid.geometric.look_up import look_up
+from starid.geometric.lookup import look_up
 from starid.geometric.observation import MAGNITUDE, OFFSET_U, OFFSET_V, Raw, Table, X, Y, Z, observe, scaled
 from starid.geometric.pattern_index import (
     DEEP_LONGEST,

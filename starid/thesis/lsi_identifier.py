@@ -23,7 +23,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.given import checked_detections
+from starid.geometric.validation import checked_detections
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
 from starid.solution import Reason, Solution

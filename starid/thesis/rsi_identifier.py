@@ -19,7 +19,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.geometric.given import checked_detections
+from starid.geometric.validation import checked_detections
 from starid.solution import Reason, Solution
 from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import FilterError, ObservedFrame

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from emulator.device.device import Device
-from protocol.messages import FaultKind, Reply, Request
+from starhil.emulator.device.device import Device
+from starhil.protocol.messages import FaultKind, Reply, Request
 from tests.conformance.simulated import SimulatedUnit
 
 Damage = Callable[[SimulatedUnit], None]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from protocol.can_framing import CanDeviceReceiver, CanFrame, CanIdentifier
-from protocol.messages import FaultKind, LinkFault, Request, RequestKind
+from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanIdentifier
+from starhil.protocol.messages import FaultKind, LinkFault, Request, RequestKind
 from tests.conformance.mutant_seams import (
     enter,
     events,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from protocol.messages import ErrorCode, Reply, ReplyKind
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from tests.conformance.mutant_seams import (
     Damage,
     enter,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from emulator.device.device import Device
-from protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.emulator.device.device import Device
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from tests.conformance.mutant_seams import (
     Damage,
     enter,

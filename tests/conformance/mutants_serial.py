@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
-from protocol.serial_framing import DeviceReceiver, Dialect
+from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import DeviceReceiver, Dialect
 from tests.conformance.mutant_seams import (
     enter,
     events,

@@ -8,23 +8,23 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Self
 
-from emulator.clock import NANOSECONDS
-from emulator.device.device import Device
-from emulator.device.state_store import MemoryStore
-from emulator.imaging.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
-from emulator.imaging.imager import Answer, Asked, DirectImager
-from emulator.links.can import CanLink
-from emulator.links.serial import SerialLink
-from emulator.profile import Profile
-from emulator.pump import ClockPump
-from emulator.truth.source import FixedTruth
-from hil_tests.conformance.can_probe import CanProbe
-from hil_tests.conformance.link_probe import ProbeTimes
-from hil_tests.conformance.serial_probe import SerialProbe
-from protocol.icd import load_icd
-from protocol.serial_framing import PacingSchedule
-from protocol.transports.base import Transport
-from protocol.transports.paced_writer import PacedWriter
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.state_store import MemoryStore
+from starhil.emulator.pipeline.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
+from starhil.emulator.pipeline.imager import Answer, Asked, DirectImager
+from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.profile import Profile
+from starhil.emulator.pump import ClockPump
+from starhil.emulator.truth.source import FixedTruth
+from starhil.hil_tests.conformance.can_probe import CanProbe
+from starhil.hil_tests.conformance.link_probe import ProbeTimes
+from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.protocol.icd import load_icd
+from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced_writer import PacedWriter
 from starid.attitude import Attitude
 
 BAUD = 115200

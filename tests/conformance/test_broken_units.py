@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.conformance.canopen_suite import CANOPEN_CASES
-from hil_tests.conformance.case import Case
-from hil_tests.conformance.runner import run_case, run_cases
-from hil_tests.errors import LinkLostError
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
+from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.runner import run_case, run_cases
+from starhil.hil_tests.errors import LinkLostError
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
 from tests.protocol.canopen.conftest import simulated_probe

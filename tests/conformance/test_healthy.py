@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.conformance.runner import run_case
-from hil_tests.conformance.suites import can_suite, serial_suite
-from protocol.icd import load_icd
+from starhil.hil_tests.conformance.runner import run_case
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
+from starhil.protocol.icd import load_icd
 from tests.conformance.simulated import SimulatedUnit
 
 ICD = load_icd()

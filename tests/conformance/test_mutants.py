@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.conformance.runner import run_case
+from starhil.hil_tests.conformance.runner import run_case
 from tests.conformance import mutants_can, mutants_parts, mutants_requests, mutants_serial
 from tests.conformance.mutant_seams import MUTANTS, Mutant
 from tests.conformance.simulated import SimulatedUnit

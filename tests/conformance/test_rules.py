@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from hil_tests.conformance.canopen_suite import CANOPEN_CASES
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from tests.conformance.test_healthy import SUITES
 
 RULES = Path(__file__).parents[2] / "docs" / "rules.md"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.conformance.canopen_suite import CANOPEN_CASES
-from hil_tests.conformance.case import Case
-from hil_tests.conformance.runner import run_cases
-from hil_tests.interruption import Interrupted
-from protocol.can_framing import CanFrame
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
+from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.runner import run_cases
+from starhil.hil_tests.interruption import Interrupted
+from starhil.protocol.can_framing import CanFrame
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
 from tests.protocol.canopen.conftest import simulated_probe

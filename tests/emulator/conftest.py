@@ -9,18 +9,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from emulator.clock import SteppedClock
-from emulator.device.device import Device
-from emulator.device.state_store import MemoryStore, StateStore
-from emulator.emulation import Emulation, RunOptions
-from emulator.imaging import worker_process
-from emulator.imaging.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
-from emulator.imaging.imager import Answer, Asked, DirectImager
-from emulator.imaging.worker_process import WorkerProcess
-from emulator.profile import Profile
-from emulator.truth.source import FixedTruth, TruthSource
-from protocol.icd import load_icd
-from protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.emulator.clock import SteppedClock
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.state_store import MemoryStore, StateStore
+from starhil.emulator.emulation import Emulation, RunOptions
+from starhil.emulator.imaging import worker_process
+from starhil.emulator.pipeline.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
+from starhil.emulator.pipeline.imager import Answer, Asked, DirectImager
+from starhil.emulator.pipeline.worker_process import WorkerProcess
+from starhil.emulator.profile import Profile
+from starhil.emulator.truth.source import FixedTruth, TruthSource
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starid.attitude import Attitude
 from tests.emulator.runs import FakeImager
 

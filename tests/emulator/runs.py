@@ -3,8 +3,8 @@
 import asyncio
 import json
 
-from emulator.imaging.frames import Warm
-from emulator.imaging.imager import DirectImager
+from starhil.emulator.pipeline.frames import Warm
+from starhil.emulator.pipeline.imager import DirectImager
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
 

@@ -1,8 +1,8 @@
 import pytest
 
-from emulator.clock import DeviceTime, RealClock, ScaledClock, SteppedClock, make_clock, split_unix
-from emulator.device.scheduler import Scheduler
-from emulator.errors import EmulatorError
+from starhil.emulator.clock import DeviceTime, RealClock, ScaledClock, SteppedClock, make_clock, split_unix
+from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.errors import EmulatorError
 
 
 def test_stepped_clock_stands_still_until_told():

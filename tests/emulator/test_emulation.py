@@ -6,17 +6,17 @@ import resource
 
 import pytest
 
-from emulator.clock import SteppedClock
-from emulator.device.modes import Mode
-from emulator.emulation import Emulation, RunOptions
-from emulator.errors import EmulatorError
-from emulator.imaging.frames import Warm
-from emulator.imaging.imager import ProcessImager
-from emulator.profile import Profile, RunConfig, configs_folder
-from emulator.scenario import load_scenario
-from emulator.truth.file import read_truth_file
-from emulator.truth.log import COLUMNS
-from protocol.errors import ProtocolError
+from starhil.emulator.clock import SteppedClock
+from starhil.emulator.device.modes import Mode
+from starhil.emulator.emulation import Emulation, RunOptions
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.frames import Warm
+from starhil.emulator.pipeline.imager import ProcessImager
+from starhil.emulator.profile import Profile, RunConfig, configs_folder
+from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.truth.file import read_truth_file
+from starhil.emulator.truth_log import COLUMNS
+from starhil.protocol.errors import ProtocolError
 from tests.emulator.runs import CAMERA, Control, FakeImager
 
 

@@ -1,9 +1,9 @@
 import pytest
 
-from emulator.errors import EmulatorError
-from emulator.profile import Profile, configs_folder, load_profile
-from emulator.scenario import Scenario
-from emulator.truth.config import SlewConfig
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import Profile, configs_folder, load_profile
+from starhil.emulator.control.scenario import Scenario
+from starhil.emulator.truth.config import SlewConfig
 
 
 def write(tmp_path, text, name="mine.toml"):

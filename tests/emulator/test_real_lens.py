@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from emulator.device.cycle import as_quaternion
-from emulator.device.device import profile_defaults
-from emulator.device.parameters import Parameters
-from emulator.emulation import camera_constants, pipeline_setup
-from emulator.imaging.frames import FrameRequest, SolverSettings, Warm
-from emulator.imaging.picture import Picture
-from emulator.profile import load_profile
-from protocol.icd import load_icd
+from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.device.device import profile_defaults
+from starhil.emulator.device.parameters import Parameters
+from starhil.emulator.emulation import camera_constants, pipeline_setup
+from starhil.emulator.pipeline.frames import FrameRequest, SolverSettings, Warm
+from starhil.emulator.pipeline.pipeline import Picture
+from starhil.emulator.profile import load_profile
+from starhil.protocol.icd import load_icd
 from starid.attitude import Attitude, random_attitude
 
 DATA_SHEET_ARCSEC = 55.44

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from emulator.emulation import Emulation
-from emulator.profile import Profile
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.profile import Profile
 from tests.emulator.runs import CAMERA
 from tests.emulator.workers import ANSWERING, WORKER
 
@@ -19,7 +19,7 @@ ATTEMPTS = 3
 @pytest.fixture(autouse=True)
 def no_pauses(monkeypatch):
     """Start a pipeline again at once."""
-    monkeypatch.setattr("emulator.revival.PAUSES_S", (0.0,) * ATTEMPTS)
+    monkeypatch.setattr("starhil.emulator.revival.PAUSES_S", (0.0,) * ATTEMPTS)
 
 
 @pytest.fixture

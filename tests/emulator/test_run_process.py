@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.icd import load_icd
-from protocol.messages import Request
-from protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import Request
+from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
 from starid.attitude import Attitude
 
 pytestmark = pytest.mark.process
@@ -39,7 +39,7 @@ class Emulator:
 
     def __init__(self, *arguments: str) -> None:
         default = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)"  # nohup has it ignored
-        command = [sys.executable, "-c", f"{default}; from emulator.cli.app import main; main()", "run"]
+        command = [sys.executable, "-c", f"{default}; from starhil.emulator.cli.app import main; main()", "run"]
         self.process = subprocess.Popen(
             [*command, "--can", "off", "--control", "auto", *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -286,7 +286,7 @@ def test_bad_input_ends_in_one_line_and_status_2(arguments, said):
     command = [
         sys.executable,
         "-c",
-        "from emulator.cli.app import main; main()",
+        "from starhil.emulator.cli.app import main; main()",
         "run",
         "--can",
         "off",

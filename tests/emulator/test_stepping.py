@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from protocol.messages import Request
-from protocol.serial_framing import encode_request
+from starhil.protocol.messages import Request
+from starhil.protocol.serial_framing import encode_request
 
 STEP_S = 30.0
 PEER_BYTES_S = 300_000.0
@@ -90,7 +90,7 @@ def test_a_request_is_answered_in_the_middle_of_a_long_step(run):
 
 
 def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_reads(run, monkeypatch, caplog):
-    monkeypatch.setattr("emulator.pump.PEER_PATIENCE_S", 0.05)
+    monkeypatch.setattr("starhil.emulator.pump.PEER_PATIENCE_S", 0.05)
 
     async def scenario(emulation, _line):
         statistics = emulation.serial.transport.statistics

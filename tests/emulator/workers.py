@@ -4,7 +4,7 @@ from tests.emulator.runs import CAMERA
 
 WORKER = """
 import pickle, socket, sys
-from emulator.imaging.frames import LENGTH, Failure, FrameResult, Warm
+from starhil.emulator.pipeline.frames import LENGTH, Failure, FrameResult, Warm
 link = socket.socket(fileno=int(sys.argv[1]))
 stream = link.makefile("rwb")
 def receive():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.own_hub import OwnHub
+from starhil.hil_tests.own_hub import OwnHub
 
 
 @pytest.fixture

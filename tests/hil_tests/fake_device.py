@@ -6,13 +6,13 @@ import asyncio
 import threading
 from dataclasses import dataclass, field
 
-from protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
-from protocol.errors import ProtocolError
-from protocol.icd import load_icd
-from protocol.image_transfer import block_checksum
-from protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
-from protocol.transports import open_can, open_serial
+from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_icd
+from starhil.protocol.image_transfer import block_checksum
+from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from starhil.protocol.transports import open_can, open_serial
 
 ICD = load_icd()
 EDGE = 64

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hil_tests.attitude import (
+from starhil.hil_tests.attitude import (
     Quaternion,
     attitude_error,
     boresight,
@@ -19,7 +19,7 @@ from hil_tests.attitude import (
     unit,
     wrapped_difference,
 )
-from hil_tests.errors import BenchError
+from starhil.hil_tests.errors import BenchError
 
 ARCSEC = math.radians(1.0 / 3600.0)
 TOLERANCE_ARCSEC = 1e-3

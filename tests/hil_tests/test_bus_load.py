@@ -8,17 +8,17 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from hil_tests.bus_load import DEVICE, HOST, load_can
-from hil_tests.errors import BenchError
-from hil_tests.jitter import unsolicited_jitter
-from hil_tests.load_figures import CanLoad, SerialLoad, Spread
-from hil_tests.serial_load import load_serial
-from protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
-from protocol.hub import CanHub
-from protocol.icd import load_icd
-from protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
-from protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
-from protocol.transports import CanTransport, SerialTransport, open_can, open_serial
+from starhil.hil_tests.bus_load import DEVICE, HOST, load_can
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.jitter import unsolicited_jitter
+from starhil.hil_tests.load_figures import CanLoad, SerialLoad, Spread
+from starhil.hil_tests.serial_load import load_serial
+from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
+from starhil.protocol.hub import CanHub
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
 
 ICD = load_icd()
 RATE = 300.0

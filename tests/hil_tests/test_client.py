@@ -7,13 +7,13 @@ import time
 
 import pytest
 
-from hil_tests.client import ObcClient
-from hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
-from hil_tests.raw_exchange import send_and_listen
-from protocol.errors import ProtocolError
-from protocol.messages import ErrorCode
-from protocol.serial_framing import Dialect
-from protocol.values import FieldError
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
+from starhil.hil_tests.raw_exchange import send_and_listen
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.values import FieldError
 from tests.hil_tests.fake_device import EDGE, FakeDevice
 
 PATIENCE_S = 5.0
@@ -233,7 +233,7 @@ def test_a_vanished_port_is_told_from_a_silent_device():
 
 
 def test_unsolicited_telemetry_that_nobody_takes_is_bounded_and_stamped_on_receipt(hub, monkeypatch):
-    monkeypatch.setattr("hil_tests.async_client.UNSOLICITED_KEPT", 5)
+    monkeypatch.setattr("starhil.hil_tests.async_client.UNSOLICITED_KEPT", 5)
     with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
         began = time.monotonic()
         for number in range(8):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.attitude import from_radec_roll
-from hil_tests.errors import BenchError
-from hil_tests.expect import AttitudeCheck, Expectation, Variable, measured_attitude, read_expectation, show
-from hil_tests.script_reader import TableReader
+from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.expect import AttitudeCheck, Expectation, Variable, measured_attitude, read_expectation, show
+from starhil.hil_tests.script_reader import TableReader
 
 
 def expectation(value, known=frozenset()):

@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from hil_tests.attitude import attitude_error, from_radec_roll
-from hil_tests.errors import BenchError
-from hil_tests.images import decode_bmp
-from hil_tests.png import encode_png, write_png
-from hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
-from hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
-from hil_tests.truth_file import TruthFile
-from hil_tests.wire_log import CandumpLog, SerialLog
-from protocol.can_framing import CanFrame
-from protocol.candump import read_candump
+from starhil.hil_tests.attitude import attitude_error, from_radec_roll
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.images import decode_bmp
+from starhil.hil_tests.png import encode_png, write_png
+from starhil.hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
+from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
+from starhil.hil_tests.truth_file import TruthFile
+from starhil.hil_tests.wire_log import CandumpLog, SerialLog
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.candump import read_candump
 
 
 def picture(height: int, width: int) -> np.ndarray:

@@ -11,13 +11,13 @@ from xml.etree import ElementTree as ET
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.app import build_app
-from hil_tests import session_run
-from hil_tests.conformance import conformance_run
-from hil_tests.emulator_process import EmulatorProcess
-from hil_tests.errors import BenchError
-from hil_tests.own_hub import OwnHub
-from hil_tests.results import write_report
+from starhil.emulator.cli.app import build_app
+from starhil.hil_tests import session_run
+from starhil.hil_tests.conformance import conformance_run
+from starhil.hil_tests.emulator_process import EmulatorProcess
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.own_hub import OwnHub
+from starhil.hil_tests.results import write_report
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.bench import Bench, LinkOptions
-from hil_tests.conformance import conformance_run
-from hil_tests.conformance.conformance_run import ConformanceRequest, run_conformance
-from hil_tests.conformance.report import write_html_report, write_junit_report
-from hil_tests.emulator_process import EmulatorProcess
-from hil_tests.errors import BenchError, EmulatorProcessError
-from hil_tests.results import prepare_report, write_junit, write_report
-from protocol.icd import load_icd
+from starhil.hil_tests.bench import Bench, LinkOptions
+from starhil.hil_tests.conformance import conformance_run
+from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, run_conformance
+from starhil.hil_tests.conformance.report import write_html_report, write_junit_report
+from starhil.hil_tests.emulator_process import EmulatorProcess
+from starhil.hil_tests.errors import BenchError, EmulatorProcessError
+from starhil.hil_tests.results import prepare_report, write_junit, write_report
+from starhil.protocol.icd import load_icd
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.attitude import attitude_error, from_radec_roll
-from hil_tests.errors import ScriptError
-from hil_tests.expect import Expectation, Variable
-from hil_tests.script import load_script
-from hil_tests.script_model import Command, Read, Sample, Send
-from hil_tests.session_run import SCRIPT_FOLDER, find_script
-from protocol.icd import load_icd
+from starhil.hil_tests.attitude import attitude_error, from_radec_roll
+from starhil.hil_tests.errors import ScriptError
+from starhil.hil_tests.expect import Expectation, Variable
+from starhil.hil_tests.script import load_script
+from starhil.hil_tests.script_model import Command, Read, Sample, Send
+from starhil.hil_tests.session_run import SCRIPT_FOLDER, find_script
+from starhil.protocol.icd import load_icd
 
 ICD = load_icd()
 

@@ -10,17 +10,17 @@ from xml.etree import ElementTree as ET
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.app import build_app
-from hil_tests.attitude import from_radec_roll
-from hil_tests.bench import Bench, LinkOptions
-from hil_tests.errors import BenchError
-from hil_tests.results import junit_cases
-from hil_tests.script import load_script
-from hil_tests.session import SessionRunner
-from hil_tests.session_run import _printer
-from protocol.candump import read_candump
-from protocol.icd import load_icd
-from protocol.messages import ErrorCode
+from starhil.emulator.cli.app import build_app
+from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.bench import Bench, LinkOptions
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.results import junit_cases
+from starhil.hil_tests.script import load_script
+from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.session_run import _printer
+from starhil.protocol.candump import read_candump
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import ErrorCode
 from tests.hil_tests.fake_device import FakeDevice
 
 ICD = load_icd()

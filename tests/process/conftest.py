@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.own_hub import OwnBus
-from protocol.transports.can import kernel_can_is_up
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.own_hub import OwnBus
+from starhil.protocol.transports.can import kernel_can_is_up
 
 FAST_BAUD = 921600
 

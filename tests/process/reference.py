@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from protocol.icd import load_icd
-from protocol.values import MessageError
+from starhil.protocol.icd import load_icd
+from starhil.protocol.values import MessageError
 
 ICD = load_icd()
 MAX_MESSAGE = 512

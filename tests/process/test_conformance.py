@@ -9,8 +9,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from tests.process.test_sessions import starhil
 
 pytestmark = pytest.mark.process

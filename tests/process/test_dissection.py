@@ -7,9 +7,9 @@ import queue
 import canopen
 import pytest
 
-from hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from protocol.candump import read_candump
-from protocol.canopen import build_dictionary, build_eds
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.protocol.candump import read_candump
+from starhil.protocol.canopen import build_dictionary, build_eds
 from tests.process.test_sessions import starhil
 from tests.protocol.dissection import dissect
 

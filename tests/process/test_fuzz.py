@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from hil_tests.client import ObcClient
-from protocol.can_framing import CanFrame
+from starhil.hil_tests.client import ObcClient
+from starhil.protocol.can_framing import CanFrame
 from tests.process.reference import (
     ICD,
     CanOracle,

@@ -14,11 +14,11 @@ from concurrent.futures import ThreadPoolExecutor
 import canopen
 import pytest
 
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.errors import DeviceError
-from hil_tests.own_hub import OwnHub
-from protocol.can_framing import CanFrame
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.errors import DeviceError
+from starhil.hil_tests.own_hub import OwnHub
+from starhil.protocol.can_framing import CanFrame
 from tests.process.conftest import FAST_BAUD
 from tests.process.reference import frame_request
 

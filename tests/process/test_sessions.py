@@ -9,8 +9,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from hil_tests.emulator_process import STARHIL
-from protocol.candump import read_candump
+from starhil.hil_tests.emulator_process import STARHIL
+from starhil.protocol.candump import read_candump
 from tests.protocol.dissection import dissect
 
 pytestmark = pytest.mark.process

@@ -14,10 +14,10 @@ import tty
 import can
 import pytest
 
-from hil_tests.client import ObcClient
-from hil_tests.emulator_process import EmulatorProcess, emulator_command
-from hil_tests.raw_exchange import format_frame
-from protocol.candump import parse_candump, read_candump
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.raw_exchange import format_frame
+from starhil.protocol.candump import parse_candump, read_candump
 from tests.process.conftest import needs_vcan0
 from tests.process.test_sessions import starhil
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.can_framing import (
+from starhil.protocol.can_framing import (
     MAX_MESSAGE,
     MAX_OPEN_MESSAGES,
     CanDeviceReceiver,
@@ -20,9 +20,9 @@ from protocol.can_framing import (
     encode_request_frames,
     segment,
 )
-from protocol.candump import format_candump, parse_candump
-from protocol.errors import ProtocolError
-from protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.candump import format_candump, parse_candump
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
 
 OBC, DEVICE = 1, 4
 GOOD = Request(RequestKind.TELECOMMAND, 54, bytes(range(12)), OBC)

@@ -11,10 +11,10 @@ from pathlib import Path
 import can
 import pytest
 
-from protocol.candump import read_candump
-from protocol.icd import load_icd
+from starhil.protocol.candump import read_candump
+from starhil.protocol.icd import load_icd
 
-STARHIL = [sys.executable, "-c", "from emulator.cli.app import main; main()"]
+STARHIL = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()"]
 
 
 def starhil(*arguments: str) -> subprocess.CompletedProcess[str]:

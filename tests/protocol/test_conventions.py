@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from protocol.export import export
-from protocol.icd import IcdError, load_icd
-from protocol.values import Section
+from starhil.protocol.export import export
+from starhil.protocol.icd import IcdError, load_icd
+from starhil.protocol.values import Section
 from starid.attitude import Attitude
 
 ICD = load_icd()

@@ -19,13 +19,13 @@ import cantools
 import pytest
 from space_packet_parser.xtce import definitions, validation
 
-from protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
-from protocol.codec import Field, Row
-from protocol.errors import ProtocolError
-from protocol.export import FORMATS, export
-from protocol.icd import load_icd
-from protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from protocol.values import Value, to_f32
+from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.export import FORMATS, export
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.values import Value, to_f32
 
 ICD = load_icd()
 TELEMETRY = [row for row in ICD.rows if row.kind == "telemetry"]
@@ -386,7 +386,7 @@ def test_an_unknown_format_is_told() -> None:
 
 
 def test_a_changed_row_changes_every_export(tmp_path: Path) -> None:
-    from protocol.icd import default_icd_path
+    from starhil.protocol.icd import default_icd_path
 
     for file in default_icd_path().glob("*.toml"):
         (tmp_path / file.name).write_text(

@@ -7,11 +7,11 @@ import asyncio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.can_framing import CanFrame
-from protocol.flow import WINDOW, FairQueue
-from protocol.hub import BACKLOG_LIMIT, CanHub
-from protocol.socketcand import format_send
-from protocol.transports import open_can
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.flow import WINDOW, FairQueue
+from starhil.protocol.hub import BACKLOG_LIMIT, CanHub
+from starhil.protocol.socketcand import format_send
+from starhil.protocol.transports import open_can
 from tests.protocol.transports.pairs import bare, until
 
 FLOOD = CanFrame(0x123, bytes(8), extended=False)

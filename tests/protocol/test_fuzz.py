@@ -11,7 +11,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from protocol.can_framing import (
+from starhil.protocol.can_framing import (
     MAX_OPEN_MESSAGES,
     CanDeviceReceiver,
     CanFrame,
@@ -20,13 +20,13 @@ from protocol.can_framing import (
     encode_reply_frames,
     encode_request_frames,
 )
-from protocol.candump import format_candump, parse_candump
-from protocol.errors import ProtocolError
-from protocol.icd import load_icd
-from protocol.image_transfer import parse_burst_packet
-from protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver, encode_reply, encode_request
-from protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
+from starhil.protocol.candump import format_candump, parse_candump
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_icd
+from starhil.protocol.image_transfer import parse_burst_packet
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver, encode_reply, encode_request
+from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "100000"))
 SEED = 20260103

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.can_framing import CanFrame
-from protocol.candump import read_candump
-from protocol.errors import ProtocolError
-from protocol.hub import BACKLOG_LIMIT, CanHub
-from protocol.socketcand import (
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.candump import read_candump
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.hub import BACKLOG_LIMIT, CanHub
+from starhil.protocol.socketcand import (
     CommandError,
     CommandSplitter,
     format_frame,
@@ -336,7 +336,7 @@ def test_any_text_is_a_frame_or_a_command_error(text: bytes) -> None:
 def test_a_full_disk_ends_the_log_and_nothing_else(
     at: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("protocol.hub.FLUSH_LOG_S", 0.001 if at == "flush" else 3600.0)
+    monkeypatch.setattr("starhil.protocol.hub.FLUSH_LOG_S", 0.001 if at == "flush" else 3600.0)
 
     async def scenario(hub: CanHub) -> None:
         one, two = await Peer.join(hub), await Peer.join(hub)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.codec import Field, Row
-from protocol.icd import UnknownNameError, default_icd_path, load_icd
-from protocol.messages import ErrorCode
-from protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import UnknownNameError, default_icd_path, load_icd
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
 
 ICD = load_icd()
 ROWS = list(ICD.rows)

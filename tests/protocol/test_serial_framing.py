@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.errors import ProtocolError
-from protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
-from protocol.serial_framing import (
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.serial_framing import (
     BURST_SIZE,
     DeviceReceiver,
     Dialect,

@@ -5,19 +5,19 @@ import socket
 
 import pytest
 
-from emulator.device.state_store import STATE_FILE, FileStore
-from emulator.errors import EmulatorError
-from emulator.profile import load_profile
-from emulator.scenario import load_scenario
-from emulator.truth.file import read_truth_file
-from hil_tests.errors import BenchError
-from hil_tests.script import load_script
-from hil_tests.truth_file import TruthFile
-from protocol.canopen.layout import load_layout
-from protocol.canopen.storage import FileStorage
-from protocol.errors import ProtocolError
-from protocol.icd import load_icd
-from protocol.user_file import UnsuitableFileError, read_user_file, read_user_text
+from starhil.emulator.device.state_store import STATE_FILE, FileStore
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import load_profile
+from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.truth.file import read_truth_file
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.script import load_script
+from starhil.hil_tests.truth_file import TruthFile
+from starhil.protocol.canopen.layout import load_layout
+from starhil.protocol.canopen.storage import FileStorage
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_icd
+from starhil.protocol.user_file import UnsuitableFileError, read_user_file, read_user_text
 
 READERS = {
     "truth file": read_truth_file,

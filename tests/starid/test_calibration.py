@@ -16,7 +16,7 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.camera_file import load_camera, save_camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.self_calibration import IMAGE_MODELS, Stars, _best, self_calibrate
+from starid.photograph.self_calibration import IMAGE_MODELS, Stars, _best, self_calibrate
 from starid.wahba import solve_wahba
 
 WIDE = Camera(937, 937, (1230.0, 1226.0), (474.0, 463.0), "pinhole", (-0.06, 0.03, 8e-4, -5e-4, 0.0))

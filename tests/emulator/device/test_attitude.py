@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from emulator.profile import Profile
-from emulator.truth.source import RateTruth
+from starhil.emulator.profile import Profile
+from starhil.emulator.truth.source import RateTruth
 from starid.attitude import Attitude
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)

@@ -2,10 +2,10 @@
 
 import pytest
 
-from emulator.device.cycle import MAX_PENDING
-from emulator.profile import Profile
-from emulator.truth.source import FixedTruth
-from protocol.messages import ErrorCode
+from starhil.emulator.device.cycle import MAX_PENDING
+from starhil.emulator.profile import Profile
+from starhil.emulator.truth.source import FixedTruth
+from starhil.protocol.messages import ErrorCode
 from starid.attitude import Attitude
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)

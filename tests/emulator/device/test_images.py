@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from emulator.device.images import StoredImage
-from emulator.imaging.frames import Failure
-from protocol.messages import ErrorCode, ReplyKind, Request
+from starhil.emulator.device.images import StoredImage
+from starhil.emulator.pipeline.frames import Failure
+from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 
 def save(bench, size="size_64"):

@@ -1,6 +1,6 @@
 import pytest
 
-from emulator.device.modes import Cause, Mode, Modes
+from starhil.emulator.device.modes import Cause, Mode, Modes
 
 
 def modes_in(mode: Mode) -> Modes:

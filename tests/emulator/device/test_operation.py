@@ -1,7 +1,7 @@
 """The device in its modes: by command, by result, at boot and in error."""
 
-from emulator.profile import Profile
-from protocol.messages import ErrorCode, Request
+from starhil.emulator.profile import Profile
+from starhil.protocol.messages import ErrorCode, Request
 
 
 def test_modes_go_by_command_and_by_result(bench):

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from emulator.errors import EmulatorError
-from emulator.profile import Profile
-from protocol.messages import ErrorCode
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import Profile
+from starhil.protocol.messages import ErrorCode
 
 F32 = 1e-6
 

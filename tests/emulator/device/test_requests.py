@@ -2,12 +2,12 @@
 
 import pytest
 
-from emulator.device.device import missing_handlers
-from emulator.device.telecommands import TELECOMMANDS
-from emulator.device.telemetry import TELEMETRY
-from emulator.profile import Profile
-from protocol.icd import load_icd
-from protocol.messages import ErrorCode, ReplyKind, Request
+from starhil.emulator.device.device import missing_handlers
+from starhil.emulator.device.telecommands import TELECOMMANDS
+from starhil.emulator.device.telemetry import TELEMETRY
+from starhil.emulator.profile import Profile
+from starhil.protocol.icd import load_icd
+from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 
 def test_every_row_of_the_definition_is_served():

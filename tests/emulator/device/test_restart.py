@@ -2,10 +2,10 @@
 
 import pytest
 
-from emulator.device.device import do_at_once
-from emulator.device.state_store import FileStore
-from emulator.errors import EmulatorError
-from protocol.messages import ErrorCode, ReplyKind
+from starhil.emulator.device.device import do_at_once
+from starhil.emulator.device.state_store import FileStore
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.messages import ErrorCode, ReplyKind
 
 
 def test_reset_is_acknowledged_then_done(bench):

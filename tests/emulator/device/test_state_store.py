@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.device.state_store import STATE_FILE, FileStore
-from emulator.errors import EmulatorError
+from starhil.emulator.device.state_store import STATE_FILE, FileStore
+from starhil.emulator.errors import EmulatorError
 
 STATE = {"boot_count": 3, "parameters": {"exposure": 50, "analog_gain": 1.5, "serial_dialect": "a"}}
 
@@ -99,7 +99,7 @@ def test_a_killed_writer_leaves_a_whole_state(tmp_path):
         """
         import sys
         from pathlib import Path
-        from emulator.device.state_store import FileStore
+        from starhil.emulator.device.state_store import FileStore
         store = FileStore(Path(sys.argv[1]))
         n = 0
         while True:

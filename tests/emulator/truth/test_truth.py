@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.errors import EmulatorError
-from emulator.truth.file import read_truth_file
-from emulator.truth.live import LiveTruth
-from emulator.truth.source import (
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.file import read_truth_file
+from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.source import (
     FixedTruth,
     HoldSegment,
     RateSegment,

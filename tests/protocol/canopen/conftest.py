@@ -13,13 +13,13 @@ from pathlib import Path
 import canopen
 import pytest
 
-import protocol.canopen
-from hil_tests.conformance.canopen_probe import CanopenProbe
-from hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
-from hil_tests.conformance.case import CaseFailed
-from protocol.can_framing import CanFrame
-from protocol.canopen import CanopenSlave, DeviceDictionary, Picture, StandInApplication, build_dictionary
-from protocol.canopen.storage import ParameterStorage
+import starhil.protocol.canopen
+from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from starhil.hil_tests.conformance.case import CaseFailed
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen import CanopenSlave, DeviceDictionary, Picture, StandInApplication, build_dictionary
+from starhil.protocol.canopen.storage import ParameterStorage
 
 NODE = 0x2C
 
@@ -185,7 +185,7 @@ def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
         return canopen.import_od(file, node_id)
 
 
-def simulated_probe(package=protocol.canopen) -> CanopenProbe:
+def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
     """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
     dictionary = package.build_dictionary()
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import protocol.canopen
+import starhil.protocol.canopen
 
-PACKAGE = "protocol.canopen"
-FOLDER = Path(protocol.canopen.__file__).parent
+PACKAGE = "starhil.protocol.canopen"
+FOLDER = Path(starhil.protocol.canopen.__file__).parent
 ALIAS = "mutant_canopen"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
 
 
 def mutant_names() -> list[str]:

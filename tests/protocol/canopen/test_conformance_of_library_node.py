@@ -7,8 +7,8 @@ from collections import deque
 import canopen
 import pytest
 
-from protocol.can_framing import CanFrame
-from protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen import build_dictionary, build_eds
 
 NODE = 0x2C
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.canopen import AbortCode, DeviceDictionary, SdoAbortError, build_dictionary, check_status
-from protocol.canopen.layout import CanopenModel, load_layout
-from protocol.icd import load_icd
-from protocol.values import IcdError
+from starhil.protocol.canopen import AbortCode, DeviceDictionary, SdoAbortError, build_dictionary, check_status
+from starhil.protocol.canopen.layout import CanopenModel, load_layout
+from starhil.protocol.icd import load_icd
+from starhil.protocol.values import IcdError
 
 ICD = load_icd()
 
@@ -141,7 +141,7 @@ def layout(**changes) -> CanopenModel:
     ],
 )
 def test_layouts_that_do_not_fit_the_definition(changes, text):
-    from protocol.errors import ProtocolError
+    from starhil.protocol.errors import ProtocolError
 
     with pytest.raises(ProtocolError, match=text):
         DeviceDictionary(ICD, layout(**changes))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
 from tests.protocol.dissection import dissect
 
 

@@ -14,7 +14,7 @@ import dcf
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
-from protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.canopen import build_dictionary, build_eds
 
 
 @pytest.fixture(scope="module")

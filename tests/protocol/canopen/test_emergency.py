@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.canopen import AbortCode, ErrorRegister
+from starhil.protocol.canopen import AbortCode, ErrorRegister
 
 CODE = 0xFF01
 

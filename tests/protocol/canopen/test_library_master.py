@@ -11,8 +11,8 @@ import can
 import canopen
 import pytest
 
-from protocol.can_framing import CanFrame
-from protocol.canopen import build_eds
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen import build_eds
 
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
 PATIENCE_S = 20.0

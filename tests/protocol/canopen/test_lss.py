@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from protocol.canopen import MemoryStorage, NmtState, StorageError
+from starhil.protocol.canopen import MemoryStorage, NmtState, StorageError
 
 VENDOR, PRODUCT, REVISION, SERIAL = 0, 0x53544152, 0x10000, 1
 IDENTITY = (VENDOR, PRODUCT, REVISION, SERIAL)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.canopen import CanopenSlave, NmtState, build_dictionary
-from protocol.errors import ProtocolError
+from starhil.protocol.canopen import CanopenSlave, NmtState, build_dictionary
+from starhil.protocol.errors import ProtocolError
 
 HEARTBEAT_LOST = bytes.fromhex("3081 11")
 

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from protocol.canopen import AbortCode, Deferred, SdoAbortError
+from starhil.protocol.canopen import AbortCode, Deferred, SdoAbortError
 
 ATTITUDE = "00 20 a0"  # 2000h:160, precise_attitude as a whole
 SERIAL_DIALECT = "20 60 24"  # 6020h:36
@@ -432,7 +432,7 @@ def test_refusal_of_the_device(bench):
 
 
 def test_other_errors_of_the_device_are_a_general_abort_and_an_event(bench):
-    from protocol.errors import ProtocolError
+    from starhil.protocol.errors import ProtocolError
 
     def fail(row):
         raise ProtocolError("no such thing")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from protocol.can_framing import CanFrame
+from starhil.protocol.can_framing import CanFrame
 from tests.protocol.canopen.conftest import NODE, Bench
 from tests.protocol.test_fuzz import INPUTS, SEED
 

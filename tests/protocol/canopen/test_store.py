@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from protocol.canopen import AbortCode, FileStorage, MemoryStorage, SdoAbortError, StorageError
+from starhil.protocol.canopen import AbortCode, FileStorage, MemoryStorage, SdoAbortError, StorageError
 
 SAVE = b"save"
 LOAD = b"load"
@@ -220,7 +220,7 @@ def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
 WRITER = """
 import sys
 from pathlib import Path
-from protocol.canopen import FileStorage
+from starhil.protocol.canopen import FileStorage
 storage = FileStorage(Path(sys.argv[1]))
 number = 0
 while True:

@@ -6,8 +6,8 @@ import datetime as dt
 
 import pytest
 
-from protocol.canopen import AbortCode
-from protocol.canopen.timestamp import decode_time_of_day, encode_time_of_day
+from starhil.protocol.canopen import AbortCode
+from starhil.protocol.canopen.timestamp import decode_time_of_day, encode_time_of_day
 
 
 def test_producer_sends_at_its_period_and_acts_on_its_own_sync(bench):

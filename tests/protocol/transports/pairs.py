@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
-from protocol.hub import CanHub
-from protocol.transports import CanTransport, SerialTransport, open_can, open_serial
-from protocol.transports.can import kernel_can_is_up
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.hub import CanHub
+from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
+from starhil.protocol.transports.can import kernel_can_is_up
 
 DEADLINE_S = 10.0
 HAS_VCAN = kernel_can_is_up("vcan0")

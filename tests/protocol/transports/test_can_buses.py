@@ -10,10 +10,10 @@ import time
 import can
 import pytest
 
-from protocol.can_framing import CanFrame
-from protocol.errors import ProtocolError
-from protocol.transports import TransportError, open_can
-from protocol.transports.python_can import PythonCanTransport
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.transports import TransportError, open_can
+from starhil.protocol.transports.python_can import PythonCanTransport
 from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, can_pair, until
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import can
 import pytest
 
-from protocol.can_framing import CanFrame
-from protocol.hub import CanHub
-from protocol.transports import TransportError, open_can
-from protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.hub import CanHub
+from starhil.protocol.transports import TransportError, open_can
+from starhil.protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
 from tests.protocol.transports.pairs import FRAMES, HAS_VCAN, CanPair, bare, until
 
 
@@ -91,7 +91,7 @@ def test_auto_starts_a_hub_joins_it_and_takes_over_when_its_owner_leaves() -> No
 
 FOUNDER = """
 import asyncio
-from protocol.transports import open_can
+from starhil.protocol.transports import open_can
 async def main():
     await open_can("auto", hub_port={port}).start(lambda _: None)
     print("founded", flush=True)

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from protocol.can_framing import CanFrame
-from protocol.hub import CanHub
-from protocol.transports import SerialTransport, open_can, open_serial
-from protocol.transports.base import Transport
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.hub import CanHub
+from starhil.protocol.transports import SerialTransport, open_can, open_serial
+from starhil.protocol.transports.base import Transport
 from tests.protocol.transports.pairs import FRAMES, bare, until
 
 SLOW_BAUD = 9600

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.transports import SerialTransport, open_serial, pty_peers
+from starhil.protocol.transports import SerialTransport, open_serial, pty_peers
 from tests.protocol.transports.pairs import until
 
 MESSAGE = bytes(range(100))

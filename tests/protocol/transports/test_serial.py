@@ -13,9 +13,9 @@ from typing import NoReturn
 import pytest
 import serial
 
-from protocol.errors import ProtocolError
-from protocol.transports import TransportError, open_serial
-from protocol.transports.paced_writer import BACKLOG_LIMIT
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.transports import TransportError, open_serial
+from starhil.protocol.transports.paced_writer import BACKLOG_LIMIT
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 
 

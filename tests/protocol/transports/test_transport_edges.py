@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from protocol.transports import TransportError, open_can
-from protocol.transports.hub_client import HubTransport
-from protocol.transports.serial import open_serial
+from starhil.protocol.transports import TransportError, open_can
+from starhil.protocol.transports.hub_client import HubTransport
+from starhil.protocol.transports.serial import open_serial
 
 
 @pytest.mark.parametrize("host", ["127.0.0..1", "x" * 300])

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from emulator.bench.scenes import Scene, SceneMaker, SceneSettings
+from starhil.emulator.benchmarks.scenes import Scene, SceneMaker, SceneSettings
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from emulator.bench.identify import ROWS, STANDARD, best_attitude
-from emulator.bench.scenes import SceneSettings
+from starhil.emulator.benchmarks.identify import ROWS, STANDARD, best_attitude
+from starhil.emulator.benchmarks.scenes import SceneSettings
 from starid.attitude import ARCSEC_PER_RAD
 from starid.geometric.identifier import Effort, Identifier
 from starid.solution import Reason

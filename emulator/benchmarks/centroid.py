@@ -1,0 +1,281 @@
+"""Centroid accuracy on rendered frames of the real sky, beside the Cramér–Rao bound.
+
+The bound is computed for every star by itself: from its true place on the pixels, its electrons, the true spot and
+trail, and the true variance of every pixel (shot noise of star, sky and dark current, read noise, rounding, and the
+spread of the pixels' sensitivity, which no single frame can tell from light). Saturated pixels tell nothing. Flux
+counts as unknown, the sky as known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.renderer import Frame, Renderer, SensorModel
+from starid.attitude import random_attitude
+from starid.cache import write_atomically
+from starid.camera import Camera
+from starid.catalog import load_catalog
+from starid.imaging.centroid import star_model
+from starid.imaging.detection import Detections, detect
+
+Array = npt.NDArray[np.float64]
+
+EDGES_V: Final = (-2.0, 2.0, 3.0, 4.0, 4.5, 5.0, 5.5, 6.0)
+"""Limits of the magnitude bins."""
+
+DEFAULT_RATES_DEG_S: Final = (0.0, 0.5, 1.0, 2.0)
+_ISOLATED_PX: Final = 12.0
+_MATCH_PX: Final = 3.0
+_EDGE_PX: Final = 12.0
+_BRIGHTEST_COMPLETE: Final = 0.5
+
+
+@dataclass(frozen=True)
+class CentroidRow:
+    """Accuracy in one magnitude bin at one rate.
+
+    Attributes
+    ----------
+    rate_deg_s : float
+        Body rate across the boresight.
+    v_low, v_high : float
+        Limits of the bin.
+    stars : int
+        Isolated stars in it, on all frames.
+    detected_pct : float
+        Share of them that were detected.
+    rms_px : float
+        Error per axis, root mean square.
+    bound_px : float
+        Cramér–Rao bound per axis, root mean square over the same stars.
+    ratio : float
+        `rms_px` over `bound_px`.
+    predicted_px : float
+        What detection said its error was, root mean square.
+    normalised_squared_error : float
+        Mean of (error / predicted)² per axis; 1 if the prediction is honest.
+    bias_px : float
+        Length of the mean error vector.
+    """
+
+    rate_deg_s: float
+    v_low: float
+    v_high: float
+    stars: int
+    detected_pct: float
+    rms_px: float
+    bound_px: float
+    ratio: float
+    predicted_px: float
+    normalised_squared_error: float
+    bias_px: float
+
+
+def cramer_rao_px(
+    xy_px: Array,
+    electrons: float,
+    sigma_px: float,
+    trail_px: tuple[float, float],
+    background_variance_e2: float,
+    sensor: SensorModel,
+    background_e: float,
+) -> tuple[float, float]:
+    """Least standard deviations along x and y of an unbiased position of one star, pixels.
+
+    Parameters
+    ----------
+    xy_px : array (2,)
+        Place of the star.
+    electrons : float
+        Its electrons in the exposure.
+    sigma_px, trail_px
+        Standard deviation of its spot, and its trail along x and y.
+    background_variance_e2, background_e : float
+        Variance of a pixel without star light (electrons²), and its mean (electrons).
+    sensor : SensorModel
+        For the spread of sensitivity and the levels of saturation.
+    """
+    reach = math.ceil(6.0 * sigma_px + 0.5 * math.hypot(*trail_px)) + 2
+    left, top = round(xy_px[0]) - reach, round(xy_px[1]) - reach
+    side = 2 * reach + 1
+    model = np.empty((3, side * side))
+    shape = (sigma_px, *trail_px)
+    star_model(xy_px[0], xy_px[1], shape, (left, top, side, side), model, np.empty((5, max(side, 11))))
+    light = electrons * model[0]
+    variance = background_variance_e2 + light + (sensor.prnu * light) ** 2
+    full = min(sensor.full_well_e, (sensor.max_dn - sensor.offset_dn) * sensor.gain_e_per_dn)
+    weight = np.where(light + background_e < full, 1.0 / variance, 0.0)
+    slopes = np.stack([electrons * model[1], electrons * model[2], model[0]])
+    information = (slopes * weight) @ slopes.T
+    bound = np.linalg.inv(information)
+    return math.sqrt(bound[0, 0]), math.sqrt(bound[1, 1])
+
+
+def measure_centroids(
+    rates_deg_s: Sequence[float] = DEFAULT_RATES_DEG_S,
+    frames: int = 30,
+    seed: int = 1,
+    sensor: SensorModel | None = None,
+    camera: Camera | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> list[CentroidRow]:
+    """Measure the accuracy of centroids on frames of random attitude.
+
+    Parameters
+    ----------
+    rates_deg_s : sequence of float
+        Body rates, about an axis across the boresight, of a random direction in every frame.
+    frames : int
+        Frames a rate.
+    seed : int
+        Seed of attitudes, directions and noise.
+    sensor, camera : optional
+        The defaults of the product unless given.
+    progress : callable, optional
+        Told in a line what is being done.
+
+    Returns
+    -------
+    list of CentroidRow
+        By rate and magnitude; bins without stars are left out.
+    """
+    if frames < 1 or not rates_deg_s:
+        raise EmulatorError(
+            f"bench centroid: {frames} frames at {len(rates_deg_s)} rates; give at least one of each"
+        )
+    sensor = SensorModel() if sensor is None else sensor
+    camera = Camera.from_fov() if camera is None else camera
+    renderer = Renderer(camera, load_catalog(), sensor, seed)
+    rows: list[CentroidRow] = []
+    for rate in rates_deg_s:
+        if progress is not None:
+            progress(f"{rate:g} °/s: {frames} frames")
+        table = np.concatenate([_one_frame(renderer, rate, index, seed) for index in range(frames)])
+        rows += _rows(rate, table)
+    return rows
+
+
+def _one_frame(renderer: Renderer, rate_deg_s: float, index: int, seed: int) -> Array:
+    """Isolated stars of a frame: (n, 9) of V, detected, error x, y, predicted x, y, bound x, y, and a spare."""
+    rng = np.random.default_rng((seed, index, round(1000 * rate_deg_s)))
+    attitude = random_attitude(rng)
+    angle = rng.uniform(0.0, 2.0 * math.pi)
+    rate = math.radians(rate_deg_s) * np.array([math.cos(angle), math.sin(angle), 0.0])
+    frame = renderer.render(attitude, rate, index)
+    found = detect(frame.image, renderer.sensor.detection_settings())
+    return _compare(renderer, frame, found)
+
+
+def _compare(renderer: Renderer, frame: Frame, found: Detections) -> Array:
+    """Set every isolated star beside its detection and its bound."""
+    sensor, camera = renderer.sensor, renderer.camera
+    truth = frame.stars.xy_px
+    gaps = np.linalg.norm(truth[:, None, :] - truth[None, :, :], axis=2)
+    np.fill_diagonal(gaps, np.inf)
+    inner = np.all((truth > _EDGE_PX) & (truth < [camera.width - _EDGE_PX, camera.height - _EDGE_PX]), axis=1)
+    trails = renderer.trails(frame)
+    lonely = gaps.min(axis=1, initial=np.inf) > _ISOLATED_PX + np.hypot(trails[:, 0], trails[:, 1])
+    still_e = frame.exposure_s * (sensor.sky_e_s(camera.pixel_scale_rad) + sensor.dark_e_s)
+    variance = still_e + sensor.read_noise_e**2 + sensor.gain_e_per_dn**2 / 12.0
+    rows = []
+    for k in np.flatnonzero(inner & lonely):
+        bound = cramer_rao_px(
+            truth[k],
+            float(frame.stars.electrons[k]),
+            sensor.psf_sigma_px,
+            (float(trails[k, 0]), float(trails[k, 1])),
+            variance,
+            sensor,
+            still_e,
+        )
+        off = found.xy_px - truth[k]
+        distance = np.hypot(off[:, 0], off[:, 1])
+        near = int(np.argmin(distance)) if len(found) else -1
+        seen = near >= 0 and distance[near] < _MATCH_PX
+        error = off[near] if seen else np.full(2, np.nan)
+        predicted = found.xy_sigma_px[near] if seen else np.full(2, np.nan)
+        rows.append([float(frame.stars.magnitude[k]), float(seen), *error, *predicted, *bound])
+    return np.array(rows, dtype=np.float64).reshape(-1, 8)
+
+
+def _rows(rate: float, table: Array) -> list[CentroidRow]:
+    """Summarise the stars of one rate by magnitude."""
+    rows = []
+    for low, high in itertools.pairwise(EDGES_V):
+        chosen = table[(table[:, 0] >= low) & (table[:, 0] < high)]
+        seen = chosen[chosen[:, 1] > 0.0]
+        if len(seen) == 0:
+            continue
+        error, predicted, bound = seen[:, 2:4], seen[:, 4:6], seen[:, 6:8]
+        rms, least = _rms(error), _rms(bound)
+        rows.append(
+            CentroidRow(
+                rate_deg_s=rate,
+                v_low=low,
+                v_high=high,
+                stars=len(chosen),
+                detected_pct=100.0 * len(seen) / len(chosen),
+                rms_px=rms,
+                bound_px=least,
+                ratio=rms / least,
+                predicted_px=_rms(predicted),
+                normalised_squared_error=float(np.mean((error / predicted) ** 2)),
+                bias_px=float(np.hypot(*error.mean(axis=0))),
+            )
+        )
+    return rows
+
+
+def _rms(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
+    """Draw error and bound over magnitude, a panel a rate, to an image or PDF file."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rates = sorted({row.rate_deg_s for row in rows})
+    figure, panels = plt.subplots(
+        1, len(rates), figsize=(3.4 * len(rates) + 0.8, 4.2), sharey=True, squeeze=False, layout="constrained"
+    )
+    for panel, rate in zip(panels[0], rates, strict=True):
+        chosen = [row for row in rows if row.rate_deg_s == rate]
+        middle = [0.5 * (max(row.v_low, _BRIGHTEST_COMPLETE) + row.v_high) for row in chosen]
+        panel.semilogy(middle, [row.bound_px for row in chosen], "k-", lw=1.5, label="Cramér–Rao bound")
+        panel.semilogy(
+            middle, [row.rms_px for row in chosen], "o", color="tab:blue", ms=6, label="measured error"
+        )
+        panel.semilogy(
+            middle,
+            [row.predicted_px for row in chosen],
+            "_",
+            color="tab:orange",
+            ms=14,
+            mew=2,
+            label="error stated",
+        )
+        panel.set_title(f"{rate:g} °/s")
+        panel.set_xlabel("V magnitude")
+        panel.grid(visible=True, which="both", lw=0.3)
+    panels[0, 0].set_ylabel("error per axis, px (root mean square)")
+    panels[0, 0].legend(loc="upper left", fontsize=8)
+    try:
+        form = path.suffix.removeprefix(".").lower() or "png"
+        write_atomically(path, lambda part: figure.savefig(part, dpi=150, format=form))
+    except (OSError, ValueError) as error:
+        raise EmulatorError(f"{path}: cannot write the plot: {error}") from None
+    finally:
+        plt.close(figure)

@@ -1,0 +1,72 @@
+"""Skies that make identification hard: bright bodies, their glare, planets, and more false stars than true ones."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sky.objects import Moon, PointSource, SkyObjects, SunGlare
+from starid.attitude import Attitude
+
+HARD_SENSOR: Final = SensorModel(limiting_magnitude=4.8, hot_pixels=500)
+"""A sensor that sees some 50 stars in 42°, and many hot pixels."""
+
+FASTEST_DEG_S: Final = 2.0
+"""Body rates in a hard sky are uniform from 0 to this."""
+
+_FALSE_STARS: Final = 100
+_FALSE_STAR_MAGNITUDES: Final = (1.0, 4.8)
+_PLANETS: Final = 3
+_PLANET_MAGNITUDES: Final = (-4.0, 1.5)
+_WITHIN_DEG: Final = 20.0
+_SUN_AWAY_DEG: Final = (30.0, 80.0)
+_SUN_ELECTRONS_S: Final = (100.0, 3000.0)
+_COSMIC_RAYS_S: Final = 50.0
+
+
+def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
+    """A hard sky about a boresight: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun.
+
+    Parameters
+    ----------
+    attitude : Attitude
+        Where the sensor looks.
+    rng : Generator
+        Chooses all that differs from frame to frame.
+    """
+    planets = tuple(
+        PointSource(*_place(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES)))
+        for _ in range(_PLANETS)
+    )
+    moon, sun = None, None
+    if rng.random() < 0.5:
+        moon = Moon(
+            *_place(attitude, (0.0, _WITHIN_DEG), rng),
+            illuminated=float(rng.uniform()),
+            bright_limb_deg=float(rng.uniform(0.0, 360.0)),
+        )
+    else:
+        sun = SunGlare(*_place(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_ELECTRONS_S)))
+    return SkyObjects(
+        moon=moon,
+        sun=sun,
+        planets=planets,
+        false_stars=_FALSE_STARS,
+        false_star_magnitudes=_FALSE_STAR_MAGNITUDES,
+        cosmic_rays_s=_COSMIC_RAYS_S,
+    )
+
+
+def _place(
+    attitude: Attitude, away_deg: tuple[float, float], rng: np.random.Generator
+) -> tuple[float, float]:
+    """Right ascension and declination, degrees, of a place uniform on a ring about the boresight."""
+    low, high = np.cos(np.deg2rad(away_deg))
+    cosine, angle = rng.uniform(high, low), rng.uniform(0.0, 2.0 * np.pi)
+    sine = np.sqrt(1.0 - cosine * cosine)
+    seen: npt.NDArray[np.float64] = np.array([sine * np.cos(angle), sine * np.sin(angle), cosine])
+    x, y, z = attitude.matrix.T @ seen
+    return float(np.rad2deg(np.arctan2(y, x)) % 360.0), float(np.rad2deg(np.arcsin(np.clip(z, -1.0, 1.0))))

@@ -1,0 +1,249 @@
+"""`starhil bench identify`: identification programs on the same scenes, against the bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.benchmarks.peers import OWN, PEERS, Reply, Solver, make_solver, version_of
+from starhil.emulator.benchmarks.scenes import Scene, SceneMaker, SceneSettings
+from starhil.emulator.errors import EmulatorError
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import StarCatalog, load_catalog
+from starid.geometric.pattern_index import seen_stars
+
+Array = NDArray[np.float64]
+
+ROWS: Final[dict[str, SceneSettings]] = {
+    "0.5": SceneSettings(5.5, 0.5),
+    "1": SceneSettings(5.5, 1.0),
+    "2": SceneSettings(5.5, 2.0),
+    "3": SceneSettings(5.5, 3.0),
+    "0.5, 5, 0": SceneSettings(5.5, 0.5, false_stars=5),
+    "0.5, 0, 3": SceneSettings(5.5, 0.5, missing_stars=3),
+    "2, 5, 3": SceneSettings(5.5, 2.0, false_stars=5, missing_stars=3),
+    "V ≤ 4, 1, 3, 1": SceneSettings(4.0, 1.0, false_stars=3, missing_stars=1),
+    "100 random points": SceneSettings(5.5, random_points=(100, 100)),
+    "30–150 random points": SceneSettings(5.5, random_points=(30, 150)),
+    "0.5, half covered": SceneSettings(5.5, 0.5, covered=0.5),
+    "0.5, 100 false, V ≤ 4.75": SceneSettings(4.75, 0.5, false_stars=100),
+    "0.5, 200 false in half the field": SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5),
+}
+"""Row of the table → scene: "σ px, false, missing" of stars to V 5.5 where nothing else is said."""
+
+STANDARD: Final = tuple(ROWS)[:9]
+"""Rows of the published comparison."""
+
+WRONG_ARCSEC: Final = 360.0
+"""A valid attitude whose boresight is off by more than this is wrong."""
+
+PEER_LIMIT_V: Final = 5.5
+"""Faintest star in the peers' databases: that of the scenes."""
+
+_BLEND_PX: Final = 2.0
+_DEEPEST_V: Final = 6.0
+_FLOOR_STEPS: Final = 3
+
+
+@dataclass
+class Tally:
+    """Figures of one solver in one row, frame by frame."""
+
+    row: str
+    solver: str
+    frames: int = 0
+    valid: int = 0
+    wrong: int = 0
+    boresight: list[float] = field(default_factory=list)
+    roll: list[float] = field(default_factory=list)
+    floor_boresight: list[float] = field(default_factory=list)
+    floor_roll: list[float] = field(default_factory=list)
+    squared: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
+
+    def add(self, scene: Scene, floor: Attitude | None, reply: Reply) -> None:
+        """Count one frame; `floor` is None where there is no true attitude."""
+        self.frames += 1
+        self.seconds.append(reply.seconds)
+        self.cpu_seconds.append(reply.cpu_seconds)
+        if reply.matrix is None:
+            return
+        self.valid += 1
+        error = Attitude.from_matrix(_orthonormal(reply.matrix)).error_to(scene.attitude)
+        if floor is None or error.cross_boresight_arcsec > WRONG_ARCSEC:
+            self.wrong += 1
+            return
+        bound = floor.error_to(scene.attitude)
+        self.boresight.append(error.cross_boresight_arcsec)
+        self.roll.append(error.roll_arcsec)
+        self.floor_boresight.append(bound.cross_boresight_arcsec)
+        self.floor_roll.append(bound.roll_arcsec)
+        if reply.covariance is not None:
+            e = error.rotation_vector_rad
+            self.squared.append(float(e @ np.linalg.solve(reply.covariance, e)) / 3.0)
+
+    def report(self) -> dict[str, Any]:
+        """Figures as plain values; None where a row has none."""
+        milliseconds, cpu = 1e3 * np.array(self.seconds), 1e3 * np.array(self.cpu_seconds)
+        boresight, roll = _median(self.boresight), _median(self.roll)
+        return {
+            "row": self.row,
+            "solver": self.solver,
+            "frames": self.frames,
+            "valid_pct": 100.0 * self.valid / max(self.frames, 1),
+            "wrong": self.wrong,
+            "boresight_median_arcsec": boresight,
+            "floor_ratio": _ratio(boresight, _median(self.floor_boresight)),
+            "median_ms": float(np.median(milliseconds)) if self.frames else None,
+            "p99_ms": float(np.percentile(milliseconds, 99.0)) if self.frames else None,
+            "cpu_median_ms": float(np.median(cpu)) if self.frames else None,
+            "cpu_p99_ms": float(np.percentile(cpu, 99.0)) if self.frames else None,
+            "roll_median_arcsec": roll,
+            "roll_floor_ratio": _ratio(roll, _median(self.floor_roll)),
+            "floor_arcsec": _median(self.floor_boresight),
+            "normalised_squared_error": float(np.mean(self.squared)) if self.squared else None,
+        }
+
+
+def run(
+    frames: int,
+    seed: int,
+    *,
+    peers: Sequence[str] = (),
+    own: Sequence[str] = ("geometric",),
+    rows: Sequence[str] = STANDARD,
+    camera: Camera = DEFAULT_CAMERA,
+    budget_s: float = 120.0,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Let all solvers answer the same scenes.
+
+    Parameters
+    ----------
+    frames : int
+        Scenes a row.
+    seed : int
+        Of the scenes; each row begins anew with it.
+    peers, own : sequence of str
+        Solvers; a peer that is not installed is named as skipped.
+    rows : sequence of str
+        Keys of `ROWS`.
+    camera : Camera
+        Pinhole without distortion.
+    budget_s : float
+        A solver that has spent this long on a row answers no more of it (its `frames` says how many).
+    progress : callable, optional
+        Told of each row.
+
+    Returns
+    -------
+    dict
+        `rows` (list of `Tally.report`), `skipped`, `versions`, `seed`.
+    """
+    if frames < 1:
+        raise EmulatorError(f"--frames {frames}: at least 1 is needed")
+    for row in rows:
+        if row not in ROWS:
+            raise EmulatorError(f"--row {row!r}: one of {'; '.join(ROWS)} is needed")
+    stars = seen_stars(load_catalog(), _DEEPEST_V, _BLEND_PX * camera.pixel_scale_rad)
+    solvers, skipped = _solvers([*own, *peers], camera, stars.brighter_than(PEER_LIMIT_V))
+    maker = SceneMaker(camera, stars)
+    tallies: list[Tally] = []
+    for row in rows:
+        if progress is not None:
+            progress(row)
+        tallies += _run_row(row, frames, seed, maker, solvers, budget_s)
+    return {
+        "seed": seed,
+        "rows": [tally.report() for tally in tallies],
+        "skipped": skipped,
+        "versions": {name: version_of(name) for name in solvers},
+    }
+
+
+def _solvers(
+    names: Sequence[str], camera: Camera, stars: StarCatalog
+) -> tuple[dict[str, Solver], dict[str, str]]:
+    """Solvers by name, and why others are left out."""
+    solvers: dict[str, Solver] = {}
+    skipped: dict[str, str] = {}
+    for name in names:
+        if name not in OWN + PEERS:
+            raise EmulatorError(f"solver {name!r}: one of {', '.join(OWN + PEERS)} is needed")
+        try:
+            solvers[name] = make_solver(name, camera, stars)
+        except ImportError:
+            skipped[name] = f"not installed: pip install {name}"
+    return solvers, skipped
+
+
+def _run_row(
+    row: str, frames: int, seed: int, maker: SceneMaker, solvers: dict[str, Solver], budget_s: float
+) -> list[Tally]:
+    """All solvers on the scenes of one row."""
+    settings = ROWS[row]
+    tallies = {name: Tally(row, name) for name in solvers}
+    spent = dict.fromkeys(solvers, 0.0)
+    warm = maker.scene(settings, np.random.default_rng([seed, 1]))
+    for solver in solvers.values():
+        # a row's figures are its own, whatever rows came before
+        solver.reset()
+        solver.solve(warm)
+    rng = np.random.default_rng(seed)
+    for _ in range(frames):
+        scene = maker.scene(settings, rng)
+        floor = None if settings.random_points else best_attitude(maker.camera, maker.stars, scene)
+        for name, solver in solvers.items():
+            if spent[name] > budget_s:
+                continue
+            reply = solver.solve(scene)
+            spent[name] += reply.seconds
+            tallies[name].add(scene, floor, reply)
+    return list(tallies.values())
+
+
+def best_attitude(camera: Camera, stars: StarCatalog, scene: Scene) -> Attitude:
+    """Attitude by least squares in pixels from the true matches: the bound for any solver.
+
+    Gauss–Newton from the truth; with fewer than two true stars the truth itself comes back.
+    """
+    true = scene.star >= 0
+    attitude = scene.attitude
+    if int(true.sum()) < 2:
+        return attitude
+    vectors = stars.vectors[scene.star[true]]
+    for _ in range(_FLOOR_STEPS):
+        directions = attitude.to_sensor(vectors)
+        xy, _ = camera.project(directions)
+        x, y, z = directions.T
+        zero = np.zeros_like(x)
+        # a turn v moves a direction by direction × v
+        moves = np.stack(
+            [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=1
+        )
+        slopes = (camera.jacobian(directions) @ moves).reshape(-1, 3)
+        residual = (scene.xy_px[true] - xy).ravel()
+        attitude = attitude.rotated(np.linalg.solve(slopes.T @ slopes, slopes.T @ residual))
+    return attitude
+
+
+def _orthonormal(matrix: Array) -> Array:
+    """Nearest rotation to a matrix in single precision."""
+    u, _, v = np.linalg.svd(matrix.astype(np.float64))
+    rotation: Array = u @ np.diag([1.0, 1.0, math.copysign(1.0, float(np.linalg.det(u @ v)))]) @ v
+    return rotation
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if len(values) else None
+
+
+def _ratio(value: float | None, bound: float | None) -> float | None:
+    return value / bound if value is not None and bound else None

@@ -1,0 +1,164 @@
+"""Fault injection at three levels: what the sensor sees, what the device does, what the wires carry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from pydantic import AfterValidator, Field
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sky.objects import SkyObjects
+from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.truth.config import Strict
+
+if TYPE_CHECKING:
+    from starhil.emulator.emulation import Emulation
+
+
+def check_sky(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values if sky objects can be made of them.
+
+    Raises
+    ------
+    ValueError
+        Names the key and what is allowed.
+    """
+    try:
+        SkyObjects.from_dict(values)
+    except EmulatorError as error:
+        raise ValueError(str(error)) from None
+    return values
+
+
+SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
+"""Fields of `SkyObjects` as TOML and JSON hold them."""
+
+Chance = Annotated[float, Field(ge=0.0, le=1.0)]
+Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
+
+
+NO_ERROR: Final = 0
+"""Value in the enumeration `device_error` that no error mode has."""
+
+
+class DeviceFault(Strict):
+    """What goes wrong in the device."""
+
+    stuck: bool = False
+    """Requests are neither taken nor answered; frames go on."""
+    error: str | None = None
+    """Enter the error mode for this cause, a name of the enumeration `device_error` that is an error."""
+    reset: str | None = None
+    """Restart now for this cause, a name of the enumeration `reset_cause`."""
+
+
+class WireFault(Strict):
+    """What goes wrong on a wire; see `WireFaultSettings`."""
+
+    drop: Chance = 0.0
+    corrupt: Chance = 0.0
+    junk: Chance = 0.0
+    delay_s: Seconds = 0.0
+    split: Annotated[int, Field(ge=0, le=4096)] = 0
+    gap_s: Seconds = 0.02
+
+    def settings(self) -> WireFaultSettings:
+        """Make the settings of a link."""
+        return WireFaultSettings(**self.model_dump())
+
+
+class FaultRequest(Strict):
+    """One `fault` request; what is not given stays as it is."""
+
+    optical: SkyValues | None = None
+    """What the sensor sees besides the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
+    device: DeviceFault | None = None
+    serial: WireFault | None = None
+    can: WireFault | None = None
+    """What the device sends on the CAN bus, CANopen's frames too."""
+
+
+class Faults:
+    """What is wrong with a run at present."""
+
+    def __init__(self, emulation: Emulation) -> None:
+        self._emulation = emulation
+        self._optical: dict[str, Any] = {}
+
+    def inject(self, request: FaultRequest) -> None:
+        """Bring faults about; all of the request, or nothing of it.
+
+        Raises
+        ------
+        EmulatorError
+            A name is not known, or a link is not there.
+        """
+        self.check(request)
+        device = self._emulation.device
+        if request.optical is not None:
+            self._optical = dict(request.optical)
+            device.cycle.faults = lambda _index: self._optical
+        faults = {"serial": request.serial, "can": request.can}
+        for name, wire in self._wires():
+            fault = faults[name]
+            if fault is not None:
+                wire.settings = fault.settings()
+        if request.device is not None:
+            device.deaf = request.device.stuck
+            if request.device.reset is not None:
+                device.reset(request.device.reset)
+            if request.device.error is not None:
+                device.modes.fail(request.device.error)
+
+    def check(self, request: FaultRequest) -> None:
+        """Check that this run can bring faults about.
+
+        Raises
+        ------
+        EmulatorError
+            A name is not known, or a link is not there.
+        """
+        enums = self._emulation.device.icd.enums
+        if request.device is not None:
+            errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
+            for key, name, known in (
+                ("error", request.device.error, errors),
+                ("reset", request.device.reset, list(enums["reset_cause"].values)),
+            ):
+                if name is not None and name not in known:
+                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
+        there = {name for name, _ in self._wires()}
+        for name, fault in (("serial", request.serial), ("can", request.can)):
+            if fault is not None and name not in there:
+                raise EmulatorError(
+                    f"{name}: this run has no such link; start it with --{name}, or leave this out"
+                )
+
+    def _wires(self) -> Iterator[tuple[str, WireFaults[Any]]]:
+        """Each wire of the run under the name of its faults: both users of the CAN bus have the same."""
+        emulation = self._emulation
+        for name, link in (("serial", emulation.serial), ("can", emulation.can), ("can", emulation.canopen)):
+            if link is not None:
+                yield name, link.wire
+
+    def clear(self) -> None:
+        """Set everything right; the error mode is left by telecommand."""
+        self._optical = {}
+        device = self._emulation.device
+        device.cycle.faults = lambda _index: {}
+        device.deaf = False
+        for _, wire in self._wires():
+            wire.settings = WireFaultSettings()
+
+    def describe(self) -> dict[str, Any]:
+        """Return what is wrong, by level."""
+        found: dict[str, Any] = {}
+        if self._optical:
+            found["optical"] = dict(self._optical)
+        if self._emulation.device.deaf:
+            found["device"] = {"stuck": True}
+        for name, wire in self._wires():
+            if not wire.settings.none:
+                found[name] = vars(wire.settings)
+        return found

@@ -1,0 +1,117 @@
+"""The Unix socket of a control channel: for its user alone, in the place of one that was left behind, gone at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import stat
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from starhil.emulator.symlink_lock import NameTakenError, claim_name
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.errors import reason
+
+PRIVATE_FOLDER: Final = 0o700
+PRIVATE_SOCKET: Final = 0o600
+
+
+class ControlSocket:
+    """A listening socket and its file.
+
+    Raises
+    ------
+    EmulatorError
+        The file cannot be made, is none of a socket, or somebody listens there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_absolute() or any(character.isspace() or character == "\0" for character in str(path)):
+            raise EmulatorError(f"--control unix:{path}: must be an absolute path without spaces")
+        self.path = path
+        try:
+            self._claim = claim_name("control", os.fsencode(path.parent.resolve() / path.name))
+        except NameTakenError as error:
+            raise EmulatorError(f"control channel unix:{path}: {error}; choose another path") from None
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._file: os.stat_result | None = None
+        try:
+            self._remove_stale()
+            self.socket.bind(str(path))
+            path.chmod(PRIVATE_SOCKET)  # nobody can connect before it listens
+            self._file = path.lstat()
+            self.socket.listen()
+        except (OSError, ValueError) as error:  # a path with a zero byte is a ValueError
+            self.close()
+            raise EmulatorError(
+                f"control channel unix:{path}: cannot listen ({reason(error)}); choose another path"
+            ) from None
+        except EmulatorError:
+            self.close()
+            raise
+
+    def _remove_stale(self) -> None:
+        """Remove the socket of an emulator that was killed."""
+        try:
+            mode = self.path.lstat().st_mode
+        except FileNotFoundError:
+            return
+        if not stat.S_ISSOCK(mode):
+            raise EmulatorError(f"control channel unix:{self.path}: is no socket; choose another path")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+            asking.setblocking(False)  # noqa: FBT003 (the call of the library)
+            try:
+                asking.connect(str(self.path))
+            except ConnectionRefusedError:
+                self.path.unlink()
+                return
+            except BlockingIOError:
+                pass  # somebody listens, and is busy
+        raise EmulatorError(
+            f"control channel unix:{self.path}: in use by another program; choose another path"
+        )
+
+    def close(self) -> None:
+        """Stop listening and remove the file, if it is still this socket's."""
+        self.socket.close()
+        self._claim.close()
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                if os.path.samestat(self.path.lstat(), self._file):
+                    self.path.unlink()
+            self._file = None
+
+
+def automatic_path() -> Path:
+    """Return where this process listens by default, in a folder that is open to its user alone.
+
+    Raises
+    ------
+    EmulatorError
+        The folder cannot be made, or is somebody else's.
+    """
+    base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
+    if _is_own_folder(base):
+        folder = base / "starhil"
+    else:
+        folder = Path(tempfile.gettempdir()) / f"starhil-{os.geteuid()}"
+    try:
+        folder.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
+        if not _is_own_folder(folder):
+            raise EmulatorError(f"control channel: {folder} is somebody else's; give --control unix:/PATH")
+        folder.chmod(PRIVATE_FOLDER)
+    except OSError as error:
+        raise EmulatorError(
+            f"control channel: {folder} cannot be used ({reason(error)}); give --control unix:/PATH"
+        ) from None
+    return folder / f"control-{os.getpid()}"
+
+
+def _is_own_folder(folder: Path) -> bool:
+    try:
+        status = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()

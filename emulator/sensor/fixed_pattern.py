@@ -1,0 +1,78 @@
+"""The pixels' own differences, the same in every frame: dark current, sensitivity, hot and dead pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.sensor.model import SensorModel
+
+_HOT_LOG_SPREAD: Final = 1.0
+
+
+@dataclass(frozen=True)
+class FixedPattern:
+    """What makes one pixel differ from the next.
+
+    Attributes
+    ----------
+    sensitivity : ndarray (h, w), float32
+        Signal relative to the mean pixel; 0 for a dead one.
+    dark_e_s : ndarray (h, w), float32
+        Dark current, electrons/s.
+    hot, dead : ndarray (n, 2), int
+        Rows and columns of the hot and of the dead pixels.
+    """
+
+    sensitivity: npt.NDArray[np.float32]
+    dark_e_s: npt.NDArray[np.float32]
+    hot: npt.NDArray[np.int64]
+    dead: npt.NDArray[np.int64]
+
+
+def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPattern:
+    """Draw the fixed pattern of a pixel array from the sensor's `pattern_seed`.
+
+    Dark currents are gamma-distributed about the mean (never negative, with the long upper tail of silicon),
+    sensitivities normal; hot pixels are log-normal. No pixel is both hot and dead. The latest patterns are kept, as
+    most changes of a sensor (exposure, gain) leave them as they are.
+    """
+    pixels = (sensor.hot_pixels, sensor.dead_pixels)
+    spreads = (sensor.prnu, sensor.dsnu, sensor.dark_e_s, sensor.hot_e_s)
+    return _draw(sensor.pattern_seed, height, width, pixels, spreads)
+
+
+@lru_cache(maxsize=2)
+def _draw(
+    seed: int, height: int, width: int, pixels: tuple[int, int], spreads: tuple[float, float, float, float]
+) -> FixedPattern:
+    """Pattern for (hot, dead) pixels and (prnu, dsnu, dark current, that of hot pixels); arrays read-only."""
+    hot_pixels, dead_pixels = pixels
+    prnu, dsnu, dark_e_s, hot_e_s = spreads
+    rng = np.random.default_rng((seed, height, width))
+    size = height * width
+    faulty = rng.permutation(size)[: hot_pixels + dead_pixels]
+    hot, dead = faulty[:hot_pixels], faulty[hot_pixels:]
+    sensitivity = np.ones(size, dtype=np.float32)
+    if prnu > 0.0:
+        sensitivity += np.float32(prnu) * rng.standard_normal(size, dtype=np.float32)
+        np.maximum(sensitivity, 0.0, out=sensitivity)
+    dark = np.full(size, dark_e_s, dtype=np.float32)
+    if dsnu > 0.0:
+        shape = 1.0 / dsnu**2
+        dark = rng.standard_gamma(shape, size, dtype=np.float32) * np.float32(dark_e_s / shape)
+    dark[hot] += (hot_e_s * np.exp(_HOT_LOG_SPREAD * rng.standard_normal(hot.size))).astype(np.float32)
+    sensitivity[dead] = 0.0
+    dark[dead] = 0.0
+    for pattern in (sensitivity, dark):
+        pattern.flags.writeable = False
+    return FixedPattern(
+        sensitivity.reshape(height, width),
+        dark.reshape(height, width),
+        np.column_stack(np.divmod(np.sort(hot), width)),
+        np.column_stack(np.divmod(np.sort(dead), width)),
+    )

@@ -1,0 +1,199 @@
+"""The sensor: lens, pixels and converter, as numbers, and what a star of a given magnitude yields in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.noise import Digitizer
+from starid.imaging.detection import DetectionSettings
+
+ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
+SOLAR_COLOUR_B_V: Final = 0.65
+"""B−V of a star whose V magnitude gives its electrons without a colour term."""
+
+_BITS: Final = (8, 12, 16)
+
+_RANGES: Final[dict[str, tuple[float, float, str]]] = {
+    "exposure_s": (1e-6, 60.0, "seconds"),
+    "aperture_m": (1e-4, 1.0, "metres"),
+    "transmission": (1e-3, 1.0, "a share"),
+    "quantum_efficiency": (1e-3, 1.0, "a share"),
+    "zero_point_photons_s_m2": (1e6, 1e13, "photons/s/m²"),
+    "colour_term": (-2.0, 2.0, "magnitudes a magnitude of B−V"),
+    "psf_sigma_px": (0.3, 12.0, "pixels"),
+    "psf_growth": (0.0, 5.0, "a share"),
+    "gain": (0.01, 1000.0, "times"),
+    "adc_range_e": (1.0, 1e7, "electrons"),
+    "offset_share": (0.0, 0.5, "a share of the converter's range"),
+    "full_well_e": (10.0, 1e7, "electrons"),
+    "read_noise_e": (0.0, 1e4, "electrons"),
+    "dark_e_s": (0.0, 1e6, "electrons/s"),
+    "sky_mag_arcsec2": (-10.0, 40.0, "magnitudes/arcsec²"),
+    "dsnu": (0.0, 2.0, "a share of the dark current"),
+    "prnu": (0.0, 0.3, "a share"),
+    "hot_pixels": (0, 10_000_000, "pixels"),
+    "hot_e_s": (0.0, 1e7, "electrons/s"),
+    "dead_pixels": (0, 10_000_000, "pixels"),
+    "pattern_seed": (0, 2**63 - 1, "a whole number"),
+    "limiting_magnitude": (-2.0, 20.0, "magnitudes"),
+}
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """A star sensor's optics and detector; the defaults are of the CubeStar class.
+
+    A 12 mm f/1.2 lens of 14.6 mm focal length puts 42° on 937 pixels of 12 µm. A star of V = 0 and solar colour
+    sends 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8 photons/s/m²/nm (Bessell
+    1979), and a G2 star's photon spectrum keeps 0.92 of that on average over the 500 nm. With 0.75 of the light
+    through the lens and 0.45 caught on the band's average that is 1.8e6 electrons/s, 1 400 in 0.2 s for V = 6.
+
+    Attributes
+    ----------
+    exposure_s : float
+        Exposure, seconds.
+    aperture_m : float
+        Diameter of the entrance pupil, metres.
+    transmission, quantum_efficiency : float
+        Shares of the photons that pass the lens and that free an electron, averages over the band.
+    zero_point_photons_s_m2 : float
+        Photons/s/m² in the band from a star of V = 0 and solar colour.
+    colour_term : float
+        The sensor's magnitude is V − colour_term·(B−V − 0.65); silicon sees red stars brighter (about 0.4).
+    psf_sigma_px : float
+        Standard deviation of the Gaussian spot at the centre of the image, pixels. At 0.8 the spot is sampled well
+        enough for a fit without pixel-phase error, and nearly as small as can be.
+    psf_growth : float
+        Share by which the spot is wider at the image's edge than at its centre: along x with the square of x,
+        along y with the square of y.
+    gain : float
+        Analog gain before the converter.
+    bits : int
+        8, 12 or 16.
+    adc_range_e : float
+        Electrons that fill the converter's range at gain 1.
+    offset_share : float
+        Black level as a share of the range.
+    full_well_e : float
+        Electrons that a pixel holds at most.
+    read_noise_e : float
+        Electrons, standard deviation.
+    dark_e_s : float
+        Mean dark current, electrons/s.
+    sky_mag_arcsec2 : float
+        Brightness of the empty sky (zodiacal light and unresolved stars), V magnitudes/arcsec².
+    dsnu, prnu : float
+        Spread from pixel to pixel of the dark current and of the sensitivity, as shares of their means.
+    hot_pixels, dead_pixels : int
+        How many pixels have much too large a dark current, and no signal at all.
+    hot_e_s : float
+        Median dark current of a hot pixel, electrons/s; they scatter by a factor 2.7 (log-normal).
+    pattern_seed : int
+        Chooses the fixed pattern: which pixels are hot or dead, and the two spreads.
+    limiting_magnitude : float
+        Faintest stars that are drawn, V; fainter companions within two pixels of one are drawn with it.
+
+    Raises
+    ------
+    EmulatorError
+        A value is not a number or is outside its range.
+    """
+
+    exposure_s: float = 0.2
+    aperture_m: float = 0.012
+    transmission: float = 0.75
+    quantum_efficiency: float = 0.45
+    zero_point_photons_s_m2: float = 4.6e10
+    colour_term: float = 0.0
+    psf_sigma_px: float = 0.8
+    psf_growth: float = 0.0
+    gain: float = 1.0
+    bits: int = 8
+    adc_range_e: float = 6400.0
+    offset_share: float = 0.03
+    full_well_e: float = 15000.0
+    read_noise_e: float = 12.0
+    dark_e_s: float = 30.0
+    sky_mag_arcsec2: float = 22.1
+    dsnu: float = 0.2
+    prnu: float = 0.01
+    hot_pixels: int = 30
+    hot_e_s: float = 10000.0
+    dead_pixels: int = 10
+    pattern_seed: int = 0
+    limiting_magnitude: float = 6.0
+
+    def __post_init__(self) -> None:
+        if self.bits not in _BITS or isinstance(self.bits, bool):
+            raise EmulatorError(f"sensor bits: {self.bits!r} given, 8, 12 or 16 needed")
+        for name, (low, high, unit) in _RANGES.items():
+            value = getattr(self, name)
+            whole = isinstance(low, int)
+            if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+                kind = "a whole number" if whole else "a number"
+                raise EmulatorError(f"sensor {name}: {value!r} given, {kind} needed ({unit})")
+            if not low <= value <= high:
+                raise EmulatorError(f"sensor {name}: {value!r} given, {low:g}…{high:g} needed ({unit})")
+
+    def with_(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed; an unknown name is refused."""
+        unknown = sorted(changes.keys() - {field.name for field in dataclasses.fields(self)})
+        if unknown:
+            raise EmulatorError(f"sensor {unknown[0]}: no such field of the sensor model")
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def zero_magnitude_e_s(self) -> float:
+        """Electrons/s from a star of V = 0 and solar colour."""
+        area = math.pi / 4.0 * self.aperture_m**2
+        return self.zero_point_photons_s_m2 * area * self.transmission * self.quantum_efficiency
+
+    def electrons(self, magnitude: float, exposure_s: float | None = None) -> float:
+        """Mean electrons from a star of a sensor magnitude in one exposure (the model's own unless given)."""
+        exposure = self.exposure_s if exposure_s is None else exposure_s
+        return self.zero_magnitude_e_s * exposure * math.pow(10.0, -0.4 * magnitude)
+
+    def sky_e_s(self, pixel_scale_rad: float) -> float:
+        """Electrons/s/pixel from the empty sky, for a pixel that sees `pixel_scale_rad` squared."""
+        arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
+        return self.zero_magnitude_e_s * arcsec2 * math.pow(10.0, -0.4 * self.sky_mag_arcsec2)
+
+    @property
+    def max_dn(self) -> int:
+        """Largest count of the converter."""
+        return int(2**self.bits - 1)
+
+    @property
+    def offset_dn(self) -> float:
+        """Black level, counts."""
+        return float(round(self.offset_share * self.max_dn))
+
+    @property
+    def gain_e_per_dn(self) -> float:
+        """Electrons a count."""
+        return self.adc_range_e / self.gain / self.max_dn
+
+    @property
+    def saturation_dn(self) -> int:
+        """Count from which a pixel is saturated, by the converter or by its full well."""
+        well = self.offset_dn + self.full_well_e / self.gain_e_per_dn
+        noise = self.read_noise_e / self.gain_e_per_dn
+        return self.max_dn if well > self.max_dn else max(int(well - 3.0 * noise), 1)
+
+    @property
+    def digitizer(self) -> Digitizer:
+        """What the noise kernel needs."""
+        return Digitizer(self.read_noise_e, self.full_well_e, self.gain_e_per_dn, self.offset_dn, self.max_dn)
+
+    def detection_settings(self, **changes: Any) -> DetectionSettings:
+        """Detection settings that know this sensor's gain, saturation and, where it is the same everywhere, spot."""
+        known = DetectionSettings(
+            psf_sigma_px=self.psf_sigma_px if self.psf_growth == 0.0 else None,
+            gain_e_per_dn=self.gain_e_per_dn,
+            saturation_dn=self.saturation_dn,
+        )
+        return dataclasses.replace(known, **changes)

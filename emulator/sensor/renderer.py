@@ -1,0 +1,401 @@
+"""Frames of the sky as the sensor sees them, with the truth of what is on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
+from starhil.emulator.sensor.noise import digitize
+from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
+from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
+from starhil.emulator.sky.light import AreaLight, AreaPainter, add_cosmic_rays, icrs_vector
+from starhil.emulator.sky.objects import PointSource, SkyObjects
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.catalog import StarCatalog, companions
+
+__all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
+
+_MOST_RATE_RAD_S: Final = 20.0
+_VISIBLE_SHARE: Final = 0.5
+_COMPANION_PX: Final = 2.0
+_OBJECT_STREAM: Final = 2
+_CONE_MARGIN_RAD: Final = math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class StarTruth:
+    """Catalogue stars on a frame, companions beyond the limiting magnitude among them, brightest first.
+
+    Attributes
+    ----------
+    hip : ndarray (n,), int32
+        Hipparcos numbers.
+    catalog_index : ndarray (n,), int64
+        Rows of the catalogue that the renderer was given.
+    xy_px : ndarray (n, 2)
+        Position at mid-exposure, pixels.
+    electrons : ndarray (n,)
+        Mean electrons of the star in the exposure.
+    magnitude : ndarray (n,)
+        V magnitude.
+    visible : ndarray (n,) of bool
+        False for stars that are hidden or left out.
+    """
+
+    hip: npt.NDArray[np.int32]
+    catalog_index: npt.NDArray[np.int64]
+    xy_px: npt.NDArray[np.float64]
+    electrons: npt.NDArray[np.float64]
+    magnitude: npt.NDArray[np.float64]
+    visible: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ObjectTruth:
+    """What else is on a frame.
+
+    Attributes
+    ----------
+    false_xy_px : ndarray (n, 2)
+        Places of the false stars, the fixed ones first.
+    planet_xy_px : ndarray (m, 2)
+        Places of the planets, in the order given; NaN for those outside the image.
+    cosmic_rays_px : ndarray (k, 4)
+        x, y of both ends of each streak.
+    covered_share : float
+        Share of the image on which less than half of the sky's light is seen.
+    """
+
+    false_xy_px: npt.NDArray[np.float64]
+    planet_xy_px: npt.NDArray[np.float64]
+    cosmic_rays_px: npt.NDArray[np.float64]
+    covered_share: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One exposure and its truth.
+
+    Attributes
+    ----------
+    image : ndarray (h, w), uint8 or uint16
+        Counts.
+    stars : StarTruth
+        The catalogue stars on it.
+    objects : ObjectTruth or None
+        What else is on it, where there is anything else.
+    attitude : Attitude
+        Attitude at mid-exposure.
+    rate_rad_s : tuple of 3 floats
+        Body rate during the exposure, sensor frame.
+    exposure_s : float
+        Length of the exposure, seconds.
+    seed, frame_index : int
+        What chose the noise.
+    """
+
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    stars: StarTruth
+    attitude: Attitude
+    rate_rad_s: tuple[float, float, float]
+    exposure_s: float
+    seed: int
+    frame_index: int
+    objects: ObjectTruth | None = None
+
+
+class Renderer:
+    """Makes frames for one camera, sky and sensor, and keeps what does not change between them.
+
+    The image depends on the arguments and on (seed, frame_index) alone, not on the frames made before.
+
+    Parameters
+    ----------
+    camera : Camera
+        Where directions fall on the pixels.
+    catalog : StarCatalog
+        The sky; stars fainter than the sensor's limiting magnitude are left out, but for the companions of brighter
+        ones that a sensor sees as one with them.
+    sensor : SensorModel
+        Optics and detector.
+    seed : int
+        Seed of a run, not negative.
+    objects : SkyObjects, optional
+        What else there is in all frames that are not told otherwise.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        catalog: StarCatalog,
+        sensor: SensorModel | None = None,
+        seed: int = 0,
+        objects: SkyObjects | None = None,
+    ) -> None:
+        self.camera = camera
+        self.catalog = catalog
+        self.sensor = SensorModel() if sensor is None else sensor
+        self.seed = _whole_number("seed", seed)
+        self.objects = objects
+        self._painter = AreaPainter(camera, self.sensor)
+        brightness = self.sensor_magnitudes()
+        limit = self.sensor.limiting_magnitude
+        near = companions(catalog, limit, _COMPANION_PX * camera.pixel_scale_rad)
+        rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
+        self._rows = rows[np.argsort(brightness[rows], kind="stable")]
+        self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
+        self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])
+        self._cos_cone = math.cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
+        self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
+        self._sky_e_s = np.float32(self.sensor.sky_e_s(camera.pixel_scale_rad))
+        self._still = np.empty((camera.height, camera.width), dtype=np.float32)
+        self._still_exposure_s = math.nan
+        self._work = np.empty_like(self._still)
+
+    def sensor_magnitudes(self) -> npt.NDArray[np.float64]:
+        """Magnitudes (n,) of all catalogue stars in the sensor's band."""
+        colour = np.nan_to_num(self.catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
+        return np.asarray(self.catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
+
+    def with_sensor(self, sensor: SensorModel) -> Renderer:
+        """Renderer of the same sky, camera and seed for another sensor (this one if nothing changes)."""
+        if sensor == self.sensor:
+            return self
+        return Renderer(self.camera, self.catalog, sensor, self.seed, self.objects)
+
+    def render(
+        self,
+        attitude: Attitude,
+        rate_rad_s: npt.ArrayLike = (0.0, 0.0, 0.0),
+        frame_index: int = 0,
+        *,
+        exposure_s: float | None = None,
+        objects: SkyObjects | None = None,
+    ) -> Frame:
+        """Make one frame.
+
+        Parameters
+        ----------
+        attitude : Attitude
+            Attitude at mid-exposure.
+        rate_rad_s : array (3,)
+            Body rate, sensor frame, rad/s; constant over the exposure.
+        frame_index : int
+            Number of the frame in the run; chooses the noise together with the seed.
+        exposure_s : float, optional
+            Other exposure than the sensor's.
+        objects : SkyObjects, optional
+            What else is there in this frame, instead of the renderer's own objects.
+
+        Raises
+        ------
+        EmulatorError
+            A rate, exposure or index that is not a number or out of range.
+        """
+        exposure = (
+            self.sensor.exposure_s
+            if exposure_s is None
+            else self.sensor.with_(exposure_s=exposure_s).exposure_s
+        )
+        rate = _rate(rate_rad_s)
+        index = _whole_number("frame_index", frame_index)
+        others = self.objects if objects is None else objects
+        mean = self._mean_without_stars(exposure)
+        path, chosen, inside = self._paths(attitude, rate, exposure)
+        electrons = self._flux_e_s[chosen] * exposure
+        drawn = electrons
+        object_truth = None
+        if others is not None:
+            drawn = electrons.copy()
+            drawn[np.flatnonzero(inside)[: others.missing_stars]] = 0.0
+            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, path, drawn)
+        self._add_light(mean, path, drawn)
+        image = digitize(mean, self.sensor.digitizer, self.seed, index)
+        rows = self._rows[chosen[inside]]
+        stars = StarTruth(
+            self.catalog.hip[rows],
+            rows.astype(np.int64),
+            path[inside, :2].copy(),
+            electrons[inside],
+            self.catalog.v[rows].astype(np.float64),
+            drawn[inside] > _VISIBLE_SHARE * electrons[inside],
+        )
+        rates = (float(rate[0]), float(rate[1]), float(rate[2]))
+        return Frame(image, stars, attitude, rates, exposure, self.seed, index, object_truth)
+
+    def _add_objects(
+        self,
+        mean: npt.NDArray[np.float32],
+        objects: SkyObjects,
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        index: int,
+        path: npt.NDArray[np.float64],
+        electrons: npt.NDArray[np.float64],
+    ) -> ObjectTruth:
+        """Add all that is no star, and dim the stars (in place) that lie behind it."""
+        rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
+        covered = 0.0
+        area: AreaLight | None = None
+        if objects.any_light_or_cover:
+            area = self._painter.paint(objects, attitude)
+            light = area.electrons_s + (area.transmission - np.float32(1.0)) * self._sky_e_s
+            light *= self._pattern.sensitivity * np.float32(exposure_s)
+            mean += light
+            np.maximum(mean, 0.0, out=mean)
+            electrons *= area.seen_at(path[:, :2])
+            covered = float(np.mean(area.transmission < 0.5))
+        planet_xy = self._add_planets(mean, objects.planets, attitude, rate, exposure_s, area)
+        false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
+        streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
+        return ObjectTruth(false_xy, planet_xy, streaks, covered)
+
+    def _add_planets(
+        self,
+        mean: npt.NDArray[np.float32],
+        planets: tuple[PointSource, ...],
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        area: AreaLight | None,
+    ) -> npt.NDArray[np.float64]:
+        """Add points of light at fixed directions; return where (n, 2) they fall."""
+        places = np.full((len(planets), 2), np.nan)
+        if not planets:
+            return places
+        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
+        path, inside, touching = self._path_of(vectors, attitude, rate, exposure_s)
+        places[inside] = path[inside, :2]
+        electrons = np.array([self.sensor.electrons(planet.magnitude, exposure_s) for planet in planets])
+        path, electrons = path[touching], electrons[touching]
+        self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))
+        return places
+
+    def _add_false_stars(
+        self,
+        mean: npt.NDArray[np.float32],
+        objects: SkyObjects,
+        rng: np.random.Generator,
+        exposure_s: float,
+    ) -> npt.NDArray[np.float64]:
+        """Add points of light at random places of the image; return where (n, 2)."""
+        fixed = np.random.default_rng((self.seed, _OBJECT_STREAM))
+        size = np.array([self.camera.width, self.camera.height])
+        low, high = objects.false_star_magnitudes
+        numbers = ((objects.fixed_false_stars, fixed), (objects.false_stars, rng))
+        places = np.concatenate([source.uniform(-0.5, size - 0.5, (count, 2)) for count, source in numbers])
+        magnitudes = np.concatenate([source.uniform(low, high, count) for count, source in numbers])
+        path = np.zeros((len(places), 6))
+        path[:, :2] = places
+        self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * 10.0 ** (-0.4 * magnitudes))
+        return places
+
+    def trails(self, frame: Frame) -> npt.NDArray[np.float64]:
+        """Trails (n, 2) of a frame's stars during its exposure: from start to end along x and y, pixels."""
+        icrs = self.catalog.vectors[frame.stars.catalog_index]
+        half = 0.5 * frame.exposure_s * np.array(frame.rate_rad_s)
+        start, _ = self.camera.project(frame.attitude.rotated(-half).to_sensor(icrs))
+        end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
+        return end - start
+
+    def _mean_without_stars(self, exposure_s: float) -> npt.NDArray[np.float32]:
+        """Mean electrons (h, w) of sky and dark current, in the buffer that a frame is built in."""
+        if exposure_s != self._still_exposure_s:
+            np.multiply(self._pattern.sensitivity, self._sky_e_s, out=self._still)
+            self._still += self._pattern.dark_e_s
+            self._still *= np.float32(exposure_s)
+            self._still_exposure_s = exposure_s
+        np.copyto(self._work, self._still)
+        return self._work
+
+    def _paths(
+        self, attitude: Attitude, rate: npt.NDArray[np.float64], exposure_s: float
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+        """Paths (n, 6) of the stars whose light may reach the pixels, their numbers, and which centres are inside.
+
+        The path is the parabola through the projections at the start, middle and end of the exposure.
+        """
+        sweep = float(np.linalg.norm(rate)) * exposure_s
+        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
+        near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
+        path, inside, touching = self._path_of(self._vectors[near], attitude, rate, exposure_s)
+        return path[touching], near[touching], inside[touching]
+
+    def _path_of(
+        self,
+        icrs: npt.NDArray[np.float64],
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Paths (n, 6) of directions (n, 3), which of them have their middle inside, and which touch the pixels."""
+        middle, inside = self.camera.project(attitude.to_sensor(icrs))
+        path = np.zeros((len(icrs), 6))
+        path[:, :2] = middle
+        if np.any(rate):
+            half = 0.5 * exposure_s * rate
+            start, _ = self.camera.project(attitude.rotated(-half).to_sensor(icrs))
+            end, _ = self.camera.project(attitude.rotated(half).to_sensor(icrs))
+            path[:, 2:4] = 0.5 * (end - start)
+            path[:, 4:6] = 0.5 * (end + start) - middle
+        reach = 1.0 + MAX_RADIUS_SIGMA * self.sensor.psf_sigma_px * (1.0 + 2.0 * self.sensor.psf_growth)
+        span = np.abs(path[:, 2:4]) + np.abs(path[:, 4:6]) + reach
+        size = np.array([self.camera.width, self.camera.height])
+        touching = np.all((middle > -span) & (middle < size + span), axis=1)
+        touching &= np.all(np.isfinite(path), axis=1)
+        return path, inside & touching, touching
+
+    def _add_light(
+        self,
+        mean: npt.NDArray[np.float32],
+        path: npt.NDArray[np.float64],
+        electrons: npt.NDArray[np.float64],
+    ) -> None:
+        """Add stars to the mean electrons, each with the spot of its place in the field."""
+        base = self.sensor.psf_sigma_px
+        half = 0.5 * np.array([self.camera.width, self.camera.height])
+        off_axis = (path[:, :2] + 0.5 - half) / half
+        sigma = base * (1.0 + self.sensor.psf_growth * off_axis**2)
+        longest = 2.0 * float(np.max(np.hypot(path[:, 2], path[:, 3]), initial=0.0))
+        nodes, weights = path_rule(longest, base)
+        add_spots(mean, self._pattern.sensitivity, path, electrons, sigma, nodes, weights)
+
+
+def render(
+    camera: Camera,
+    catalog: StarCatalog,
+    attitude: Attitude,
+    sensor: SensorModel | None = None,
+    *,
+    rate_rad_s: npt.ArrayLike = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    frame_index: int = 0,
+    objects: SkyObjects | None = None,
+) -> Frame:
+    """Make a single frame; for several in a row keep a `Renderer`, whose caches this makes anew."""
+    return Renderer(camera, catalog, sensor, seed, objects).render(attitude, rate_rad_s, frame_index)
+
+
+def _whole_number(name: str, value: int) -> int:
+    """Check a seed or an index."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**63:
+        raise EmulatorError(f"{name}: {value!r} given, a whole number from 0 needed")
+    return int(value)
+
+
+def _rate(value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Check a body rate."""
+    rate = np.asarray(value, dtype=np.float64)
+    if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MOST_RATE_RAD_S:
+        raise EmulatorError(
+            f"body rate: {value!r} given, three numbers of at most {_MOST_RATE_RAD_S} rad/s needed"
+        )
+    return rate

@@ -1,0 +1,205 @@
+"""Identification for a camera of which little more than a rough field of view is known.
+
+The search is given several chances, from cheap to dear: all detections, or an even choice of the brightest of
+each part of the image, so that a tree line, lettering or a nebula full of false detections has no more say than
+its share of the area; a lens without distortion, or with barrel or pincushion distortion; few or many triangles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+from starid.errors import StaridError
+from starid.geometric.identifier import Effort, Identifier, scaled_camera
+from starid.solution import Reason, Solution
+from starid.photograph.typical_camera import typical_camera
+
+DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
+"""Relative displacements at the corner of the image, of lenses that are tried."""
+
+TRIANGLES: Final = (100, 100, 1000, 5000)
+"""Triangles looked up in each round; the first one has narrow windows, and it and the last one no distortions."""
+
+ALL_ROUNDS: Final = range(len(TRIANGLES))
+
+SIZE_PX: Final = 1000.0
+"""Side of a square image that the windows are given for; they grow with the image."""
+
+CELLS: Final = 60
+"""Parts of the image for an even choice of detections, about."""
+
+NARROWEST_DEG: Final = 1.0
+"""Narrowest field: a square one of this width has three stars of Hipparcos on average."""
+
+MOST_AT_ONCE: Final = 500
+"""Brightest detections that take part."""
+
+WINDOW_PX: Final = 20.0
+"""Widest first matching window."""
+
+MAX_FALSE: Final = 1e-7
+"""Bound on the probability of a false answer of each single chance: there are several dozens of them."""
+
+_STRICT: Final = Effort(max_false_probability=MAX_FALSE)
+_LENIENT: Final = Effort(
+    tolerance_px=6.0,
+    window_px=WINDOW_PX,
+    test_window_px=16.0,
+    magnitude_gate=2.5,
+    max_false_probability=MAX_FALSE,
+)
+
+
+class _Chance(NamedTuple):
+    """One try: detections (rows), distortion and effort."""
+
+    rows: NDArray[np.intp]
+    distortion: float
+    effort: Effort
+
+
+class RoughSearch:
+    """Lost in space for a camera with a rough field of view and an unknown lens.
+
+    Parameters
+    ----------
+    camera : Camera
+        Size, model, rough focal length; where it has a distortion, no other is tried.
+    catalog : StarCatalog
+        The stars.
+    fov_tolerance : float
+        Relative uncertainty of the focal length.
+
+    Raises
+    ------
+    StaridError
+        The field is so narrow that it has too few stars of the catalogue.
+    """
+
+    def __init__(self, camera: Camera, catalog: StarCatalog, *, fov_tolerance: float) -> None:
+        if camera.fov_deg < NARROWEST_DEG:
+            raise StaridError(
+                f"camera fov_deg: {camera.fov_deg:g} given, at least {NARROWEST_DEG:g} needed: a narrower field has too few stars"
+            )
+        self._tolerance = fov_tolerance
+        self._scale = max(math.sqrt(camera.width * camera.height) / SIZE_PX, 0.75)
+        self._first = Identifier(
+            camera,
+            catalog,
+            fov_tolerance=fov_tolerance,
+            effort=self._scaled(_LENIENT),
+            index_camera=typical_camera(camera),
+        )
+
+    @property
+    def identifier(self) -> Identifier:
+        """Identifier for the camera as it was given, with the index that the search uses."""
+        return self._first
+
+    def identify(self, xy_px: ArrayLike, flux: ArrayLike, *, rounds: Sequence[int] = ALL_ROUNDS) -> Solution:
+        """Attitude and camera; invalid, with the reason, where no chance came true.
+
+        Parameters
+        ----------
+        xy_px, flux
+            As `Identifier.identify` takes them.
+        rounds : sequence of int
+            Which of `TRIANGLES` to go through.
+        """
+        begin = time.perf_counter()
+        xy, brightness = (
+            np.asarray(xy_px, dtype=np.float64).reshape(-1, 2),
+            np.asarray(flux, dtype=np.float64),
+        )
+        solution = Solution.invalid(Reason.NO_MATCH)
+        plain = self._first.camera
+        straight: dict[float, NDArray[np.float64]] = {0.0: xy}
+        for chance in self._chances(xy, brightness, rounds):
+            lens = distorted(plain, chance.distortion)
+            if chance.distortion not in straight:
+                straight[chance.distortion] = plain.project(lens.back_project(xy))[0]
+            places = straight[chance.distortion]
+            rows = chance.rows[np.isfinite(places[chance.rows, 0])]
+            search = self._first.with_camera(plain, fov_tolerance=self._tolerance, effort=chance.effort)
+            solution = search.identify(places[rows], brightness[rows])
+            if solution.valid:
+                found = solution.camera or plain
+                solution = dataclasses.replace(
+                    solution,
+                    detection_index=rows[solution.detection_index].astype(np.int64),
+                    camera=scaled_camera(lens, found.focal_px[0] / plain.focal_px[0]),
+                )
+            if solution.valid or solution.reason is Reason.TOO_FEW_STARS:
+                break
+        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+
+    def _chances(
+        self, xy: NDArray[np.float64], flux: NDArray[np.float64], rounds: Sequence[int]
+    ) -> Iterator[_Chance]:
+        """All tries, the cheap ones first."""
+        brightest = np.argsort(-flux, kind="stable")
+        choices = [brightest[:MOST_AT_ONCE]]
+        choices += [even_choice(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
+        known_lens = any(self._first.camera.distortion)
+        for number in rounds:
+            plain = known_lens or number in (ALL_ROUNDS[0], ALL_ROUNDS[-1])
+            windows = _STRICT if number == ALL_ROUNDS[0] else _LENIENT
+            effort = self._scaled(dataclasses.replace(windows, max_triangles=TRIANGLES[number]))
+            for rows in choices:
+                for distortion in DISTORTIONS[:1] if plain else DISTORTIONS:
+                    yield _Chance(rows, distortion, effort)
+
+    def _scaled(self, effort: Effort) -> Effort:
+        """Effort with its windows grown to the size of the image."""
+        return dataclasses.replace(
+            effort,
+            tolerance_px=effort.tolerance_px * self._scale,
+            window_px=effort.window_px * self._scale,
+            test_window_px=effort.test_window_px * self._scale,
+        )
+
+
+def even_choice(
+    xy: NDArray[np.float64], brightest: NDArray[np.intp], camera: Camera, depth: int
+) -> NDArray[np.intp]:
+    """Rows of the `depth` brightest detections of each part of the image.
+
+    Parameters
+    ----------
+    xy : ndarray (n, 2)
+        Positions, pixels.
+    brightest : ndarray (n,)
+        Rows by falling flux.
+    camera : Camera
+        Gives the size of the image.
+    depth : int
+        Detections of each part.
+    """
+    side = math.sqrt(camera.width * camera.height / CELLS)
+    columns = math.ceil(camera.width / side)
+    cell = (xy[:, 0] // side).astype(np.int64) + columns * (xy[:, 1] // side).astype(np.int64)
+    ordered = cell[brightest]
+    by_cell = np.argsort(ordered, kind="stable")
+    grouped = ordered[by_cell]
+    first = np.searchsorted(grouped, grouped, side="left")
+    rank = np.empty(len(ordered), dtype=np.int64)
+    rank[by_cell] = np.arange(len(ordered)) - first
+    return brightest[rank < depth]
+
+
+def distorted(camera: Camera, displacement: float) -> Camera:
+    """Camera as wide as another, whose lens moves the image's corner by a share of its distance from the centre."""
+    if displacement == 0.0:
+        return camera
+    corner = 0.5 * math.hypot(camera.width, camera.height) / camera.focal_px[0]
+    distortion = (displacement / corner**2,)
+    return Camera.from_fov(camera.fov_deg, camera.width, camera.height, camera.model, distortion)

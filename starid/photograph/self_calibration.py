@@ -1,0 +1,316 @@
+"""Calibration without a laboratory: from the stars of several frames and a rough field of view.
+
+Each frame is identified with the start camera, whose lens may be off by the tolerance; the matches
+calibrate the camera; with it all catalogue stars in the field are matched again, which brings in the corners
+that the start camera had missed; and so on until nothing changes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starid.attitude import Attitude
+from starid.calibration import (
+    DEFAULT_ESTIMATE,
+    GROUPS,
+    Calibration,
+    CalibrationFrame,
+    calibrate,
+    check_estimate,
+)
+from starid.camera import Camera
+from starid.catalog import StarCatalog, blend, load_catalog
+from starid.errors import StaridError
+from starid.photograph.rough_search import RoughSearch
+from starid.solution import Solution
+
+Array = NDArray[np.float64]
+
+MODELS: Final[tuple[tuple[str, ...], ...]] = (
+    ("focal",),
+    ("focal", "k1"),
+    ("focal", "centre", "k1"),
+    ("focal", "centre", "k1", "k2"),
+    DEFAULT_ESTIMATE,
+    ("aspect", *DEFAULT_ESTIMATE[1:]),
+)
+"""Sets of free parameters from which "auto" takes the one that the frames justify."""
+
+IMAGE_MODELS: Final[tuple[tuple[str, ...], ...]] = (("focal",), ("focal", "k1"), ("focal", "k1", "k2"))
+"""What one image of an unknown camera may tell: in a narrow field the optical axis cannot be told from the
+attitude, and stays at the image's centre."""
+
+_ROUNDS: Final = 4
+_WINDOW_SIGMAS: Final = 5.0
+_LEAST_WINDOW_PX: Final = 1.0
+_SIGMA_FLOOR_PX: Final = 0.02
+_FAINTER: Final = 0.3
+_BLEND_PX: Final = 2.0
+
+
+class Stars(NamedTuple):
+    """Detections of one frame: positions (n, 2) px, fluxes (n,), errors (n,) or (n, 2) px or None."""
+
+    xy_px: Array
+    flux: Array
+    xy_sigma_px: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """Outcome: the calibration, and which frames it rests on.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        Camera, covariance and residuals.
+    frame_index : tuple of int
+        Frames given that were identified and used, in the order of `calibration.attitudes`.
+    matches : tuple of ndarray (m, 2), int64
+        Detection index and HIP of every pair that the calibration was given, for each of these frames.
+    refused : dict of int to str
+        Frames that could not be identified, and why.
+    """
+
+    calibration: Calibration
+    frame_index: tuple[int, ...]
+    matches: tuple[NDArray[np.int64], ...]
+    refused: dict[int, str]
+
+
+def self_calibrate(
+    frames: Sequence[Stars],
+    camera: Camera,
+    catalog: StarCatalog | None = None,
+    *,
+    fov_tolerance: float = 0.1,
+    estimate: Sequence[str] | None = None,
+    models: Sequence[tuple[str, ...]] = MODELS,
+) -> SelfCalibration:
+    """Identify frames and estimate the camera that took them.
+
+    Parameters
+    ----------
+    frames : sequence of Stars
+        Detections of each frame.
+    camera : Camera
+        Start value: size, model and rough focal length.
+    catalog : StarCatalog, optional
+        By default the whole of Hipparcos at its default epoch.
+    fov_tolerance : float
+        Relative uncertainty of the start camera's focal length.
+    estimate : sequence of str, optional
+        What is free (see `starid.calibration.GROUPS`); by default the set of `models` with the least
+        Bayesian information criterion.
+    models : sequence of tuple of str
+        Sets to choose from when `estimate` is not given.
+
+    Raises
+    ------
+    StaridError
+        No frame could be identified, or what `calibrate` refuses.
+    """
+    if not frames:
+        raise StaridError("calibration: no frames given; at least one image with stars needed")
+    if estimate is not None:
+        check_estimate(estimate)
+    sky = load_catalog() if catalog is None else catalog
+    search = RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
+    solutions: dict[int, Solution] = {}
+    refused: dict[int, str] = {}
+    for index, stars in enumerate(frames):
+        solution = search.identify(stars.xy_px, stars.flux)
+        if solution.valid:
+            solutions[index] = solution
+        else:
+            refused[index] = solution.reason.value
+    if not solutions:
+        reasons = ", ".join(sorted(set(refused.values())))
+        raise StaridError(
+            f"calibration: none of {len(frames)} frames could be identified ({reasons}); "
+            "check the field of view, or take frames with more stars"
+        )
+    result = calibrate_identified(frames, solutions, camera, sky, estimate=estimate, models=models)
+    return dataclasses.replace(result, refused=refused)
+
+
+def calibrate_identified(
+    frames: Sequence[Stars],
+    solutions: Mapping[int, Solution],
+    camera: Camera,
+    sky: StarCatalog,
+    *,
+    estimate: Sequence[str] | None = None,
+    models: Sequence[tuple[str, ...]] = MODELS,
+) -> SelfCalibration:
+    """Estimate the camera that took frames of which some are identified.
+
+    Parameters
+    ----------
+    frames : sequence of Stars
+        Detections of each frame.
+    solutions : mapping of int to Solution
+        Valid solutions by frame, at least one; the first one's camera, if it has one, is where the
+        adjustment starts.
+    camera : Camera
+        The camera that the frames were identified with.
+    sky : StarCatalog
+        What the solutions' `catalog_index` counts in.
+    estimate, models
+        As in `self_calibrate`.
+
+    Raises
+    ------
+    StaridError
+        What `calibrate` refuses.
+    """
+    indices = tuple(solutions)
+    matched: list[CalibrationFrame] = []
+    faintest = -np.inf
+    for index, solution in solutions.items():
+        stars, rows = frames[index], solution.catalog_index
+        faintest = max(faintest, float(sky.v[rows].max()))
+        matched.append(
+            _frame(
+                stars,
+                _floored_sigma(stars),
+                solution.detection_index,
+                sky.vectors[rows],
+                solution.attitude,
+            )
+        )
+    start = solutions[indices[0]].camera or camera
+    seen = blend(sky.brighter_than(faintest + _FAINTER), _BLEND_PX * camera.pixel_scale_rad)
+    _, result = next(_calibrations(matched, start, (_enough(matched, ("focal", "k1")), ("focal",))))
+    matches: tuple[NDArray[np.int64], ...] = ()
+    for _ in range(_ROUNDS):
+        pairs = [
+            _paired(frames[index], result.camera, attitude, seen, result.sigma_px)
+            for index, attitude in zip(indices, result.attitudes, strict=True)
+        ]
+        again = [
+            _frame(frames[index], _floored_sigma(frames[index]), chosen, seen.vectors[rows], attitude)
+            for index, attitude, (chosen, rows) in zip(indices, result.attitudes, pairs, strict=True)
+        ]
+        matches = tuple(np.stack([chosen, seen.hip[rows]], axis=1) for chosen, rows in pairs)
+        before = result
+        start = dataclasses.replace(camera, focal_px=result.camera.focal_px)
+        result = _best(again, start, models) if estimate is None else calibrate(again, start, estimate)
+        if _same(before, result):
+            break
+    return SelfCalibration(result, indices, matches, {})
+
+
+def _floored_sigma(stars: Stars) -> Array | None:
+    """Errors of the positions as given, with a floor for what no detector knows of itself."""
+    if stars.xy_sigma_px is None:
+        return None
+    floored: Array = np.hypot(stars.xy_sigma_px, _SIGMA_FLOOR_PX)
+    return floored
+
+
+def _frame(
+    stars: Stars, sigma: Array | None, chosen: NDArray[np.int64], reference: Array, attitude: Attitude
+) -> CalibrationFrame:
+    return CalibrationFrame(
+        xy_px=np.asarray(stars.xy_px)[chosen],
+        reference=reference,
+        sigma_px=None if sigma is None else sigma[chosen],
+        attitude=attitude,
+    )
+
+
+def _paired(
+    stars: Stars, camera: Camera, attitude: Attitude, sky: StarCatalog, sigma_px: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pair detections and catalogue stars that are each other's nearest, within a window: indices of both (m,)."""
+    near = sky.in_cone(attitude.boresight, camera.field_radius_rad * 1.02)
+    xy, inside = camera.project(attitude.to_sensor(sky.vectors[near]))
+    near, xy = near[inside], xy[inside]
+    measured = np.asarray(stars.xy_px, dtype=np.float64)
+    window = max(_WINDOW_SIGMAS * sigma_px, _LEAST_WINDOW_PX)
+    distance, of_catalog = cKDTree(xy).query(measured, distance_upper_bound=window)
+    _, of_detection = cKDTree(measured).query(xy)
+    chosen = np.flatnonzero(np.isfinite(distance))
+    chosen = chosen[of_detection[of_catalog[chosen]] == chosen]
+    return chosen, near[of_catalog[chosen]]
+
+
+def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:
+    """Count the unknowns: camera parameters and three angles a frame."""
+    return sum(len(GROUPS[name]) for name in model) - ("focal" in model) + 3 * len(frames)
+
+
+def _enough(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the model, or the focal length alone where there are too few stars for it."""
+    equations = 2 * sum(len(frame.xy_px) for frame in frames)
+    return model if equations > 2 * _unknowns(model, frames) else ("focal",)
+
+
+def _best(
+    frames: list[CalibrationFrame], camera: Camera, candidates: Sequence[tuple[str, ...]]
+) -> Calibration:
+    """Calibrate with each model and keep that with the least Bayesian information criterion.
+
+    Models that `calibrate` refuses are passed over; its refusal of the last is raised only if none is left.
+    """
+    models = [model for model in candidates if _enough(frames, model) == model] or [("focal",)]
+    tried = list(_calibrations(frames, camera, models))
+    equations = 2 * sum(len(frame.xy_px) for frame in frames)
+    variance = _variance_factor(tried[-1][1], frames)
+    costs = [
+        _misfit(result, frames, variance) + _unknowns(model, frames) * np.log(equations)
+        for model, result in tried
+    ]
+    return tried[int(np.argmin(costs))][1]
+
+
+def _calibrations(
+    frames: Sequence[CalibrationFrame], camera: Camera, models: Sequence[tuple[str, ...]]
+) -> Iterator[tuple[tuple[str, ...], Calibration]]:
+    """Calibrate with one model after the other, and give those that hold; at least one, or the last refusal."""
+    refusal: StaridError | None = None
+    held = 0
+    for model in models:
+        try:
+            result = calibrate(frames, camera, model)
+        except StaridError as error:
+            refusal = error
+            continue
+        held += 1
+        yield model, result
+    if refusal is not None and held == 0:
+        raise refusal
+
+
+def _variance_factor(result: Calibration, frames: Sequence[CalibrationFrame]) -> float:
+    """Mean square of the residuals of the used stars on one axis, in units of the stars' variances."""
+    weights = [
+        frame.axis_sigmas[used].ravel() ** -2.0 for frame, used in zip(frames, result.used, strict=True)
+    ]
+    return result.sigma_px**2 * float(np.concatenate(weights).mean())
+
+
+def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], variance: float) -> float:
+    """Sum of squared residuals in units of `variance` times the stars' own variances, each star's share bounded."""
+    total = 0.0
+    for residual, frame in zip(result.residual_px, frames, strict=True):
+        squares = ((residual / frame.axis_sigmas) ** 2).sum(axis=1) / variance
+        total += float(np.minimum(squares, _WINDOW_SIGMAS**2).sum())
+    return total
+
+
+def _same(first: Calibration, second: Calibration) -> bool:
+    """Tell whether two calibrations map the image alike to a thousandth of a pixel."""
+    if first.estimated != second.estimated:
+        return False
+    grid = second.camera.border(9)
+    moved = first.camera.project(second.camera.back_project(grid))[0] - grid
+    return bool(np.nanmax(np.abs(moved)) < 1e-3)

@@ -1,0 +1,239 @@
+"""How the features vary over the sky: maps 2.3–2.8 and variation plots 2.9–2.12."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.thesis.experiments.experiment import (
+    Context,
+    Experiment,
+    Outcome,
+    Parameters,
+    Part,
+    Results,
+    Row,
+    planar_sky,
+    row,
+    write_csv,
+)
+from starid.thesis.experiments.plots import colours, figure, save
+
+FRAME_DEG: Final = 42.0
+"""Frame width of these figures: their zones, δ −6° … 36° and α 0° … 42°, are 42° wide."""
+
+NO_LIMIT: Final = -99.0
+"""A brightness limit that keeps every star."""
+
+_COLUMNS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
+_FIGURES: Final = {"n": "2_3", "A": "2_4", "r": "2_5", "theta": "2_6", "sigma_A": "2_7", "sigma_r": "2_8"}
+_LABELS: Final = {
+    "n": "number of stars n",
+    "A": "brightness mean A / mag",
+    "r": "polar radius r / °",
+    "sigma_A": "brightness deviation σ_A / mag",
+    "sigma_r": "polar radius deviation σ_r / °",
+    "theta": "polar angle θ / °",
+}
+_PANELS: Final = ("n", "A", "r", "theta", "sigma_A", "sigma_r")
+
+_NOTE: Final = """No brightness limit, frames 42° wide in the flat (α, δ) plane, as the thesis draws them; every star of the
+catalogue takes part. The thesis prints no numbers with these figures; the values it names in the text are compared.
+As a frame near δ = ±90° reaches beyond the pole, where the flat plane ends, half of it is empty there: that alone
+makes r grow and n fall at the upper and lower rims of the maps."""
+
+
+def _features(centres: NDArray[np.float64], kappa: float) -> NDArray[np.float64]:
+    """Features and θ (degrees) of frames, (n, 6); NaN for a frame without a star."""
+    from starid.thesis.frame_sky import cell_features
+
+    sky = planar_sky(kappa, "faintest", FRAME_DEG)
+    table = np.full((len(centres), 6), np.nan)
+    sums, out = np.empty(8), np.empty(5)
+    for i, (ra, dec) in enumerate(centres):
+        angle = cell_features(sky.stars, sky.bin_start, sky.frame, ra % 360.0, dec, sums, out)
+        if out[0] >= 1.0:
+            table[i, :5] = out
+            table[i, 5] = np.degrees(angle)
+    return table
+
+
+def _parts(parameters: Parameters) -> list[Part]:
+    lines = [
+        Part(f"{axis}-p{percent:g}", {"axis": axis, "percent": percent, "kappa": NO_LIMIT})
+        for axis in ("ra", "dec")
+        for percent in parameters["percent"]
+    ]
+    limits = [
+        Part(f"{axis}-kappa{kappa:g}", {"axis": axis, "percent": 90.0, "kappa": kappa})
+        for axis in ("ra", "dec")
+        for kappa in parameters["kappa"]
+    ]
+    return [
+        Part("map", {"axis": "map", "percent": parameters["map_percent"], "kappa": NO_LIMIT}),
+        *lines,
+        *limits,
+    ]
+
+
+def _work(context: Context, part: Part) -> Results:
+    del context
+    step = FRAME_DEG * (1.0 - part.values["percent"] / 100.0)
+    ra = np.arange(0.0, 360.0, step)
+    dec = -90.0 + step * np.arange(round(180.0 / step) + 1)
+    dec = dec[dec <= 90.0 + 1e-9]
+    if part.values["axis"] == "map":
+        places = np.stack(np.meshgrid(ra, dec), axis=-1)
+    elif part.values["axis"] == "ra":
+        places = np.stack([ra, np.full_like(ra, -6.0 + 0.5 * FRAME_DEG)], axis=-1)
+    else:
+        places = np.stack([np.full_like(dec, 0.5 * FRAME_DEG), dec], axis=-1)
+    table = _features(places.reshape(-1, 2), part.values["kappa"])
+    return {"ra": ra, "dec": dec, "places": places.reshape(-1, 2), "features": table}
+
+
+def _maps(context: Context, result: Results) -> list[str]:
+    files = []
+    shape = (result["dec"].size, result["ra"].size)
+    for i, name in enumerate(_COLUMNS):
+        fig, axis = figure(width=7.0, height=3.6)
+        options: dict[str, Any] = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}
+        values = result["features"][:, i].reshape(shape)
+        image = axis.pcolormesh(result["ra"], result["dec"], values, shading="nearest", **options)
+        fig.colorbar(image, ax=axis, label=_LABELS[name])
+        axis.grid(visible=False)
+        axis.set(xlabel="α of the centre / °", ylabel="δ of the centre / °", xlim=(0, 360), ylim=(-90, 90))
+        axis.set_xticks(range(0, 361, 60))
+        axis.set_yticks(range(-90, 91, 30))
+        files.append(save(fig, context.folder / f"figure_{_FIGURES[name]}.png"))
+    columns = {"ra_deg": result["places"][:, 0], "dec_deg": result["places"][:, 1]}
+    columns.update({name: result["features"][:, i] for i, name in enumerate(_COLUMNS)})
+    write_csv(context.folder / "feature_maps.csv", columns)
+    return [*files, "feature_maps.csv"]
+
+
+def _variation(
+    context: Context, results: Mapping[str, Results], number: int, axis: str, keys: dict[str, str]
+) -> list[str]:
+    fig, axes = figure(6, 1, width=7.5, height=9.5, sharex=True)
+    columns: dict[str, list[Any]] = {"curve": [], "ra_deg": [], "dec_deg": []} | {n: [] for n in _COLUMNS}
+    for (key, label), colour in zip(keys.items(), colours(len(keys)), strict=True):
+        result = results[key]
+        where = result["places"][:, 0 if axis == "ra" else 1]
+        for panel, name in zip(axes, _PANELS, strict=True):
+            panel.plot(where, result["features"][:, _COLUMNS.index(name)], color=colour, label=label)
+        columns["curve"] += [label] * len(where)
+        columns["ra_deg"] += list(result["places"][:, 0])
+        columns["dec_deg"] += list(result["places"][:, 1])
+        for i, name in enumerate(_COLUMNS):
+            columns[name] += list(result["features"][:, i])
+    for panel, name in zip(axes, _PANELS, strict=True):
+        panel.set_ylabel(
+            _LABELS[name]
+            .replace("brightness deviation ", "")
+            .replace("polar radius deviation ", "")
+            .replace("brightness mean ", "")
+            .replace("number of stars ", "")
+            .replace("polar radius ", "")
+            .replace("polar angle ", "")
+        )
+    axes[-1].set_xlabel("α of the centre / °" if axis == "ra" else "δ of the centre / °")
+    axes[-1].set_xlim((0, 360) if axis == "ra" else (-90, 90))
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(keys))
+    name = f"figure_2_{number}"
+    write_csv(context.folder / f"{name}.csv", columns)
+    return [save(fig, context.folder / f"{name}.png"), f"{name}.csv"]
+
+
+def _rows(whole: Results) -> list[Row]:
+    table, dec = whole["features"], whole["places"][:, 1]
+    n, brightness, radius = table[:, 0], table[:, 1], table[:, 2]
+    inner = np.abs(dec) <= 90.0 - 0.5 * FRAME_DEG
+    south, north = n[inner & (dec < 0)].mean(), n[inner & (dec > 0)].mean()
+    return [
+        row(
+            "figure 2.3: most stars in a frame",
+            published="nearly 5000",
+            ours=float(n.max()),
+            digits=0,
+            passed=4000.0 <= n.max() <= 6000.0,
+            target="4000 … 6000",
+        ),
+        row(
+            "figure 2.3: fewest stars in a frame",
+            published="a few hundreds",
+            ours=float(n.min()),
+            digits=0,
+            remark="At the rims of the flat plane, where half the frame is empty.",
+        ),
+        row(
+            "figure 2.3: mean number of stars, southern over northern hemisphere (whole frames)",
+            published="> 1",
+            ours=float(south / north),
+            passed=bool(south > north),
+            target="> 1",
+        ),
+        row(
+            "figure 2.4: brightness mean A, range over the map",
+            published="within (8, 9) mag",
+            ours=f"{brightness.min():.2f} … {brightness.max():.2f} mag",
+            passed=bool(brightness.min() >= 7.95 and brightness.max() <= 9.05),
+            target="8 … 9 mag",
+        ),
+        row(
+            "figure 2.5: greatest polar radius r",
+            published="up to 10°",
+            ours=float(radius.max()),
+            unit="°",
+            remark="At the rims of the flat plane; which frames the thesis's map leaves out there cannot be told.",
+        ),
+        row(
+            "figure 2.5: greatest polar radius r of frames that lie whole within −90° … 90°",
+            ours=float(radius[inner].max()),
+            unit="°",
+            remark="What is left of it without the empty space beyond the poles.",
+        ),
+    ]
+
+
+def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+    percents, limits = context.parameters["percent"], context.parameters["kappa"]
+    files = _maps(context, results["map"])
+    for number, axis in ((9, "ra"), (10, "dec")):
+        keys = {f"{axis}-p{p:g}": f"p = {p:g} %" for p in percents}
+        files += _variation(context, results, number, axis, keys)
+    for number, axis in ((11, "ra"), (12, "dec")):
+        keys = {f"{axis}-kappa{k:g}": "no limit" if k == NO_LIMIT else f"κ = {k:g}" for k in limits}
+        files += _variation(context, results, number, axis, keys)
+    bright = results[f"ra-kappa{limits[-1]:g}"]["features"]
+    everything = results[f"ra-kappa{limits[0]:g}"]["features"]
+    falls = row(
+        f"figure 2.11: mean n and A without a limit, and with κ = {limits[-1]:g}",
+        published="n falls, A rises sharply",
+        ours=f"n {np.nanmean(everything[:, 0]):.0f} → {np.nanmean(bright[:, 0]):.0f}, A {np.nanmean(everything[:, 1]):.2f} → {np.nanmean(bright[:, 1]):.2f} mag",
+        passed=bool(np.nanmean(bright[:, 0]) < 0.5 * np.nanmean(everything[:, 0])),
+        target="n below half",
+    )
+    return Outcome((*_rows(results["map"]), falls), tuple(files), (_NOTE,))
+
+
+_FULL: Final = {
+    "map_percent": 90.0,
+    "percent": [60.0, 70.0, 80.0, 90.0, 95.0],
+    "kappa": [NO_LIMIT, 1.0, 3.0, 5.0, 7.0, 9.0],
+}
+
+EXPERIMENTS: Final = (
+    Experiment(
+        "feature-maps",
+        "Features over the sky: figures 2.3–2.12",
+        _parts,
+        _work,
+        _finish,
+        full=_FULL,
+        quick=_FULL,
+    ),
+)

@@ -1,0 +1,130 @@
+"""Does ε_ψ tell of a bad answer? Patterns 6.20–6.27 and B, and errors over thresholds of ε_ψ, 6.28–6.30 and C."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.thesis.experiments.experiment import Context, Results, Row, row, write_csv
+from starid.thesis.experiments.lsi_trials import OFF, ON
+from starid.thesis.experiments.plots import colours, figure, save
+
+_CASES: Final = {
+    "none": "no noise",
+    "both-1": "μ = 1",
+    "both-2": "μ = 2",
+    "both-3": "μ = 3",
+    "false-1": "1 false star",
+    "false-2": "2 false stars",
+    "false-3": "3 false stars",
+    "missing-1": "1 missing star",
+    "missing-2": "2 missing stars",
+    "missing-3": "3 missing stars",
+}
+_GROUPS: Final = (("both", "noise"), ("false", "false stars"), ("missing", "missing stars"))
+_TRIALS: Final = slice(559, 600)
+_LEAST: Final = 1e-6
+_STEP: Final = 0.01
+_GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
+
+
+def complete(results: Mapping[str, Results]) -> bool:
+    """Whether all cases are there, on and off the grid."""
+    return all(f"{case}-{grid}" in results for case in _CASES for grid in (ON, OFF))
+
+
+def _logarithm(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(1.0 + np.log10(np.maximum(errors, _LEAST)), dtype=np.float64)
+
+
+def _patterns(context: Context, results: Mapping[str, Results], grid: str) -> str:
+    fig, axes = figure(len(_CASES), 2, width=9.5, height=15.0, sharex=True)
+    for i, (case, words) in enumerate(_CASES.items()):
+        result = results[f"{case}-{grid}"]
+        trials = np.arange(_TRIALS.start + 1, _TRIALS.stop + 1)
+        for j, (name, symbol) in enumerate((("f_mse", "ε_f / °"), ("theta_mse", "ε_θ / °"))):
+            axes[i, j].plot(trials, _logarithm(result[name][_TRIALS]), "r-", label=symbol)
+            axes[i, j].plot(trials, _logarithm(result["psi_mse"][_TRIALS]), "b--", label="ε_ψ")
+            axes[i, j].set_title(words)
+            axes[i, j].set_ylabel("1 + log₁₀ ε")
+    for j in range(2):
+        axes[0, j].legend(loc="upper right")
+        axes[-1, j].set_xlabel("trial")
+    fig.suptitle(f"LSI (MSE), trials 560 to 600, frames {_GRID_WORDS[grid]}")
+    return save(fig, context.folder / f"figures_6_20_to_6_27_and_b_{grid}.png")
+
+
+def _below_thresholds(
+    errors: NDArray[np.float64], psi: NDArray[np.float64], thresholds: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and standard deviation of the errors whose ε_ψ is below each threshold; NaN where there are none."""
+    order = np.argsort(psi)
+    counts = np.searchsorted(psi[order], thresholds)
+    sums = np.concatenate([[0.0], np.cumsum(errors[order])])
+    squares = np.concatenate([[0.0], np.cumsum(errors[order] ** 2)])
+    with np.errstate(invalid="ignore"):
+        mean = np.where(counts > 0, sums[counts], np.nan) / np.maximum(counts, 1)
+        spread = np.sqrt(np.maximum(squares[counts] / np.maximum(counts, 1) - mean**2, 0.0))
+    return np.asarray(mean), np.asarray(spread)
+
+
+def _thresholds(context: Context, results: Mapping[str, Results], quantity: str) -> list[str]:
+    thresholds = np.arange(_STEP, 2.0 + 0.5 * _STEP, _STEP)
+    columns: dict[str, Any] = {"threshold_psi": thresholds}
+    symbol = "ε_f" if quantity == "f" else "ε_θ"
+    fig, axes = figure(3, 4, width=12.0, height=8.5, sharex=True)
+    for i, (group, words) in enumerate(_GROUPS):
+        keys = ["none", *(case for case in _CASES if case.startswith(group))]
+        for g, grid in enumerate((ON, OFF)):
+            for case, colour in zip(keys, ["black", *colours(3)], strict=True):
+                result = results[f"{case}-{grid}"]
+                pair = _below_thresholds(result[f"{quantity}_mse"], result["psi_mse"], thresholds)
+                for k, (values, name) in enumerate(zip(pair, ("mean", "deviation"), strict=True)):
+                    axis = axes[i, 2 * g + k]
+                    axis.plot(thresholds, values, color=colour, label=_CASES[case])
+                    axis.set_title(f"{words}, {_GRID_WORDS[grid]}")
+                    axis.set_ylabel(f"{name} of {symbol} / °")
+                    columns[f"{case}_{grid}_{name}_deg"] = values
+        axes[i, 0].legend()
+    for axis in axes[-1]:
+        axis.set_xlabel("threshold of ε_ψ")
+    name = "figures_6_28_to_6_30" if quantity == "f" else "figures_c"
+    write_csv(context.folder / f"{name}.csv", columns)
+    return [save(fig, context.folder / f"{name}.png"), f"{name}.csv"]
+
+
+def pattern_files(context: Context, results: Mapping[str, Results]) -> list[str]:
+    """Draw the patterns and the errors over thresholds; returns the names of the files."""
+    files = [_patterns(context, results, grid) for grid in (ON, OFF)]
+    for quantity in ("f", "theta"):
+        files += _thresholds(context, results, quantity)
+    return files
+
+
+def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
+    """How far ε_ψ and ε_f go together, and what a threshold on ε_ψ leaves."""
+    from scipy.stats import spearmanr
+
+    rows = []
+    for case in ("none", "both-1", "false-1", "missing-1"):
+        for grid in (ON, OFF):
+            result = results[f"{case}-{grid}"]
+            psi, errors = result["psi_mse"], result["f_mse"]
+            kept = errors[psi < 1.0]
+            rows.append(
+                row(
+                    f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {_GRID_WORDS[grid]}",
+                    published="positive",
+                    ours=float(spearmanr(psi, errors).statistic),
+                    remark=f"ε_ψ < 1 in {100.0 * kept.size / psi.size:.0f} % of the frames"
+                    + (
+                        f"; of these {100.0 * float(np.mean(kept > 1.0)):.1f} % are more than 1° off."
+                        if kept.size
+                        else "."
+                    ),
+                )
+            )
+    return rows

@@ -1,0 +1,90 @@
+"""Memory of a process that identifies with the largest database."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from starid.thesis.experiments.experiment import (
+    Context,
+    Experiment,
+    Outcome,
+    Parameters,
+    Part,
+    ReproduceError,
+    Results,
+    row,
+    write_csv,
+)
+
+_LIMIT_MB: Final = 400.0
+_PROBE: Final = "starid.thesis.experiments.memory_probe"
+
+_NOTE: Final = """Greatest resident size of a fresh process that maps the database's file, sorts its codes into the search tree, solves
+270 frames lost in space and follows a sequence of 100 with the recursive algorithm, the interpreter, its libraries and the mapped
+file included. The compiled code is there before: the process is run twice, and the second run counts."""
+
+
+def _parts(parameters: Parameters) -> list[Part]:
+    return [Part(f"p{percent:g}", {"percent": percent}) for percent in parameters["percent"]]
+
+
+def _work(context: Context, part: Part) -> Results:
+    overlap = part.values["percent"] / 100.0
+    context.database(overlap)
+    command = [sys.executable, "-m", _PROBE, str(context.database_file(overlap))]
+    figures: dict[str, Any] = {}
+    for _ in range(2):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+        if done.returncode != 0:
+            raise ReproduceError(f"reproduce: the memory probe failed: {done.stderr.strip()[-300:]}")
+        figures = json.loads(done.stdout)
+    return {name: np.asarray(value) for name, value in figures.items()}
+
+
+def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+    percents = context.parameters["percent"]
+    megabytes = {
+        percent: {name: float(value) / 1e6 for name, value in results[f"p{percent:g}"].items()}
+        for percent in percents
+    }
+    write_csv(
+        context.folder / "memory.csv",
+        {
+            "percent": percents,
+            "loaded_mb": [megabytes[p]["loaded"] for p in percents],
+            "peak_mb": [megabytes[p]["peak"] for p in percents],
+        },
+    )
+    rows = tuple(
+        row(
+            f"greatest memory of the process, database of {percent:g} %",
+            ours=megabytes[percent]["peak"],
+            unit="MB",
+            digits=0,
+            at_most=_LIMIT_MB,
+            remark=f"{megabytes[percent]['loaded']:.0f} MB when the database is loaded and its tree is made",
+        )
+        for percent in percents
+    )
+    return Outcome(rows, ("memory.csv",), (_NOTE,))
+
+
+EXPERIMENTS: Final = (
+    Experiment(
+        "memory",
+        "Memory of the process at run time",
+        _parts,
+        _work,
+        _finish,
+        full={"percent": [99.5, 99.75]},
+        quick=None,
+        alone=True,
+        revision=2,
+    ),
+)

@@ -1,0 +1,64 @@
+"""Which experiments there are."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Sequence
+from typing import Final
+
+from starid.thesis.experiments.experiment import Experiment, ReproduceError
+
+MODULES: Final[tuple[str, ...]] = (
+    "feature_maps",
+    "database_sizes",
+    "worked_example",
+    "lsi_accuracy",
+    "lsi_noise",
+    "lsi_run_time",
+    "memory",
+    "fsf",
+    "fsf_limits",
+    "fsf_studies",
+    "rsi",
+    "spherical",
+)
+"""Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
+
+
+def experiments() -> dict[str, Experiment]:
+    """All experiments by name, in the order of the thesis.
+
+    Raises
+    ------
+    ReproduceError
+        If two modules use the same name.
+    """
+    found: dict[str, Experiment] = {}
+    for module in MODULES:
+        for experiment in importlib.import_module(f"starid.thesis.experiments.{module}").EXPERIMENTS:
+            if experiment.name in found:
+                raise ReproduceError(f"reproduce: two experiments are called {experiment.name}")
+            found[experiment.name] = experiment
+    return found
+
+
+def select(names: Sequence[str], *, quick: bool) -> list[Experiment]:
+    """Experiments by name; without names all, or all that have a quick form.
+
+    Raises
+    ------
+    ReproduceError
+        If a name is unknown, or has no quick form and the quick run is asked for.
+    """
+    known = experiments()
+    if not names:
+        return [experiment for experiment in known.values() if not quick or experiment.quick is not None]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else "`starhil reproduce --list` names them all"
+            raise ReproduceError(f"reproduce: there is no experiment {name}; {hint}")
+        if quick and known[name].quick is None:
+            raise ReproduceError(f"reproduce: {name} has no quick form; leave out --quick")
+    return [known[name] for name in dict.fromkeys(names)]

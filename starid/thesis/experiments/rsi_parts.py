@@ -1,0 +1,108 @@
+"""Sets and methods of the recursive experiments, and what is measured in each frame of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from starid.thesis.experiments.experiment import Parameters, Part, Results
+
+FIELDS: Final = (
+    "error",
+    "roll_error",
+    "psi",
+    "side",
+    "cells",
+    "search_ms",
+    "lasso_ms",
+    "triggered",
+    "exceeded",
+    "valid",
+    "mean_distance",
+    "sigma_distance",
+)
+"""What is kept of every frame: ε_f, ε_θ (degrees), ε_ψ, Γ (degrees), cells of the region, times, flags, μ_d, σ_d (degrees)."""
+
+SETTLING: Final = 5
+"""First frames left out of the statistics: false stars cannot be told yet."""
+
+LSI_ONLY: Final = 0.0
+"""In place of a threshold τ: every frame searches the whole database."""
+
+BY_EQUATION, BY_TABLE = "equation", "table"
+"""Side of the region of search by eq. 6.5 as read here, or as table 6.8 has it."""
+
+
+def rsi_parts(parameters: Parameters) -> list[Part]:
+    """All runs; the side of table 6.8 is known, and tried, for as many false stars as noise only."""
+    return [
+        Part(
+            f"p{100 * p:g}-f{f}-m{m}-t{tau:g}-n{memory}-{side}-x{scale:g}",
+            {
+                "overlap": p,
+                "false_stars": f,
+                "factor": m,
+                "tau": tau,
+                "memory": memory,
+                "side": side,
+                "scale": scale,
+            },
+        )
+        for p in parameters["overlaps"]
+        for f, m in parameters["sets"]
+        for tau, memory, side in parameters["methods"]
+        for scale in parameters["scales"]
+        if (m > 0 or scale == parameters["scales"][0])
+        and (side == BY_EQUATION or (f == m and scale == parameters["scales"][0]))
+    ]
+
+
+def method_of(values: Mapping[str, Any]) -> str:
+    """Name of a part's method."""
+    if values["tau"] == LSI_ONLY:
+        return "FSF-aided LSI"
+    name = f"RSI, τ = {values['tau']:g}"
+    if values["memory"]:
+        return f"{name}, with memory (ours)"
+    return name if values["side"] == BY_EQUATION else f"{name}, Γ of table 6.8"
+
+
+def set_words(values: Mapping[str, Any]) -> str:
+    """A part's overlap, noise and false stars."""
+    words = f"p = {100 * values['overlap']:g} %, μ = {values['factor']}, f = {values['false_stars']}"
+    return words + (f", noise × {values['scale']:g}" if values["factor"] else "")
+
+
+def statistics(result: Results) -> dict[str, float]:
+    """Means, deviations and shares over the frames of a part, after the settling."""
+    settled = dict(zip(FIELDS, result["numbers"][:, SETTLING:], strict=True))
+    side = settled["side"][np.isfinite(settled["side"])]
+    error = settled["error"]
+    return {
+        "error_mean": float(np.nanmean(error)),
+        "error_sigma": float(np.nanstd(error)),
+        "error_median": float(np.nanmedian(error)),
+        "gross_percent": 100.0 * float(np.nanmean(error > 1.0)),
+        "roll_mean": float(np.nanmean(settled["roll_error"])),
+        "roll_sigma": float(np.nanstd(settled["roll_error"])),
+        "roll_median": float(np.nanmedian(settled["roll_error"])),
+        "psi_mean": float(np.nanmean(settled["psi"])),
+        "psi_sigma": float(np.nanstd(settled["psi"])),
+        "trigger_percent": 100.0 * float(np.mean(settled["triggered"])),
+        "exceeded_percent": 100.0 * float(np.mean(settled["exceeded"])),
+        "invalid_percent": 100.0 * float(np.mean(settled["valid"] == 0.0)),
+        "region_percent": 100.0 * float(side.size / error.size),
+        "side_mean": float(side.mean()) if side.size else math.nan,
+        "side_sigma": float(side.std()) if side.size else math.nan,
+        "search_ms": float(np.nanmean(settled["search_ms"])),
+        "search_ms_sigma": float(np.nanstd(settled["search_ms"])),
+        "search_ms_median": float(np.nanmedian(settled["search_ms"])),
+        "lasso_ms_median": float(np.nanmedian(settled["lasso_ms"])),
+        "lasso_ms": float(np.nanmean(settled["lasso_ms"])),
+        "lasso_ms_sigma": float(np.nanstd(settled["lasso_ms"])),
+        "mean_distance_deg": float(np.nanmean(settled["mean_distance"])),
+        "sigma_distance_deg": float(np.nanmean(settled["sigma_distance"])),
+    }

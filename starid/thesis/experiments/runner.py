@@ -1,0 +1,240 @@
+"""Runs experiments: parts in parallel, nothing twice, every result in a file before it counts."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from starid.thesis.experiments.experiment import (
+    Context,
+    Experiment,
+    Outcome,
+    Parameters,
+    Part,
+    ReproduceError,
+    Results,
+)
+from starid.cache import write_atomically
+
+OUTCOME_FILE: Final = "outcome.json"
+"""What an experiment ended with, in its folder."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of the experiment at work, parts done and parts in all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """An experiment that has been run.
+
+    Attributes
+    ----------
+    experiment, outcome
+        The experiment and what came of it.
+    quick
+        Whether it ran with its quick parameters.
+    seconds
+        Processor time for its parts, added up over the processes, and for its tables and figures.
+    parts
+        Number of parts computed for it, 0 if all were there already.
+    """
+
+    experiment: Experiment
+    outcome: Outcome
+    quick: bool
+    seconds: float
+    parts: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    experiment: Experiment
+    context: Context
+    parts: tuple[Part, ...]
+
+    def file(self, part: Part) -> Path:
+        mark = self.experiment.fingerprint(self.context.parameters, self.context.seed, part)
+        return self.context.folder / "parts" / f"{part.key}-{mark}.npz"
+
+    @property
+    def fingerprint(self) -> str:
+        return self.experiment.fingerprint(self.context.parameters, self.context.seed)
+
+
+def _plan(experiment: Experiment, folder: Path, *, quick: bool, seed: int) -> _Plan:
+    parameters: Parameters | None = experiment.quick if quick else experiment.full
+    if parameters is None:
+        raise ReproduceError(f"reproduce: {experiment.name} has no quick form; leave out --quick")
+    context = Context(
+        folder / experiment.name, folder / "databases", experiment.name, seed, parameters, quick
+    )
+    parts = tuple(experiment.parts(parameters))
+    if len({part.key for part in parts}) != len(parts):
+        raise ReproduceError(f"reproduce: {experiment.name} has two parts of the same name")
+    return _Plan(experiment, context, parts)
+
+
+def _processor_time() -> float:
+    """Processor time of this process and of those it has waited for, seconds."""
+    return sum(os.times()[:4])
+
+
+def _run_part(plan: _Plan, part: Part) -> tuple[str, float]:
+    """Compute a part and keep it; returns the experiment's name and the processor time it took, seconds."""
+    start = _processor_time()
+    results = plan.experiment.work(plan.context, part)
+    seconds = _processor_time() - start
+
+    arrays: dict[str, Any] = {**results, "seconds_": np.float64(seconds)}
+
+    def write(path: Path) -> None:
+        with path.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+
+    write_atomically(plan.file(part), write)
+    return plan.experiment.name, seconds
+
+
+def _load_part(path: Path) -> tuple[Results, float]:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            results = {name: stored[name] for name in stored.files}
+            seconds = float(results.pop("seconds_"))
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise ReproduceError(
+            f"reproduce: {path} cannot be read ({error}); remove it to have it made again"
+        ) from error
+    return results, seconds
+
+
+def _finished_before(plan: _Plan) -> Finished | None:
+    """The outcome in the experiment's folder, if it belongs to these parameters and all its files are there."""
+    stored = _read_outcome(plan.context.folder)
+    if stored is None or stored["fingerprint"] != plan.fingerprint:
+        return None
+    outcome = Outcome.from_dict(stored["outcome"])
+    if not all((plan.context.folder / name).exists() for name in outcome.files):
+        return None
+    return Finished(plan.experiment, outcome, plan.context.quick, float(stored["seconds"]), 0)
+
+
+def _read_outcome(folder: Path) -> Mapping[str, Any] | None:
+    path = folder / OUTCOME_FILE
+    try:
+        stored: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise ReproduceError(
+            f"reproduce: {path} cannot be read ({error}); remove it to have it made again"
+        ) from error
+    return stored
+
+
+def _finish(plan: _Plan, computed: int) -> Finished:
+    start = _processor_time()
+    results: dict[str, Results] = {}
+    seconds = 0.0
+    for part in plan.parts:
+        results[part.key], spent = _load_part(plan.file(part))
+        seconds += spent
+    plan.context.folder.mkdir(parents=True, exist_ok=True)
+    # tables and figures are overwritten: an outcome of other parameters no longer belongs to them
+    (plan.context.folder / OUTCOME_FILE).unlink(missing_ok=True)
+    outcome = plan.experiment.finish(plan.context, results)
+    seconds += _processor_time() - start
+    text = json.dumps(
+        {
+            "fingerprint": plan.fingerprint,
+            "quick": plan.context.quick,
+            "seconds": round(seconds, 3),
+            "outcome": outcome.to_dict(),
+        },
+        indent=1,
+        ensure_ascii=False,
+    )
+    write_atomically(plan.context.folder / OUTCOME_FILE, lambda path: path.write_text(text, encoding="utf-8"))
+    return Finished(plan.experiment, outcome, plan.context.quick, seconds, computed)
+
+
+def run(
+    experiments: Sequence[Experiment],
+    folder: Path,
+    *,
+    quick: bool = False,
+    seed: int = 1,
+    jobs: int = 2,
+    progress: Progress | None = None,
+) -> list[Finished]:
+    """Run experiments; what is finished in `folder` with the same parameters is taken from there.
+
+    Parameters
+    ----------
+    experiments
+        Which, in the order of the report.
+    folder
+        Where all results go, each experiment into a folder of its own.
+    quick
+        Use the quick parameters.
+    seed
+        Seed of all chance; results do not depend on `jobs`.
+    jobs
+        Processes. Experiments that measure time run afterwards, one at a time.
+    progress
+        Told of every part that ends.
+
+    Raises
+    ------
+    ReproduceError
+        If a stored result cannot be read or an experiment has no quick form.
+    """
+    from joblib import Parallel, delayed
+
+    plans = [_plan(experiment, folder, quick=quick, seed=seed) for experiment in experiments]
+    finished = {plan.experiment.name: _finished_before(plan) for plan in plans}
+    open_plans = [plan for plan in plans if finished[plan.experiment.name] is None]
+    todo = [(plan, part) for plan in open_plans for part in plan.parts if not plan.file(part).exists()]
+    missing = {plan.experiment.name: 0 for plan in open_plans}
+    for plan, _ in todo:
+        missing[plan.experiment.name] += 1
+    left, done = dict(missing), 0
+
+    def end(plan: _Plan) -> None:
+        finished[plan.experiment.name] = _finish(plan, missing[plan.experiment.name])
+
+    for plan in open_plans:
+        if missing[plan.experiment.name] == 0:
+            end(plan)
+    by_name = {plan.experiment.name: plan for plan in open_plans}
+    for alone in (False, True):
+        tasks = [(plan, part) for plan, part in todo if plan.experiment.alone == alone]
+        work = (delayed(_run_part)(plan, part) for plan, part in tasks)
+        parallel = Parallel(n_jobs=1 if alone else jobs, return_as="generator_unordered")
+        for name, _ in parallel(work):
+            done += 1
+            left[name] -= 1
+            if progress is not None:
+                progress(name, done, len(todo))
+            if left[name] == 0:
+                end(by_name[name])
+    return [result for plan in plans if (result := finished[plan.experiment.name]) is not None]
+
+
+def finished_in(folder: Path, experiments: Sequence[Experiment], *, quick: bool, seed: int) -> list[Finished]:
+    """Experiments of which a folder holds an outcome for these parameters and this seed; nothing is computed."""
+    found = []
+    for experiment in experiments:
+        if quick and experiment.quick is None:
+            continue
+        stored = _finished_before(_plan(experiment, folder, quick=quick, seed=seed))
+        if stored is not None:
+            found.append(stored)
+    return found

@@ -1,0 +1,123 @@
+"""What `starhil` does with errors that no command has put into its own words."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import typer
+
+from starhil.emulator.cli import app
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (FileNotFoundError(2, "No such file or directory", "a/b.txt"), "a/b.txt: No such file or directory"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (PermissionError(13, "Permission denied", "a", None, "b"), "a -> b: Permission denied"),
+        (OSError("two\nlines"), "two lines"),
+        (TimeoutError(), "TimeoutError"),
+        (MemoryError("Unable to allocate 26.1 GiB"), "not enough memory: Unable to allocate 26.1 GiB"),
+        (MemoryError(), "not enough memory"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line_and_status_2(
+    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    built = typer.Typer()
+
+    @built.command()
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(app, "build_app", lambda: built)
+    monkeypatch.setattr("sys.argv", ["starhil"])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    printed = capsys.readouterr()
+    assert caught.value.code == 2
+    assert (printed.out, printed.err) == ("", f"starhil: {said}\n")
+
+
+@pytest.mark.parametrize("name", ["", ".", ".."])
+def test_a_folder_where_a_file_goes_is_named(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = name or str(tmp_path)
+    monkeypatch.setattr("sys.argv", ["starhil", "icd", "export", "markdown", "-o", folder])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    printed = capsys.readouterr()
+    assert caught.value.code == 2
+    assert printed.out == ""
+    assert printed.err == f"starhil: {folder}: is a folder; name a file with -o\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("rum", "no such command 'rum'. Did you mean 'run'? (see starhil --help)"),
+        ("run --sed 3", "run: no such option: --sed"),
+        ("run --dialect d", "--dialect d: must be a, b or c"),
+        (
+            "run --canopen 999",
+            "run: invalid value for '--canopen': must be at most 127 (see starhil run --help)",
+        ),
+        ("render --ra x", "render: invalid value for '--ra': must be a valid number"),
+        ("render", "render: missing option '--ra'"),
+        ("icd export nope", "icd export: invalid value for 'FORMAT': 'nope' is not one of 'markdown'"),
+        ("icd export", "icd export: missing argument 'FORMAT'"),
+        ("campaign lost-in-space --frames 1.5", "campaign lost-in-space: invalid value for '--frames'"),
+    ],
+)
+def test_a_refused_option_is_one_line_and_status_2(
+    arguments: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    printed = capsys.readouterr()
+    assert caught.value.code == 2
+    assert printed.out == ""
+    assert printed.err.startswith(f"starhil: {said}")
+    assert printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("raised", "status"), [(typer.Exit(1), 1), (KeyboardInterrupt(), 130), (None, 0), (typer.Abort(), 130)]
+)
+def test_the_exit_status_of_a_command_is_that_of_the_process(
+    raised: BaseException | None, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = typer.Typer()
+
+    @built.command()
+    def work() -> None:
+        if raised is not None:
+            raise raised
+
+    monkeypatch.setattr(app, "build_app", lambda: built)
+    monkeypatch.setattr("sys.argv", ["starhil"])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    assert caught.value.code == status
+
+
+def test_no_command_at_all_is_answered_with_the_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil"])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    assert caught.value.code == 2
+    assert "Usage: starhil" in capsys.readouterr().out
+
+
+def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil", "--version"])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    assert caught.value.code == 0
+    assert re.fullmatch(r"starhil \d+\.\d+\.\d+\n", capsys.readouterr().out)

@@ -1,0 +1,94 @@
+"""The cache folder: its size limit, what goes first, and the command that shows and clears it."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from starhil.emulator.cli.app import build_app
+from starid import cache
+
+MEGABYTE = np.zeros(125_000)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder for 3 MB."""
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", "3.1")
+    return tmp_path / "cache"
+
+
+def name(number: int) -> str:
+    return f"hipparcos-{number:016x}"
+
+
+def keep(*numbers: int) -> None:
+    """Have tables of a megabyte each computed and cached, as of one second after the other."""
+    for number in numbers:
+        cache.cached_tables(name(number), lambda: {"a": MEGABYTE})
+
+
+def age(folder: Path, **seconds: int) -> None:
+    for key, value in seconds.items():
+        os.utime(folder / f"{name(int(key[1:]))}.npz", (value, value))
+
+
+def kept(folder: Path) -> set[int]:
+    return {int(path.stem.partition("-")[2], 16) for path in folder.glob("hipparcos-*.npz")}
+
+
+def test_the_least_recently_used_goes_when_the_limit_is_passed(folder: Path) -> None:
+    keep(1, 2, 3)
+    age(folder, n1=1000, n2=2000, n3=3000)
+    keep(1)  # used again
+    keep(4)
+    assert kept(folder) == {1, 3, 4}
+
+
+def test_what_was_just_computed_is_kept_even_beyond_the_limit(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", "0.5")
+    keep(1, 2)
+    assert kept(folder) == {2}
+
+
+def test_files_of_others_are_neither_counted_nor_removed(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "notes.bin").write_bytes(bytes(9_000_000))
+    (folder / "index-mine.bin").write_bytes(bytes(9_000_000))
+    keep(1, 2, 3)
+    assert kept(folder) == {1, 2, 3}
+    assert CliRunner().invoke(build_app(), ["cache", "clear"]).exit_code == 0
+    assert {path.name for path in folder.iterdir()} == {"notes.bin", "index-mine.bin"}
+
+
+def test_info_shows_files_size_and_limit(folder: Path) -> None:
+    keep(1, 2)
+    age(folder, n1=2000, n2=1000)
+    content = json.loads(CliRunner().invoke(build_app(), ["cache", "info", "--json"]).stdout)
+    assert (content["folder"], content["limit_bytes"]) == (str(folder), 3_100_000)
+    assert [item["name"] for item in content["files"]] == [f"{name(2)}.npz", f"{name(1)}.npz"]
+    assert content["bytes"] == sum(path.stat().st_size for path in folder.iterdir())
+    shown = CliRunner().invoke(build_app(), ["cache"]).stdout
+    assert "2.0 MB of 3.1 MB in 2 files" in shown
+
+
+def test_an_empty_cache_is_shown_and_cleared(folder: Path) -> None:
+    assert "0.0 MB of 3.1 MB in 0 files" in CliRunner().invoke(build_app(), ["cache", "info"]).stdout
+    assert "removed 0 of 0 files" in CliRunner().invoke(build_app(), ["cache", "clear"]).stdout
+
+
+def test_a_limit_that_is_no_number_is_reported_and_the_default_holds(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for text in ("much", "-1", "nan", "inf"):
+        monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", text)
+        assert cache.size_limit() == 500_000_000
+    assert "must be a number of megabytes" in caplog.text

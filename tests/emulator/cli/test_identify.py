@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from starhil.emulator.cli.app import build_app
+from starid.attitude import Attitude
+from starid.errors import StaridError
+
+RUNNER = CliRunner()
+DEGREE_LIMIT = 0.01
+
+
+def starhil(*arguments: str):
+    return RUNNER.invoke(build_app(), list(arguments), catch_exceptions=True)
+
+
+def answer(path, *options: str) -> dict:
+    result = starhil("identify", str(path), "--json", *options)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("ra", "dec", "roll"), [(83.8, -1.2, 30), (0, 0, 180), (359.99, 89.9, -75), (120, -90, 10)]
+)
+def test_what_render_draws_identify_finds(tmp_path, ra, dec, roll):
+    image = tmp_path / "sky.png"
+    options = ["--ra", str(ra), "--dec", str(dec), "--roll", str(roll), "--seed", "1"]
+    assert starhil("render", *options, "-o", str(image)).exit_code == 0
+    found = answer(image)
+    error = Attitude.from_quaternion(found["quaternion_xyzw"]).error_to(
+        Attitude.from_radec_roll(ra, dec, roll)
+    )
+    assert found["valid"]
+    assert found["reason"] == "ok"
+    assert error.total_arcsec < 3600 * DEGREE_LIMIT
+    again = Attitude.from_radec_roll(found["ra_deg"], found["dec_deg"], found["roll_deg"])
+    assert again.error_to(Attitude.from_quaternion(found["quaternion_xyzw"])).total_arcsec < 1e-6
+
+
+def test_an_unknown_camera_is_measured_from_its_image(tmp_path):
+    image = tmp_path / "narrow.png"
+    options = [
+        "--ra",
+        "314.7",
+        "--dec",
+        "64.2",
+        "--roll",
+        "89",
+        "--fov",
+        "12",
+        "--size",
+        "1024x768",
+        "--limit",
+        "9",
+    ]
+    assert starhil("render", *options, "--exposure", "1", "--bits", "16", "-o", str(image)).exit_code == 0
+    found = answer(image, "--fov", "11.2")
+    assert found["fov_deg"] == pytest.approx(12, abs=0.01)
+    error = Attitude.from_quaternion(found["quaternion_xyzw"]).error_to(
+        Attitude.from_radec_roll(314.7, 64.2, 89)
+    )
+    assert error.cross_boresight_arcsec < 10
+
+
+def test_the_stars_are_where_the_truth_has_them(tmp_path):
+    image = tmp_path / "sky.png"
+    drawn = starhil("render", "--ra", "83.8", "--dec", "-1.2", "-o", str(image), "--json")
+    truth = {star["hip"]: (star["x_px"], star["y_px"]) for star in json.loads(drawn.stdout)["stars"]}
+    stars = answer(image)["stars"]
+    distances = [
+        np.hypot(star["x_px"] - truth[star["hip"]][0], star["y_px"] - truth[star["hip"]][1]) for star in stars
+    ]
+    assert len(stars) > 50
+    assert np.median(distances) < 0.1
+
+
+def test_the_annotated_picture_is_written_in_colour(tmp_path):
+    image, marked = tmp_path / "sky.png", tmp_path / "marked.png"
+    starhil("render", "--ra", "10", "--dec", "20", "-o", str(image))
+    answer(image, "--annotate", str(marked))
+    picture = cv2.imread(str(marked), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (937, 937, 3)
+    assert (picture[..., 0] != picture[..., 1]).any()
+
+
+def test_noise_alone_is_no_attitude(tmp_path):
+    image = tmp_path / "noise.png"
+    cv2.imwrite(str(image), np.random.default_rng(1).normal(60, 4, (937, 937)).astype(np.uint8))
+    result = starhil("identify", str(image), "--json")
+    found = json.loads(result.stdout)
+    assert result.exit_code == 1
+    assert not found["valid"]
+    assert found["reason"] == "too_few_stars"
+    assert found["ra_deg"] is None
+
+
+def test_an_image_of_another_size_is_refused(tmp_path):
+    image = tmp_path / "small.png"
+    cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (480, 640)).astype(np.uint8))
+    result = starhil("identify", str(image))
+    assert isinstance(result.exception, StaridError)
+    assert "640×480" in str(result.exception)
+    assert "937×937" in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--fov", "wide"], "'wide'"),
+        (["--fov", "11", "--profile", "cubestar"], "give one of them"),
+        (["--fov", "11", "--model", "fisheye"], "pinhole or equidistant"),
+    ],
+)
+def test_options_that_name_no_camera_are_refused(tmp_path, options, named):
+    image = tmp_path / "dark.png"
+    cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (64, 64)).astype(np.uint8))
+    result = starhil("identify", str(image), *options)
+    assert result.exit_code != 0
+    assert named in str(result.exception)
+
+
+def test_colour_is_refused_but_where_the_image_may_come_from_any_camera(tmp_path):
+    image = tmp_path / "colour.png"
+    noise = np.random.default_rng(2).normal(60, 4, (100, 120, 3)).astype(np.uint8)
+    cv2.imwrite(str(image), noise)
+    refused = starhil("identify", str(image))
+    assert "3 channels" in str(refused.exception)
+    looked_at = starhil("identify", str(image), "--fov", "11", "--json")
+    assert looked_at.exit_code == 1
+    found = json.loads(looked_at.stdout)
+    assert found["reason"] == "too_few_stars"
+    assert "expose longer" in found["advice"]
+    assert "channels" in str(starhil("identify", str(image), "--fov", "11", "--refuse-colour").exception)
+
+
+def test_a_tolerance_of_the_automatic_field_is_refused(tmp_path):
+    image = tmp_path / "sky.png"
+    cv2.imwrite(str(image), np.arange(64 * 64, dtype=np.uint16).reshape(64, 64))
+    result = starhil("identify", str(image), "--fov", "auto", "--fov-tolerance", "0")
+    assert "--fov auto has its own tolerance" in str(result.exception)

@@ -1,0 +1,166 @@
+"""Output paths, encodings and numbers: what holds for every command."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from starhil.emulator.cli import app, output
+
+PROGRAM = [sys.executable, "-c", "from starhil.emulator.cli import main; main()"]
+WRITTEN = {"--output", "--annotate", "--junit", "--html", "--truth-log"}
+"""Options that name a file to write; `hub --log` is one too, the other logs are not."""
+
+
+def starhil(*arguments: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(
+        [*PROGRAM, *arguments], capture_output=True, timeout=300, env={**os.environ, **environment}
+    )
+
+
+def refusal(*arguments: str, **environment: str) -> str:
+    """The one line on standard error of a command that is refused."""
+    done = starhil(*arguments, **environment)
+    said = done.stderr.decode()
+    assert (done.returncode, done.stdout, said.count("\n")) == (2, b"", 1), said
+    return said
+
+
+def commands(group: Any = None, path: str = "") -> list[tuple[str, Any]]:
+    """Every command of the command line with its path."""
+    group = typer.main.get_command(app.build_app()) if group is None else group
+    found: list[tuple[str, Any]] = []
+    for name, command in group.commands.items():
+        below = f"{path} {name}".strip()
+        found += commands(command, below) if hasattr(command, "commands") else [(below, command)]
+    return found
+
+
+def test_every_option_that_names_a_file_to_write_states_the_rule() -> None:
+    files = {
+        f"{path} {option.opts[0]}": str(option.help)
+        for path, command in commands()
+        for option in command.params
+        if (WRITTEN & {*option.opts} or (path, option.name) == ("hub", "log"))
+        and not option.is_flag
+        and not str(option.help).startswith("Folder")
+    }
+    assert len(files) >= 11
+    assert [name for name, said in files.items() if "Missing folders are made" not in said] == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "icd export eds -o",
+        "render --ra 83.8 --dec -1.2 --size 64 -o",
+        "database build --overlap 50 -o",
+    ],
+)
+def test_missing_folders_are_made_and_a_file_in_their_place_is_refused(
+    arguments: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a" / "b" / "out.png"
+    done = starhil(*arguments.split(), str(path))
+    assert done.returncode == 0, done.stderr
+    assert path.stat().st_size > 0
+    assert [each.name for each in path.parent.iterdir()] == ["out.png"]
+    assert refusal(*arguments.split(), str(path / "c" / "out.png")).startswith(f"starhil: {path / 'c'}")
+    assert "is a folder" in refusal(*arguments.split(), str(path.parent))
+
+
+def test_an_export_to_the_standard_output_by_name_is_the_export(tmp_path: Path) -> None:
+    plain = starhil("icd", "export", "markdown").stdout
+    assert starhil("icd", "export", "markdown", "-o", "/proc/self/fd/1").stdout == plain
+    assert starhil("icd", "export", "markdown", PYTHONIOENCODING="ascii").stdout == plain
+    assert not plain.isascii()
+
+
+def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error() -> None:
+    done = starhil(
+        "render", "--ra", "83.8", "--dec", "-1.2", "--size", "64", "-o", "/proc/self/fd/1", "--json"
+    )
+    assert done.stdout.startswith(b"\x89PNG")
+    assert done.stdout.endswith(b"IEND\xaeB`\x82")
+    assert json.loads(done.stderr)["width"] == 64
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp437", "utf-8"])
+def test_an_output_of_any_encoding_shows_every_character(encoding: str) -> None:
+    done = starhil("catalog", "--star", "11767", PYTHONIOENCODING=encoding)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert "37.97" in done.stdout.decode(encoding)
+
+
+def test_what_an_encoding_lacks_is_spelled_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", stream)
+    output.show_every_character()
+    print("1σ 0.12″ ≤ 3° 漢 \udcff", file=stream, flush=True)
+    assert stream.buffer.getvalue() == b'1sigma 0.12" <= 3 deg \\u6f22 \\udcff\n'  # type: ignore[attr-defined]
+
+
+def test_every_command_refuses_what_is_not_finite() -> None:
+    assert [path for path, command in commands() if not isinstance(command, app.FiniteCommand)] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        ("catalog --limit nan", "--limit"),
+        ("catalog --cone 1 inf 3", "--cone"),
+        ("bench latency --rate nan", "--rate"),
+        ("campaign lost-in-space --require-valid nan", "--require-valid"),
+        ("features --ra 1 --dec 2 --kappa=-inf", "--kappa"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused(
+    arguments: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    assert caught.value.code == 2
+    assert f"invalid value for '{option}': must be finite" in capsys.readouterr().err
+
+
+def test_the_epoch_0_is_not_the_default_one() -> None:
+    assert "epoch" in refusal("features", "--ra", "83", "--dec", "0", "--epoch", "0")
+
+
+@pytest.mark.parametrize("arguments", ["identify gone.png", "render --ra 1 --dec 2 --profile gone.toml"])
+def test_a_name_that_no_image_can_have_is_refused_before_the_work(arguments: str, tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "out.bmp"
+    assert "suffix '.bmp' given" in refusal(*arguments.split(), "-o", str(path))
+    assert not path.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("database build --overlap 99.9999999", "give less overlap or wider frames"),
+        ("database build --overlap 50 --fov 1e-5", "give less overlap or wider frames"),
+        ("features --ra 1 --dec 2 --fov 1e9", "--fov 1e+09: degrees are needed"),
+        ("features --ra 1e300 --dec 2", "right ascension 1e+300"),
+        ("render --ra 1 --dec 2 --fov 1e-9 -o out.png", "--fov 1e-09: at least 0.1"),
+        ("catalog --path /dev/zero", "cannot be read (not a regular file)"),
+        ("calibrate gone.png --fov 1 -o /proc/x/y", "its folder cannot be made"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    arguments: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])
+    with pytest.raises(SystemExit) as caught:
+        app.main()
+    printed = capsys.readouterr()
+    assert (caught.value.code, printed.out, printed.err.count("\n")) == (2, "", 1)
+    assert said in printed.err

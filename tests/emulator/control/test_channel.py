@@ -1,0 +1,323 @@
+"""The control channel of a whole run: time, truth, feeds, faults, and requests that are none."""
+
+import asyncio
+import json
+import os
+import threading
+
+import pytest
+
+import starhil.protocol.transports.can
+from starhil.emulator.truth.file import read_truth_file
+from starhil.emulator.truth_log import COLUMNS
+from tests.emulator.runs import Control
+
+
+def test_time_passes_only_by_steps(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            assert (await control.do("status"))["mode"] == "boot"
+            await asyncio.sleep(0.05)
+            assert (await control.do("status"))["run_time_s"] == 0.0
+            assert (await control.do("step", seconds=1.0))["run_time_s"] == 1.0
+            assert (await control.do("status"))["mode"] == "standby"
+            for bad in (
+                {},
+                {"seconds": 0},
+                {"seconds": -1},
+                {"seconds": "1"},
+                {"seconds": True},
+                {"seconds": 1, "x": 2},
+            ):
+                answer = await control.do("step", **bad)
+                assert not answer["ok"]
+                assert answer["error"]
+
+    run(scenario)
+
+
+def test_truth_is_read_back_and_swapped_while_running(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            await control.do("step", seconds=1.0)
+            truth = await control.do("truth")
+            assert (truth["ra_deg"], truth["dec_deg"]) == pytest.approx((83.8, -1.2))
+            swap = {
+                "kind": "rate",
+                "attitude": {"ra_deg": 10.0, "dec_deg": 0.0},
+                "rate_deg_s": [0.0, 0.0, 2.0],
+            }
+            assert (await control.do("set_truth", truth=swap))["ok"]
+            later = await control.do("truth", run_time_s=4.0)
+            assert later["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
+            assert later["roll_deg"] == pytest.approx(6.0)  # three seconds after the swap
+            by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
+            assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
+            for wrong, said in (
+                ({}, "truth: an object is needed, with the keys of [truth] in a profile"),
+                ({"truth": 3}, "truth: an object is needed, with the keys of [truth] in a profile"),
+                ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind"),
+                ({"truth": {}}, "truth.kind: must be one of 'file', 'fixed', 'live', 'rate', 'slew'"),
+                (
+                    {"truth": {"kind": "fixed", "attitude": {"ra_deg": "x"}}},
+                    "truth.attitude.ra_deg: must be a valid number (given: 'x')",
+                ),
+            ):
+                assert await control.do("set_truth", **wrong) == {"ok": False, "error": said}
+            bad = await control.do("set_truth", truth={"kind": "rate"})
+            assert bad == {"ok": False, "error": "truth.rate_deg_s: missing; give it"}
+            assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
+            assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
+
+    run(scenario)
+
+
+def test_a_slow_truth_file_holds_up_nothing_else(run, tmp_path, monkeypatch):
+    path = tmp_path / "truth.csv"
+    path.write_text("t,ra_deg,dec_deg,roll_deg\n0,10,20,0\n100,10,20,50\n")
+    go = threading.Event()
+
+    def slowly(*arguments, **options):
+        assert go.wait(60.0)
+        return read_truth_file(*arguments, **options)
+
+    monkeypatch.setattr("starhil.emulator.truth.config.read_truth_file", slowly)
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control, Control(emulation) as other:
+            await control.do("step", seconds=1.0)
+            swap = asyncio.create_task(
+                control.do("set_truth", truth={"kind": "file", "path": str(path), "start": "now"})
+            )
+            await asyncio.sleep(0)
+            assert (await other.do("status"))["truth_kind"] == "fixed"
+            await other.do("step", seconds=2.0)
+            go.set()
+            assert (await swap)["ok"]
+            assert (await control.do("truth", run_time_s=13.0))["roll_deg"] == pytest.approx(5.0)
+
+    run(scenario)
+
+
+def test_a_truth_file_that_is_a_pipe_is_rejected_at_once(run, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await control.do("set_truth", truth={"kind": "file", "path": str(tmp_path / "pipe")})
+            assert "not a regular file" in answer["error"]
+            assert (await control.do("status"))["truth_kind"] == "fixed"
+
+    run(scenario)
+
+
+def test_frames_are_told_with_truth_and_error(run):
+    run.picture.turn_rad = 1e-5
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            await control.do("step", seconds=1.0)
+            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+            await control.do("step", seconds=3.0)
+            frames = (await control.do("frames", count=2))["frames"]
+            assert [frame["frame"] for frame in frames] == [2, 3]
+            assert frames[-1]["cross_boresight_arcsec"] == pytest.approx(2.0626, abs=1e-3)
+            assert list(frames[-1]) == list(COLUMNS)
+            assert not (await control.do("frames", count=0))["ok"]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(
+    "line", [b"nonsense", b"[1]", b'{"do": "dance"}', b"{}", b'{"do": "status", "x": 1}', b"\xff\xfe"]
+)
+def test_bad_requests_are_answered_and_the_next_good_one_too(run, line):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await control.raw(line)
+            assert answer["ok"] is False
+            assert answer["error"]
+            assert (await control.raw(b'{"do": "status", "id": [7]}'))["id"] == [7]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        ({"kind": "file", "path": "a\0b"}, "embedded null"),
+        ({"kind": "live", "host": "127.0.0..1"}, "truth feed udp:127.0.0..1:0: cannot listen"),
+        ({"kind": "live", "protocol": "tcp", "host": "a\0b"}, "cannot listen"),
+        ({"kind": "rate", "rate_deg_s": [1e200, 0.0, 0.0]}, "truth.rate_deg_s.0: must be at most 600"),
+        (
+            {"kind": "slew", "segments": [{"do": "rate", "seconds": 1e308, "rate_deg_s": [9.0, 0.0, 0.0]}]},
+            "seconds: must be at most",
+        ),
+        (
+            {
+                "kind": "slew",
+                "segments": [{"do": "slew", "to": {"ra_deg": 1.0, "dec_deg": 0.0}, "max_rate_deg_s": 5e-324}],
+            },
+            "max_rate_deg_s: must be at least",
+        ),
+    ],
+)
+def test_a_truth_that_cannot_be_is_refused_and_the_connection_stays(run, truth, said):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await control.do("set_truth", truth=truth)
+            assert not answer["ok"]
+            assert said in answer["error"]
+            assert "\n" not in answer["error"]
+            assert (await control.do("status"))["truth_kind"] == "fixed"
+
+    run(scenario)
+
+
+def test_a_fault_of_ours_is_answered_and_logged_and_the_connection_stays(run, monkeypatch, caplog):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            with monkeypatch.context() as patch:
+                patch.setattr(emulation.faults, "describe", lambda: {}[0])
+                answer = await control.do("clear_faults", id=4)
+            assert answer["id"] == 4
+            assert not answer["ok"]
+            assert "internal error: KeyError; see" in answer["error"]
+            (record,) = [each for each in caplog.records if each.name == "starhil.control"]
+            assert record.exc_info
+            assert (await control.do("status"))["ok"]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("protocol", ["udp", "tcp"])
+def test_a_live_feed_stays_until_another_one_is_there(run, protocol):
+    live = {"kind": "live", "protocol": protocol}
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            first = emulation.feed
+            where = emulation.ready_words["truth"]
+            refused = await control.do("set_truth", truth={**live, "host": "192.0.2.1", "port": 5000})
+            assert not refused["ok"]
+            assert emulation.feed is first
+            assert (first._transport or first._server) is not None
+            assert (await control.do("status"))["feed"]["address"] == where
+            port = int(where.rsplit(":", 1)[1])
+            again = await control.do("set_truth", truth={**live, "port": port})
+            assert again == {"ok": True, "kind": "live", "address": where}
+            gone = await control.do("set_truth", truth={"kind": "fixed"})
+            assert gone == {"ok": True, "kind": "fixed", "address": ""}
+            assert emulation.feed is None
+            by_name = {**live, "host": "localhost", "port": port}
+            for _ in range(2):
+                assert (await control.do("set_truth", truth=by_name))["ok"]
+
+    run(scenario, truth=live)
+
+
+@pytest.mark.parametrize("channel", ["off", "virtual:emulation-faults"])
+def test_faults_of_the_can_bus_reach_canopen_too(run, monkeypatch, channel):
+    real = starhil.protocol.transports.can.open_can
+    monkeypatch.setattr(
+        "starhil.protocol.transports.can.open_can", lambda _spec, **_options: real("virtual:emulation-faults")
+    )
+
+    async def scenario(emulation, _line):
+        wires = [link.wire for link in (emulation.can, emulation.canopen) if link is not None]
+        assert len(wires) == (1 if channel == "off" else 2)
+        async with Control(emulation) as control:
+            answer = await control.do("fault", can={"drop": 0.5})
+            assert answer["faults"]["can"]["drop"] == 0.5
+            assert [wire.settings.drop for wire in wires] == [0.5] * len(wires)
+            assert (await control.do("clear_faults"))["faults"] == {}
+            assert all(wire.settings.none for wire in wires)
+
+    links = {"serial": {"port": "off"}, "can": {"channel": channel}, "canopen": {"node": 44}}
+    run(scenario, links=links)
+
+
+def test_faults_are_brought_about_and_cleared(run):
+    async def scenario(emulation, _line):
+        device = emulation.device
+        async with Control(emulation) as control:
+            await control.do("step", seconds=1.0)
+            assert (await control.do("fault", device={"stuck": True}))["faults"] == {
+                "device": {"stuck": True}
+            }
+            assert device.deaf
+            await control.do("fault", serial={"drop": 0.5, "split": 4}, device={"error": "injected"})
+            assert device.modes.error == "injected"
+            assert emulation.serial.wire.settings.drop == 0.5
+            assert not device.deaf
+            assert (await control.do("clear_faults"))["faults"] == {}
+            assert emulation.serial.wire.settings.none
+            await control.do("fault", device={"reset": "watchdog"})
+            assert device.reset_cause == "watchdog"
+            assert device.modes.mode.value == "boot"
+            for bad in (
+                {"can": {"drop": 0.1}},
+                {"device": {"error": "boredom"}},
+                {"device": {"reset": "boredom"}},
+                {"serial": {"drop": 2.0}},
+                {"serial": {"dorp": 0.1}},
+                {"weather": {}},
+            ):
+                answer = await control.do("fault", **bad)
+                assert not answer["ok"], bad
+
+    run(scenario)
+
+
+def test_optical_faults_go_with_each_frame(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            await control.do("step", seconds=1.0)
+            assert (await control.do("fault", optical={"false_stars": 7, "blocked_share": 0.25}))["ok"]
+            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+            await control.do("step", seconds=1.0)
+            assert run.picture.frames[-1].faults == {"false_stars": 7, "blocked_share": 0.25}
+            await control.do("clear_faults")
+            await control.do("step", seconds=1.0)
+            assert run.picture.frames[-1].faults == {}
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("protocol", ["udp", "tcp"])
+def test_a_live_feed_drives_the_truth(run, protocol):
+    message = json.dumps({"t": 5.0, "q": [0.0, 0.0, 0.0, 1.0], "rate": [0.0, 0.0, 1.0]}).encode()
+
+    async def scenario(emulation, line):
+        kind, host, port = emulation.ready_words["truth"].split(":")
+        assert kind == protocol
+        assert f"truth={protocol}:127.0.0.1:" in line
+        loop = asyncio.get_running_loop()
+        if protocol == "udp":
+            transport, _ = await loop.create_datagram_endpoint(
+                asyncio.DatagramProtocol, remote_addr=(host, int(port))
+            )
+            transport.sendto(message + b"\nbad\n")
+        else:
+            _, transport = await asyncio.open_connection(host, int(port))
+            transport.write(message + b"\nbad\n")
+        async with Control(emulation) as control:
+            while (status := await control.do("status"))["feed"]["refused"] == 0:
+                await asyncio.sleep(0.01)
+            assert status["feed"]["accepted"] == 1
+            assert status["feed"]["last_fault"] == "not a JSON line"
+            assert (await control.do("truth", run_time_s=0.5))["roll_deg"] >= 0.0
+            assert (await control.do("truth", run_time_s=0.5))["status"] == "extrapolated"
+            assert (await control.do("truth", run_time_s=9.0))["status"] == "stale"
+        transport.close()
+
+    run(scenario, truth={"kind": "live", "protocol": protocol})
+
+
+def test_quit_ends_the_run(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            assert (await control.do("quit"))["ok"]
+        await asyncio.wait_for(emulation.ended.wait(), 5.0)
+
+    run(scenario)

@@ -1,0 +1,186 @@
+"""Where the control channel listens, who may use it, and what it leaves behind."""
+
+import asyncio
+import os
+import socket
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from starhil.emulator.control.channel import MAX_LINE
+from starhil.emulator.control.socket import ControlSocket
+from starhil.emulator.emulation import RunOptions
+from starhil.emulator.errors import EmulatorError
+from tests.emulator.runs import Control
+
+
+@pytest.fixture(autouse=True)
+def runtime_folder(tmp_path, monkeypatch):
+    """A folder such as a session of a user has; paths of sockets are short."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
+def mode(path) -> int:
+    return stat.S_IMODE(Path(path).stat().st_mode)
+
+
+def test_the_socket_is_for_its_user_alone_and_gone_at_the_end(run, runtime_folder):
+    async def scenario(emulation, line):
+        path = emulation.ready_words["control"].removeprefix("unix:")
+        assert f"control=unix:{path}" in line
+        assert path == str(runtime_folder / "starhil" / f"control-{os.getpid()}")
+        assert mode(path) == 0o600
+        assert mode(runtime_folder / "starhil") == 0o700
+        async with Control(emulation) as control:
+            assert (await control.do("status"))["ok"]
+        return path
+
+    assert not os.path.lexists(run(scenario))
+
+
+@pytest.mark.parametrize("base", ["", "/nonexistent"])
+def test_without_a_folder_of_the_session_it_is_one_of_the_user(run, tmp_path, monkeypatch, base):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", base)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / f"starhil-{os.geteuid()}").mkdir(mode=0o777)
+
+    async def scenario(emulation, _line):
+        return emulation.ready_words["control"].removeprefix("unix:")
+
+    path = run(scenario)
+    assert path.startswith(f"{tmp_path}/starhil-{os.geteuid()}/")
+    assert mode(tmp_path / f"starhil-{os.geteuid()}") == 0o700
+
+
+def test_a_folder_of_somebody_else_is_not_used(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / f"starhil-{os.geteuid()}").symlink_to(tmp_path / "theirs")
+    with pytest.raises(EmulatorError, match=r"somebody else's; give --control unix:/PATH"):
+        run(lambda *_: None)
+
+
+def test_a_socket_that_a_killed_emulator_left_is_replaced(run, tmp_path):
+    path = tmp_path / "control"
+    program = "import socket, sys, os; socket.socket(socket.AF_UNIX).bind(sys.argv[1]); os._exit(1)"
+    subprocess.run([sys.executable, "-c", program, str(path)], check=False)
+    assert path.is_socket()
+
+    async def scenario(emulation, _line):
+        assert emulation.ready_words["control"] == f"unix:{path}"
+        async with Control(emulation) as control:
+            assert (await control.do("status"))["ok"]
+
+    run(scenario, options=RunOptions(control=f"unix:{path}"))
+    assert not path.exists()
+
+
+def test_a_path_in_use_is_refused_and_left_alone(run, tmp_path):
+    path, text = tmp_path / "control", tmp_path / "text"
+    text.write_text("of great worth")
+    options = RunOptions(control=f"unix:{path}")
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(path))
+        other.listen()
+        with pytest.raises(EmulatorError, match="in use by another program; choose another path"):
+            run(lambda *_: None, options=options)
+        assert path.is_socket()
+    path.unlink()
+    with pytest.raises(EmulatorError, match="is no socket; choose another path"):
+        run(lambda *_: None, options=RunOptions(control=f"unix:{text}"))
+    assert text.read_text() == "of great worth"
+
+    async def twice(_emulation, _line):
+        with pytest.raises(EmulatorError, match=r"in use by another emulator, process \d+"):
+            ControlSocket(path)
+        assert path.is_socket()
+
+    run(twice, options=options)
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("relative", "absolute path"),
+        ("/tmp/with space", "absolute path"),
+        ("/tmp/zero\0", "absolute path"),
+        ("/nonexistent/control", "No such file"),
+        ("/tmp/" + "x" * 200, "too long"),
+    ],
+)
+def test_a_path_that_cannot_be_is_refused_in_one_line(run, path, said):
+    with pytest.raises(EmulatorError, match=said) as refusal:
+        run(lambda *_: None, options=RunOptions(control=f"unix:{path}"))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("control", ["auto", "127.0.0.1:0"])
+def test_with_a_token_nothing_is_done_without_it(run, control):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            for wrong in ({}, {"token": ""}, {"token": "sesam"}, {"token": 3}, {"token": None}):
+                answer = await control.do("quit", id=7, **wrong)
+                assert answer == {
+                    "id": 7,
+                    "ok": False,
+                    "error": "token: missing or wrong; give that of --control-token",
+                }
+            assert not emulation.ended.is_set()
+            assert (await control.do("status", token="sésame"))["ok"]
+
+    run(scenario, options=RunOptions(control=control, control_token="sésame"))
+
+
+def test_a_token_that_is_not_asked_for_does_no_harm(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            assert (await control.do("status", token="any"))["ok"]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("size", [MAX_LINE + 1, 10_000_000])
+def test_a_line_that_is_too_long_is_answered_and_the_channel_goes_on(run, size):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await asyncio.wait_for(control.raw(b"x" * size), 60.0)
+            assert answer["ok"] is False
+            assert "line too long" in answer["error"]
+            assert (await control.do("status"))["ok"]
+            assert (await control.raw(b'{"do": "status", "x": "' + bytes(1000) + b'"}'))["ok"] is False
+
+    run(scenario)
+
+
+def test_a_key_given_twice_is_refused(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            for line in (
+                b'{"do": "status", "do": "quit"}',
+                b'{"do": "fault", "can": {"drop": 0, "drop": 1}}',
+            ):
+                answer = await control.raw(line)
+                assert answer["ok"] is False
+                assert "given twice" in answer["error"]
+            assert not emulation.ended.is_set()
+
+    run(scenario)
+
+
+def test_no_answer_quotes_a_file(run, tmp_path):
+    path = tmp_path / "shadow"
+    path.write_text("root:$6$s3cr3t:19000:0:99999:7:::\n")
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await control.do("set_truth", truth={"kind": "file", "path": str(path)})
+            assert answer["ok"] is False
+            assert "line 1" in answer["error"]
+            assert "s3cr3t" not in answer["error"]
+
+    run(scenario)

@@ -1,0 +1,89 @@
+"""Two nodes of one address on a bus are reported, with the setting that gives one of them another."""
+
+import asyncio
+import logging
+
+import pytest
+
+from starhil.emulator.links.bus_address import BusAddress
+from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.canopen import CanopenLink
+from starhil.protocol.can_framing import CanFrame, CanIdentifier, MessageType, encode_request_frames
+from starhil.protocol.hub import CanHub
+from starhil.protocol.messages import Request
+from starhil.protocol.transports import open_can
+from tests.emulator.test_links import Wire
+
+BUS = "socketcand:127.0.0.1:1/test-of-addresses"
+REQUEST = encode_request_frames(Request.of(128), 1, 4)[0]
+REPLY = CanFrame(CanIdentifier(MessageType.TELEMETRY, 128, 4, 1).pack(), bytes(8))
+
+
+def clashes(caplog) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_an_address_is_reported_while_another_has_it_and_free_after(caplog):
+    first, second = (BusAddress("address", "links.can.address") for _ in range(2))
+    first.take(BUS, 4)
+    second.take(BUS, 5)
+    assert clashes(caplog) == []
+    second.take(BUS, 4)
+    [text] = clashes(caplog)
+    assert text.startswith(f"CAN {BUS}: address 4 is in use by another emulator, process ")
+    assert text.endswith("give one of them another: --set links.can.address=5")
+    second.release()
+    first.release()
+    second.take(BUS, 4)
+    assert len(clashes(caplog)) == 1
+    second.release()
+
+
+@pytest.mark.parametrize(("bus", "number"), [("virtual:pair", 4), (BUS, 0)])
+def test_a_bus_of_one_process_and_a_node_that_is_off_have_no_clash(bus, number, caplog):
+    addresses = [BusAddress("node", "links.canopen.node") for _ in range(2)]
+    for address in addresses:
+        address.take(bus, number)
+    for address in addresses:
+        address.release()
+    assert clashes(caplog) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"), [(CanLink, "--set links.can.address=5"), (CanopenLink, "--set links.canopen.node=")]
+)
+def test_a_second_device_on_a_bus_warns_at_its_start_and_works(kind, remedy, bench, caplog):
+    async def main():
+        hub = CanHub(port=0)
+        await hub.start()
+        if kind is CanopenLink:
+            bench.device.parameters.set({"canopen_node": 44})
+        links = [kind(bench.device, open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0")) for _ in range(2)]
+        await links[0].start()
+        assert clashes(caplog) == []
+        await links[1].start()
+        [text] = clashes(caplog)
+        assert remedy in text
+        for link in links:
+            await link.close()
+        await hub.close()
+
+    asyncio.run(main())
+
+
+def test_a_frame_from_a_node_of_the_same_address_is_reported_once(bench, caplog):
+    async def main():
+        bus = Wire()
+        link = CanLink(bench.device, bus)
+        await link.start()
+        caplog.clear()
+        bus.arrive(REQUEST)
+        assert clashes(caplog) == []
+        for _ in range(3):
+            bus.arrive(REPLY)
+        [text] = clashes(caplog)
+        assert "address 4 is also that of another node" in text
+        assert "--set links.can.address=5" in text
+        await link.close()
+
+    asyncio.run(main())

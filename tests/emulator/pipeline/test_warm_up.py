@@ -1,0 +1,46 @@
+"""What a run has compiled, or loaded, before its first frame."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+SCRIPT = """
+import sys
+from dataclasses import replace
+from numba.core.dispatcher import Dispatcher
+from starhil.emulator.emulation import pipeline_setup
+from starhil.emulator.pipeline.pipeline import make_picture
+from starhil.emulator.profile import Profile
+
+def kernels():
+    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("starid", "emulator")]
+    return {
+        f"{item.py_func.__module__}.{item.__name__}{signature}"
+        for module in modules for item in vars(module).values() if isinstance(item, Dispatcher)
+        for signature in item.signatures
+    }
+
+requests = []
+from starhil.emulator.imaging import picture as module
+frame = module.Picture._frame
+module.Picture._frame = lambda self, request: (requests.append(request), frame(self, request))[1]
+picture, _ = make_picture(pipeline_setup(Profile()))
+before = kernels()
+for rate in ((0.0, 0.0, 0.0), (0.0, 0.0052, 0.0), (0.01, 0.01, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.05)):
+    for index in range(4):
+        predicted = requests[0].attitude_xyzw if index % 2 else None
+        answer = picture.handle(replace(requests[0], index=index, rate_rad_s=rate, predicted_xyzw=predicted))
+        assert answer.valid, answer
+print(len(before), sorted(kernels() - before))
+"""
+
+
+def test_no_kernel_is_left_to_be_compiled_in_a_slew():
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    count, _, late = done.stdout.strip().partition(" ")
+    assert int(count) > 10
+    assert late == "[]"

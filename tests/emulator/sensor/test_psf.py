@@ -1,0 +1,77 @@
+"""Spots hold the star's light at the star's place, at rest and on a path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from starhil.emulator.sensor.psf import add_spots, path_rule
+
+SIZE = 64
+
+
+def draw(
+    path: list[float], electrons: float = 10000.0, sigma: tuple[float, float] = (0.8, 0.8)
+) -> np.ndarray:
+    image = np.zeros((SIZE, SIZE), dtype=np.float32)
+    nodes, weights = path_rule(2.0 * float(np.hypot(path[2], path[3])), min(sigma))
+    add_spots(
+        image, np.ones_like(image), np.array([path]), np.array([electrons]), np.array([sigma]), nodes, weights
+    )
+    return image.astype(np.float64)
+
+
+def centre(image: np.ndarray) -> tuple[float, float]:
+    rows, columns = np.mgrid[0:SIZE, 0:SIZE]
+    return float((columns * image).sum() / image.sum()), float((rows * image).sum() / image.sum())
+
+
+@pytest.mark.parametrize("place", [(30.0, 30.0), (30.5, 30.5), (31.23, 28.71)])
+def test_a_spot_is_the_gaussian_integrated_over_pixels(place: tuple[float, float]) -> None:
+    image = draw([*place, 0.0, 0.0, 0.0, 0.0])
+    edges = np.arange(SIZE + 1) - 0.5
+    x, y = (np.diff(0.5 * erf((edges - value) / (0.8 * np.sqrt(2.0)))) for value in place)
+    np.testing.assert_allclose(image, 10000.0 * np.outer(y, x), atol=0.02)
+    assert image.sum() == pytest.approx(10000.0, rel=1e-5)
+    assert centre(image) == pytest.approx(place, abs=1e-4)
+
+
+@pytest.mark.parametrize("length", [0.3, 3.0, 9.0, 25.0])
+def test_a_trail_is_the_mean_of_many_spots(length: float) -> None:
+    along = np.array([0.8, 0.6]) * length / 2.0
+    trail = draw([30.2, 31.7, *along, 0.0, 0.0])
+    times = (np.arange(2000) + 0.5) / 1000.0 - 1.0
+    many = np.zeros((SIZE, SIZE), dtype=np.float32)
+    path = np.zeros((2000, 6))
+    path[:, :2] = np.array([30.2, 31.7]) + times[:, None] * along
+    nodes, weights = path_rule(0.0, 0.8)
+    add_spots(many, np.ones_like(many), path, np.full(2000, 5.0), np.full((2000, 2), 0.8), nodes, weights)
+    np.testing.assert_allclose(trail, many, atol=3e-3 * many.max())
+    assert trail.sum() == pytest.approx(10000.0, rel=1e-4)
+    assert centre(trail) == pytest.approx((30.2, 31.7), abs=1e-3)
+
+
+def test_a_spot_half_outside_is_cut_at_the_edge() -> None:
+    image = draw([-0.5, 20.0, 0.0, 0.0, 0.0, 0.0])
+    assert image.sum() == pytest.approx(5000.0, rel=1e-4)
+
+
+def test_widths_along_the_axes_differ() -> None:
+    image = draw([30.0, 30.0, 0.0, 0.0, 0.0, 0.0], sigma=(0.7, 1.4))
+    rows, columns = np.mgrid[0:SIZE, 0:SIZE]
+    width = ((columns - 30.0) ** 2 * image).sum() / image.sum()
+    height = ((rows - 30.0) ** 2 * image).sum() / image.sum()
+    assert width == pytest.approx(0.7**2 + 1.0 / 12.0, rel=1e-3)
+    assert height == pytest.approx(1.4**2 + 1.0 / 12.0, rel=1e-3)
+
+
+def test_a_dead_pixel_gets_no_light() -> None:
+    image = np.zeros((SIZE, SIZE), dtype=np.float32)
+    sensitivity = np.ones_like(image)
+    sensitivity[30, 30] = 0.0
+    nodes, weights = path_rule(0.0, 0.8)
+    spot = np.array([[30.0, 30.0, 0.0, 0.0, 0.0, 0.0]])
+    add_spots(image, sensitivity, spot, np.array([1000.0]), np.array([[0.8, 0.8]]), nodes, weights)
+    assert image[30, 30] == 0.0
+    assert image[30, 31] > 50.0

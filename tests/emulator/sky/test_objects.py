@@ -1,0 +1,208 @@
+"""What else is in the field: it shows where it should, hides what it should, and is written in the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.renderer import Renderer, SensorModel
+from starhil.emulator.sky.light import icrs_vector
+from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA
+from starid.catalog import load_catalog
+from starid.imaging.detection import detect
+
+ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(DEFAULT_CAMERA, load_catalog(), SensorModel(bits=12), seed=1)
+
+
+def place(ra_deg: float, dec_deg: float) -> np.ndarray:
+    xy, _ = DEFAULT_CAMERA.project(ORION.to_sensor(icrs_vector(ra_deg, dec_deg)[None, :]))
+    return xy[0]
+
+
+def mean_around(image: np.ndarray, xy: np.ndarray, half: int = 2) -> float:
+    x, y = np.rint(xy).astype(int)
+    return float(np.median(image[y - half : y + half + 1, x - half : x + half + 1]))
+
+
+def test_the_moon_saturates_hides_and_glares(renderer: Renderer) -> None:
+    plain = renderer.render(ORION)
+    rigel = plain.stars.hip == 24436
+    frame = renderer.render(ORION, objects=SkyObjects(moon=Moon(78.63, -8.2)))
+    assert mean_around(frame.image, plain.stars.xy_px[rigel][0]) == renderer.sensor.max_dn
+    assert not frame.stars.visible[frame.stars.hip == 24436][0]
+    near, far = place(80.6, -8.2), place(95.0, -8.2)
+    glare = [mean_around(frame.image, xy) - mean_around(plain.image, xy) for xy in (near, far)]
+    assert glare[0] > 10.0 * max(glare[1], 1.0)
+    radius_px = 0.26 / np.degrees(DEFAULT_CAMERA.pixel_scale_rad)
+    disc = renderer.render(ORION, objects=SkyObjects(moon=Moon(70.0, -12.0, glare_share=0.0))).image
+    x, y = np.rint(place(70.0, -12.0)).astype(int)
+    full = np.count_nonzero(disc[y - 15 : y + 16, x - 15 : x + 16] == renderer.sensor.max_dn)
+    # the spot's wings saturate as well, some 2 to 4 pixels beyond the limb
+    assert np.pi * (radius_px + 1.0) ** 2 < full < np.pi * (radius_px + 5.0) ** 2
+
+
+def test_the_lit_limb_points_where_it_is_told(renderer: Renderer) -> None:
+    """North is up and east is left: a limb at position angle 90° (east) lights the left half."""
+    objects = SkyObjects(
+        moon=Moon(83.8, -1.2, diameter_deg=4.0, magnitude=-6.5, illuminated=0.5, glare_share=0.0)
+    )
+    image = renderer.render(ORION, objects=objects).image.astype(np.float64)
+    x, y = np.rint(place(83.8, -1.2)).astype(int)
+    left, right = image[y - 20 : y + 21, x - 20].mean(), image[y - 20 : y + 21, x + 20].mean()
+    assert left > right + 20.0
+
+
+def test_the_sun_brightens_the_side_where_it_is(renderer: Renderer) -> None:
+    image = renderer.render(ORION, objects=SkyObjects(sun=SunGlare(83.8, 40.0, 2000.0))).image
+    top, bottom = np.median(image[:50]), np.median(image[-50:])
+    offset = renderer.sensor.offset_dn
+    assert top - offset > 4.0 * (bottom - offset)
+
+
+@pytest.mark.parametrize("electrons_s", [0.0, 2e6])
+def test_the_earth_covers_what_is_behind_it(renderer: Renderer, electrons_s: float) -> None:
+    earth = EarthLimb(83.8, -70.0, radius_deg=64.0, electrons_s=electrons_s)
+    frame = renderer.render(ORION, objects=SkyObjects(earth=earth))
+    vectors = DEFAULT_CAMERA.back_project(frame.stars.xy_px)
+    distance = np.degrees(np.arccos(vectors @ ORION.to_sensor(icrs_vector(83.8, -70.0))))
+    assert not np.any(frame.stars.visible[distance < 63.9])
+    assert np.all(frame.stars.visible[distance > 64.4])
+    assert frame.objects is not None
+    assert 0.2 < frame.objects.covered_share < 0.6
+    below = np.median(frame.image[-40:])
+    assert below == renderer.sensor.max_dn if electrons_s else below <= np.median(frame.image[:40])
+
+
+def test_a_straight_edge_covers_the_share_asked_for(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(obstructions=(Obstruction(0.3, 180.0),)))
+    assert frame.objects is not None
+    assert frame.objects.covered_share == pytest.approx(0.3, abs=0.01)
+    edge = 0.3 * 937
+    assert not np.any(frame.stars.visible[frame.stars.xy_px[:, 0] < edge - 10.0])
+    assert np.all(frame.stars.visible[frame.stars.xy_px[:, 0] > edge + 10.0])
+
+
+def test_a_polygon_covers_its_inside(renderer: Renderer) -> None:
+    corners = ((100.0, 100.0), (600.0, 100.0), (600.0, 500.0), (100.0, 500.0))
+    frame = renderer.render(ORION, objects=SkyObjects(obstructions=(Obstruction(polygon_px=corners),)))
+    xy = frame.stars.xy_px
+    inside = np.all((xy > [110.0, 110.0]) & (xy < [590.0, 490.0]), axis=1)
+    outside = np.any((xy < [90.0, 90.0]) | (xy > [610.0, 510.0]), axis=1)
+    assert not np.any(frame.stars.visible[inside])
+    assert np.all(frame.stars.visible[outside])
+
+
+def test_false_stars_move_and_fixed_ones_stay(renderer: Renderer) -> None:
+    objects = SkyObjects(false_stars=20, fixed_false_stars=10)
+    frames = [renderer.render(ORION, frame_index=index, objects=objects) for index in range(2)]
+    first, second = (frame.objects.false_xy_px for frame in frames if frame.objects is not None)
+    np.testing.assert_array_equal(first[:10], second[:10])
+    assert np.abs(first[10:] - second[10:]).min() > 1e-6
+    found = detect(frames[0].image, renderer.sensor.detection_settings())
+    gaps = np.linalg.norm(first[:, None] - found.xy_px[None], axis=2).min(axis=1)
+    assert np.count_nonzero(gaps < 0.3) >= 28
+
+
+def test_missing_stars_are_the_brightest(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(missing_stars=3))
+    assert not np.any(frame.stars.visible[:3])
+    assert np.all(frame.stars.visible[3:])
+    sky = np.median(frame.image)
+    for xy in frame.stars.xy_px[:3]:
+        assert mean_around(frame.image, xy) < sky + 15.0
+
+
+def test_planets_are_points_at_their_directions(renderer: Renderer) -> None:
+    planets = (PointSource(83.0, 3.0, -2.0, "Jupiter"), PointSource(270.0, 60.0, 1.0, "Saturn"))
+    frame = renderer.render(ORION, objects=SkyObjects(planets=planets))
+    assert frame.objects is not None
+    assert frame.objects.planet_xy_px[0] == pytest.approx(place(83.0, 3.0))
+    assert np.all(np.isnan(frame.objects.planet_xy_px[1]))
+    found = detect(frame.image, renderer.sensor.detection_settings())
+    assert np.linalg.norm(found.xy_px - place(83.0, 3.0), axis=1).min() < 0.1
+
+
+def test_particles_leave_streaks_where_the_truth_says(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(cosmic_rays_s=200.0))
+    plain = renderer.render(ORION)
+    assert frame.objects is not None
+    streaks = frame.objects.cosmic_rays_px
+    assert 15 <= len(streaks) <= 70
+    middles = 0.5 * (streaks[:, :2] + streaks[:, 2:])
+    middles = middles[np.all((middles > 5.0) & (middles < 930.0), axis=1)]
+    brighter = [mean_around(frame.image, xy, 0) > mean_around(plain.image, xy, 0) + 50.0 for xy in middles]
+    assert np.mean(brighter) > 0.9
+
+
+def test_a_blank_sky_has_no_light(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(blank=True))
+    assert not np.any(frame.stars.visible)
+    found = detect(frame.image, renderer.sensor.detection_settings())
+    assert len(found) == 0
+    assert found.reason
+
+
+def test_objects_do_not_change_the_noise_stream(renderer: Renderer) -> None:
+    plain = renderer.render(ORION)
+    nothing = renderer.render(ORION, objects=SkyObjects())
+    assert plain.image.tobytes() == nothing.image.tobytes()
+
+
+def test_plain_values_make_the_same_objects() -> None:
+    made = SkyObjects.from_dict(
+        {
+            "moon": {"ra_deg": 10, "dec_deg": 5.0},
+            "planets": [{"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": -1.0}],
+            "obstructions": [{"polygon_px": [[0, 0], [10, 0], [0, 10]]}],
+            "blocked_share": 0.5,
+            "false_star_magnitudes": [2, 4],
+            "missing_stars": 3,
+        }
+    )
+    assert made == SkyObjects(
+        moon=Moon(10, 5.0),
+        planets=(PointSource(1.0, 2.0, -1.0),),
+        obstructions=(Obstruction(polygon_px=((0, 0), (10, 0), (0, 10))), Obstruction(0.5)),
+        false_star_magnitudes=(2, 4),
+        missing_stars=3,
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"comet": {}}, "unknown key 'comet'"),
+        ({"moon": {"ra_deg": 1.0}}, "sky moon: key 'dec_deg' is missing"),
+        ({"moon": {"ra_deg": 1.0, "dec_deg": 95.0}}, "dec_deg: 95.0 given"),
+        ({"moon": 3}, "sky moon: 3 given, a table needed"),
+        ({"planets": 4}, "sky planets: a list of tables"),
+        ({"false_stars": 1.5}, "false_stars: 1.5 given, a whole number"),
+        ({"false_stars": -1}, "false_stars: -1 given"),
+        ({"false_star_magnitudes": [5, 1]}, "the brighter one comes first"),
+        ({"false_star_magnitudes": "bright"}, "two numbers needed"),
+        ({"blocked_share": 1.5}, "share: 1.5 given"),
+        ({"obstructions": [{"polygon_px": [1, 2]}]}, "polygon_px"),
+        ({"obstructions": [{"polygon_px": [["a", "b"], [1, 2], [3, 4]]}]}, "polygon_px: 'a' given, a number"),
+        ({"obstructions": [{"polygon_px": [[True, 0], [1, 2], [3, 4]]}]}, "polygon_px: True given"),
+        ({"obstructions": [{"polygon_px": [[float("nan"), 0], [1, 2], [3, 4]]}]}, "polygon_px: nan given"),
+        ({"obstructions": [{"polygon_px": [[1e200, 0], [1, 2], [3, 4]]}]}, "polygon_px: 1e+200 given"),
+        ({"moon": {"ra_deg": 10**400, "dec_deg": 0.0}}, "ra_deg: 1000"),
+        ({"moon": {"ra_deg": float("inf"), "dec_deg": 0.0}}, "ra_deg: inf given"),
+        ({"blocked_share": ""}, "share: '' given"),
+        ({"blank": "no"}, "blank: 'no' given, true or false"),
+        ({"planets": [{"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 1.0, "name": 3}]}, "name: 3 given"),
+    ],
+)
+def test_bad_objects_are_refused_in_one_line(values: dict[str, object], text: str) -> None:
+    with pytest.raises(EmulatorError) as caught:
+        SkyObjects.from_dict(values)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)

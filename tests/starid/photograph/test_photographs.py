@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from starid import field_sweep, image_solver
+from starid.attitude import ARCSEC_PER_RAD
+from starid.camera import Camera
+from starid.catalog import StarCatalog, load_catalog
+from starid.errors import StaridError
+from starid.photograph.field_sweep import solve_any_field
+from starid.geometric.identifier import Identifier
+from starid.geometric.pattern_stars import pick_pattern_stars
+from starid.photograph.views import Look, has_dark_tail, looks
+from starid.photograph.solver import ImageSolution, solve_image
+from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_choice
+from starid.photograph.typical_camera import typical_camera
+from tests.starid.photograph import FOV_DEG, HEIGHT, WIDTH, photograph
+
+CENTRE_ARCSEC = 10.0
+TOLD = Camera.from_fov(FOV_DEG * 0.92, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def sky() -> StarCatalog:
+    return load_catalog()
+
+
+def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
+    """Angle between where the image's centre looks and where it is found to look."""
+    middle = np.array([[(WIDTH - 1) / 2, (HEIGHT - 1) / 2]])
+    seen = found.solution.attitude.to_icrs(found.camera.back_project(middle))[0]
+    true = truth.to_icrs(camera.back_project(middle))[0]
+    return float(np.linalg.norm(seen - true) * ARCSEC_PER_RAD)
+
+
+@pytest.mark.parametrize(
+    ("seed", "defects"),
+    [
+        (1, {}),
+        (2, {"distortion": -0.1}),
+        (3, {"distortion": 0.05}),
+        (4, {"foreground": 0.5}),
+        (5, {"spot_px": 5.0}),
+    ],
+    ids=["plain", "barrel", "pincushion", "hill", "out of focus"],
+)
+def test_a_photograph_tells_attitude_field_and_distortion(sky, seed, defects) -> None:
+    image, truth, camera = photograph(sky, seed, **defects)
+    found = solve_image(image, TOLD, sky, fov_tolerance=0.1)
+    assert found.solution.valid
+    assert not found.mirrored
+    assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
+    assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
+
+
+def test_a_negative_and_a_mirrored_photograph_are_seen_for_what_they_are(sky) -> None:
+    image, truth, camera = photograph(sky, 6)
+    negative = solve_image(np.invert(image), TOLD, sky, fov_tolerance=0.1)
+    assert centre_error_arcsec(negative, truth, camera) < CENTRE_ARCSEC
+    mirror = solve_image(np.ascontiguousarray(image[:, ::-1]), TOLD, sky, fov_tolerance=0.1)
+    assert mirror.mirrored
+    assert centre_error_arcsec(mirror, truth, camera) < CENTRE_ARCSEC
+    on_image = mirror.on_image(mirror.detections.xy_px)
+    np.testing.assert_allclose(on_image[:, 0], WIDTH - 1 - mirror.detections.xy_px[:, 0])
+
+
+def test_a_lens_that_cannot_be_calibrated_leaves_the_answer(sky, monkeypatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise StaridError("calibration: folds the image")
+
+    image, truth, camera = photograph(sky, 1)
+    monkeypatch.setattr(image_solver, "calibrate_identified", refuse)
+    found = solve_image(image, TOLD, sky, fov_tolerance=0.1)
+    assert found.solution.valid
+    assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
+
+
+def test_stars_strewn_at_random_are_no_sky(sky) -> None:
+    rng = np.random.default_rng(7)
+    search = RoughSearch(TOLD, sky, fov_tolerance=0.1)
+    xy = rng.uniform(0.0, [WIDTH - 1, HEIGHT - 1], (100, 2))
+    assert not search.identify(xy, 10.0 ** rng.uniform(0, 2, 100), rounds=[0]).valid
+
+
+def test_a_field_that_is_not_known_is_found_by_trying(sky, monkeypatch) -> None:
+    image, truth, camera = photograph(sky, 8)
+    monkeypatch.setattr(field_sweep, "FIELDS_DEG", (6.2, 9.3))
+    found = solve_any_field(image, sky)
+    assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
+    assert found.camera.fov_deg == pytest.approx(FOV_DEG, rel=2e-3)
+
+
+def test_fields_of_the_sweep_leave_no_gap() -> None:
+    fields = np.sort(field_sweep.FIELDS_DEG)
+    reach = 1.0 + field_sweep.TOLERANCE
+    assert (fields[1:] / fields[:-1] <= reach / (1.0 - field_sweep.TOLERANCE)).all()
+    assert fields[0] < 6.0
+    assert fields[-1] > 42.0
+
+
+def test_similar_cameras_share_an_index_with_pixels_no_finer_than_theirs() -> None:
+    one = typical_camera(Camera.from_fov(10.4, 1024, 768))
+    assert one is not None
+    assert one == typical_camera(Camera.from_fov(11.0, 1280, 960))
+    for width, fov_deg in ((640, 6.0), (1024, 11.4), (4000, 25.0)):
+        camera = Camera.from_fov(fov_deg, width, width * 3 // 4)
+        typical = typical_camera(camera)
+        assert typical is not None
+        assert typical.pixel_scale_rad > camera.pixel_scale_rad
+    assert typical_camera(Camera.from_fov(120.0, 1000, 1000)) is None
+
+
+def test_an_even_choice_has_the_brightest_of_each_part() -> None:
+    rng = np.random.default_rng(9)
+    xy = np.concatenate(
+        [rng.uniform(0, [WIDTH, HEIGHT], (300, 2)), rng.uniform(0, 40, (300, 2))]
+    )  # half of all crowd in a corner
+    flux = rng.uniform(1.0, 100.0, 600)
+    brightest = np.argsort(-flux)
+    rows = even_choice(xy, brightest, TOLD, 2)
+    assert brightest[0] in rows
+    assert np.count_nonzero(rows >= 300) <= 2
+    assert CELLS < len(rows) <= 2 * CELLS + 40
+    assert (np.diff(flux[rows]) <= 0.0).all()
+
+
+@pytest.mark.parametrize("displacement", [-0.12, 0.05])
+def test_a_distorted_lens_keeps_the_width_of_the_field(displacement) -> None:
+    lens = distorted(TOLD, displacement)
+    assert lens.fov_deg == pytest.approx(TOLD.fov_deg)
+    corner = np.array([[-0.5, -0.5]])
+    at_centre = lens.focal_px[0] / TOLD.focal_px[0]
+    seen = TOLD.project(lens.back_project(corner))[0] - np.array(TOLD.centre_px)
+    stretch = np.linalg.norm(corner - np.array(TOLD.centre_px)) / np.linalg.norm(seen) / at_centre
+    assert stretch == pytest.approx(1.0 + displacement, abs=0.03)
+
+
+def test_a_negative_is_known_by_its_dark_tail(sky) -> None:
+    image, _, _ = photograph(sky, 10)
+    assert not has_dark_tail(image)
+    assert has_dark_tail(np.invert(image))
+    ways = list(looks(image))
+    assert isinstance(ways[0], Look)
+    assert [look.mirrored for look in ways] == [False] * (len(ways) - 1) + [True]
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_coarser_look_tells_what_the_plain_one_tells(sky, bits) -> None:
+    image, _, _ = photograph(sky, 12, trail_px=12.0)
+    if bits == 16:
+        image = image.astype(np.uint16) * 100
+    plain, coarse = (look.detections for look in list(looks(image))[:2])
+    distance, twin = cKDTree(coarse.xy_px).query(plain.xy_px)
+    bright = (distance < 1.0) & (plain.flux > 20.0 * plain.flux_sigma)
+    assert np.count_nonzero(bright) > 20
+    ratio = coarse.flux[twin[bright]] / plain.flux[bright]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
+    errors = coarse.flux_sigma[twin[bright]] / plain.flux_sigma[bright]
+    assert np.median(errors) == pytest.approx(1.0, abs=0.3)
+    assert coarse.background == pytest.approx(plain.background, rel=0.01)
+    assert coarse.noise == pytest.approx(plain.noise, rel=0.2)
+    assert coarse.trail_px == pytest.approx(plain.trail_px, rel=0.1)
+
+
+def test_pattern_stars_are_those_of_the_plain_rule() -> None:
+    rng = np.random.default_rng(11)
+    vectors = rng.normal(size=(1500, 3))
+    vectors /= np.linalg.norm(vectors, axis=1)[:, None]
+    area, quota = 0.15, 4
+    near = vectors @ vectors.T >= 1.0 - area / (2.0 * np.pi)
+    taken = np.zeros(1500, dtype=bool)
+    for star in range(1500):
+        taken[star] = np.count_nonzero(near[star] & taken) < quota
+    np.testing.assert_array_equal(pick_pattern_stars(vectors, area, quota), np.flatnonzero(taken))
+
+
+def test_no_wrong_field_gets_a_wide_window_before_the_right_one_had_its_narrow_one(sky, monkeypatch) -> None:
+    image, _, camera = photograph(sky, 1)
+    windows: list[tuple[float, float]] = []
+    identify = Identifier.identify
+
+    def noted(self, *arguments, **options):
+        windows.append((self.camera.fov_deg, self._effort.window_px))
+        return identify(self, *arguments, **options)
+
+    monkeypatch.setattr(Identifier, "identify", noted)
+    monkeypatch.setattr(field_sweep, "FIELDS_DEG", (40.0, 20.0, FOV_DEG * (HEIGHT / WIDTH) ** 0.5))
+    found = solve_any_field(image, sky)
+    assert found.solution.valid
+    assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
+    sweep = windows[: 1 + next(n for n, (fov, _) in enumerate(windows) if abs(fov / FOV_DEG - 1.0) < 0.1)]
+    assert {window for _, window in sweep} == {sweep[0][1]}

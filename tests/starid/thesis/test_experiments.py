@@ -1,0 +1,315 @@
+"""The reproduction's harness: parts, resuming, checks, report, command line; and the numbers the thesis prints."""
+
+import csv
+import dataclasses
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from starhil.emulator.cli.app import build_app
+from starhil.emulator.errors import EmulatorError
+from starid.thesis.experiments import registry, report, runner
+from starid.thesis.experiments.experiment import (
+    Context,
+    Experiment,
+    Outcome,
+    Parameters,
+    Part,
+    Results,
+    row,
+    write_csv,
+)
+from starid.thesis.experiments.lsi_trials import (
+    FRAMES,
+    OFF,
+    ON,
+    centres,
+    frames_under_test,
+)
+from starid.thesis.frame_grid import make_grid
+
+WORKED_EXAMPLE_CHECKS = 8
+TIME_COLUMN = 6
+
+
+def _parts(parameters: Parameters) -> list[Part]:
+    return [Part(f"part{i}", {"number": i}) for i in parameters["numbers"]]
+
+
+def _work(context: Context, part: Part) -> Results:
+    calls = context.folder.parent / "calls.txt"
+    calls.parent.mkdir(parents=True, exist_ok=True)
+    with calls.open("a") as stream:
+        stream.write(f"{context.name} {part.key}\n")
+    return {"value": context.rng(part.key).normal(size=3) + part.values["number"]}
+
+
+def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+    total = float(sum(result["value"].sum() for result in results.values()))
+    write_csv(
+        context.folder / "values.csv",
+        {"key": list(results), "sum": [r["value"].sum() for r in results.values()]},
+    )
+    return Outcome(
+        (row("total | of all", published=1.0, ours=total, at_least=context.parameters["least"]),),
+        ("values.csv",),
+        ("A note.",),
+    )
+
+
+def _experiment(name: str = "toy", least: float = -1e9) -> Experiment:
+    return Experiment(
+        name,
+        "A toy",
+        _parts,
+        _work,
+        _finish,
+        full={"numbers": [1, 2, 3], "least": least},
+        quick={"numbers": [1], "least": least},
+    )
+
+
+def _calls(folder: Path) -> list[str]:
+    path = folder / "calls.txt"
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def test_a_finished_experiment_is_not_run_again(tmp_path):
+    first = runner.run([_experiment()], tmp_path, jobs=1)
+    assert len(_calls(tmp_path)) == 3
+    again = runner.run([_experiment()], tmp_path, jobs=1)
+    assert len(_calls(tmp_path)) == 3
+    assert again[0].parts == 0
+    assert again[0].outcome == first[0].outcome
+
+
+def test_only_what_changed_is_computed_again(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    longer = dataclasses.replace(_experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9})
+    assert runner.run([longer], tmp_path, jobs=1)[0].parts == 1
+    revised = dataclasses.replace(longer, revision=2)
+    assert runner.run([revised], tmp_path, jobs=1)[0].parts == 4
+    assert runner.run([revised], tmp_path, seed=2, jobs=1)[0].parts == 4
+
+
+def test_a_run_goes_on_where_it_was_interrupted(tmp_path):
+    whole = runner.run([_experiment()], tmp_path / "whole", jobs=1)[0].outcome
+
+    def interrupted(context: Context, part: Part) -> Results:
+        if part.key == "part3":
+            raise KeyboardInterrupt
+        return _work(context, part)
+
+    with pytest.raises(KeyboardInterrupt):
+        runner.run([dataclasses.replace(_experiment(), work=interrupted)], tmp_path / "cut", jobs=1)
+    assert len(_calls(tmp_path / "cut")) == 2
+    resumed = runner.run([_experiment()], tmp_path / "cut", jobs=1)[0]
+    assert (resumed.parts, resumed.outcome) == (1, whole)
+
+
+def test_an_output_file_that_is_gone_is_made_again_from_the_parts(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    (tmp_path / "toy" / "values.csv").unlink()
+    assert runner.run([_experiment()], tmp_path, jobs=1)[0].parts == 0
+    assert (tmp_path / "toy" / "values.csv").exists()
+    assert len(_calls(tmp_path)) == 3
+
+
+def test_a_damaged_part_is_refused_by_name(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    part = next((tmp_path / "toy" / "parts").glob("part2-*.npz"))
+    part.write_bytes(part.read_bytes()[:40])
+    (tmp_path / "toy" / "outcome.json").unlink()
+    with pytest.raises(EmulatorError, match=r"part2.*remove it"):
+        runner.run([_experiment()], tmp_path, jobs=1)
+
+
+def test_a_part_with_damaged_contents_is_refused_by_name(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    part = next((tmp_path / "toy" / "parts").glob("part2-*.npz"))
+    content = bytearray(part.read_bytes())
+    with zipfile.ZipFile(part) as archive:
+        start = archive.getinfo("value.npy").header_offset
+    names = int.from_bytes(content[start + 26 : start + 28], "little")
+    extra = int.from_bytes(content[start + 28 : start + 30], "little")
+    content[start + 30 + names + extra] = 0xFF  # a block type that deflate does not have
+    part.write_bytes(content)
+    (tmp_path / "toy" / "outcome.json").unlink()
+    with pytest.raises(EmulatorError, match=r"part2.*invalid block type.*remove it"):
+        runner.run([_experiment()], tmp_path, jobs=1)
+
+
+def test_an_interrupted_finish_leaves_no_outcome_of_other_parameters(tmp_path):
+    runner.run([_experiment()], tmp_path, jobs=1)
+    values = (tmp_path / "toy" / "values.csv").read_text()
+
+    def interrupted(context: Context, results: Mapping[str, Results]) -> Outcome:
+        _finish(context, results)
+        raise KeyboardInterrupt
+
+    longer = dataclasses.replace(
+        _experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9}, finish=interrupted
+    )
+    with pytest.raises(KeyboardInterrupt):
+        runner.run([longer], tmp_path, jobs=1)
+    runner.run([_experiment()], tmp_path, jobs=1)
+    assert (tmp_path / "toy" / "values.csv").read_text() == values
+
+
+def test_parts_on_the_sphere_do_not_depend_on_what_the_process_did_before(tmp_path):
+    spherical = registry.experiments()["spherical"]
+    parameters = {**spherical.full, "frames": 2}
+    context = Context(tmp_path, tmp_path, "spherical", 1, parameters, quick=False)
+    parts = {part.key: part for part in spherical.parts(parameters)}
+
+    def numbers(key: str) -> np.ndarray:
+        return np.delete(spherical.work(context, parts[key])["numbers"], TIME_COLUMN, axis=1)
+
+    first = numbers("lsi-1")
+    numbers("lsi-2")
+    np.testing.assert_array_equal(numbers("lsi-1"), first)
+
+
+def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
+    one = runner.run([_experiment()], tmp_path / "one", jobs=1)[0].outcome
+    two = runner.run([_experiment()], tmp_path / "two", jobs=2)[0].outcome
+    assert one == two
+
+
+def test_progress_counts_up_to_all_parts(tmp_path):
+    seen: list[tuple[str, int, int]] = []
+    runner.run(
+        [_experiment(), dataclasses.replace(_experiment("other"), alone=True)],
+        tmp_path,
+        jobs=1,
+        progress=lambda *step: seen.append(step),
+    )
+    assert [(done, total) for _, done, total in seen] == [(i, 6) for i in range(1, 7)]
+    assert [name for name, _, _ in seen[3:]] == ["other"] * 3
+
+
+@pytest.mark.parametrize(
+    ("ours", "bounds", "passed", "target"),
+    [
+        (99.95, {"at_least": 99.9}, True, "≥ 99.9 %"),
+        (99.89, {"at_least": 99.9}, False, "≥ 99.9 %"),
+        (0.5, {"at_most": 0.5}, True, "≤ 0.5 %"),
+        (0.6, {"at_least": 0.0, "at_most": 0.5}, False, "≥ 0 %, ≤ 0.5 %"),
+        (float("nan"), {"at_least": 0.0}, False, "≥ 0 %"),
+        (1.0, {}, None, ""),
+    ],
+)
+def test_a_bound_makes_a_row_a_check(ours, bounds, passed, target):
+    made = row("q", ours=ours, unit="%", **bounds)
+    assert (made.passed, made.target) == (passed, target)
+
+
+def test_a_text_has_no_bounds():
+    with pytest.raises(EmulatorError, match="a text has no bounds"):
+        row("q", ours="many", at_least=1.0)
+
+
+def test_columns_of_unequal_length_are_refused(tmp_path):
+    with pytest.raises(EmulatorError, match=r"t\.csv have the lengths \[1, 2\]"):
+        write_csv(tmp_path / "t.csv", {"a": [1], "b": [1, 2]})
+
+
+def test_the_report_names_what_was_missed_and_links_the_files(tmp_path):
+    results = runner.run([_experiment(least=1e9)], tmp_path, jobs=1)
+    text = report.report_text(results, quick=False, seed=1)
+    assert "0 of 1 checks are met" in text
+    assert "## Not met" in text
+    assert "total \\| of all" in text
+    assert "[values.csv](toy/values.csv)" in text
+    assert report.summary(results)["failed"] == 1
+
+
+def _invoke(*arguments: str):
+    return CliRunner().invoke(build_app(), ["reproduce", *arguments])
+
+
+@pytest.mark.parametrize(("least", "status"), [(-1e9, 0), (1e9, 1)])
+def test_the_exit_status_says_whether_all_checks_are_met(tmp_path, monkeypatch, least, status):
+    monkeypatch.setattr(registry, "experiments", lambda: {"toy": _experiment(least=least)})
+    result = _invoke("toy", "-o", str(tmp_path), "--jobs", "1", "--json")
+    assert result.exit_code == status, result.output
+    figures = json.loads(result.stdout)
+    assert (figures["checks"], figures["failed"]) == (1, status)
+    assert Path(figures["report"]).read_text().startswith("# The thesis's experiments")
+
+
+def test_the_report_holds_all_that_is_finished_in_the_folder(tmp_path, monkeypatch):
+    known = {"toy": _experiment(), "other": _experiment("other")}
+    monkeypatch.setattr(registry, "experiments", lambda: known)
+    _invoke("toy", "-o", str(tmp_path), "--jobs", "1")
+    _invoke("other", "-o", str(tmp_path), "--jobs", "1")
+    text = (tmp_path / "report.md").read_text()
+    assert "`toy`" in text
+    assert "`other`" in text
+
+
+def test_an_unknown_experiment_is_refused_with_the_nearest_name():
+    with pytest.raises(EmulatorError, match="no experiment lsi-acuracy; did you mean lsi-accuracy"):
+        registry.select(["lsi-acuracy"], quick=False)
+
+
+def test_an_experiment_without_a_quick_form_is_left_out_or_refused(monkeypatch):
+    known = {"toy": _experiment(), "slow": dataclasses.replace(_experiment("slow"), quick=None)}
+    monkeypatch.setattr(registry, "experiments", lambda: known)
+    assert [experiment.name for experiment in registry.select([], quick=True)] == ["toy"]
+    with pytest.raises(EmulatorError, match="slow has no quick form"):
+        registry.select(["slow"], quick=True)
+
+
+def test_every_registered_experiment_has_parts_with_names_fit_for_files():
+    for experiment in registry.experiments().values():
+        for parameters in (experiment.full, experiment.quick):
+            if parameters is not None:
+                keys = [part.key for part in experiment.parts(parameters)]
+                assert keys
+                assert len(set(keys)) == len(keys)
+                assert not any(set(key) & set("/\\ :*") for key in keys), experiment.name
+                json.dumps(dict(parameters))
+
+
+def test_all_test_frames_lie_on_the_grid_and_the_moved_ones_do_not():
+    grid = make_grid("planar", 40.0, 0.995)
+    assert len(centres()) == FRAMES == 1701
+    for kind, most in ((ON, 1e-9), (OFF, None)):
+        frames = frames_under_test(np.random.default_rng(3), kind, grid.step_deg, 1)
+        steps = np.stack(
+            [
+                (frames[:, 0] - grid.first_ra_deg) / grid.step_deg,
+                (frames[:, 1] - grid.row_dec_deg[0]) / grid.step_deg,
+            ]
+        )
+        away = np.abs(steps - np.rint(steps))
+        if most is not None:
+            assert away.max() < most
+        else:
+            assert away.min() > 1e-6
+            assert 0.2 < away.mean() < 0.3
+
+
+def test_the_worked_example_agrees_with_the_thesis(tmp_path):
+    example = registry.experiments()["worked-example"]
+    outcome = runner.run([example], tmp_path, quick=True, jobs=1)[0].outcome
+    checks = [entry for entry in outcome.rows if entry.passed is not None]
+    assert len(checks) == WORKED_EXAMPLE_CHECKS
+    assert not outcome.failed
+    with (tmp_path / "worked-example" / "dictionary.csv").open() as stream:
+        table = list(csv.DictReader(stream))
+    assert [int(line["cell"]) for line in table] == [509, 510, 511, 734, 735, 736, 959, 960, 961]
+    assert (tmp_path / "worked-example" / "figure_5_1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_sizes_of_the_databases_are_the_published_ones(tmp_path):
+    sizes = registry.experiments()["database-sizes"]
+    outcome = runner.run([sizes], tmp_path, quick=True, jobs=1)[0].outcome
+    assert not outcome.failed
+    assert sum(entry.passed is True for entry in outcome.rows) >= 20
