@@ -1,6 +1,6 @@
 # make demo        set up and run the product end to end; results in out/demo
 # make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
-# make lint        ruff and mypy --strict
+# make lint        ruff, mypy --strict and the contracts of imports
 # make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
 # make cosmos      the COSMOS export, read by OpenC3's own reader (installed apart, 220 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
@@ -37,6 +37,7 @@ lint: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 reproduce: $(VENV)/.product
 	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)

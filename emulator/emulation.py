@@ -13,30 +13,30 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from starhil.emulator.symlink_lock import claim_symlink
 from starhil.emulator.clock import Clock, SteppedClock, make_clock
 from starhil.emulator.control.channel import ControlServer
+from starhil.emulator.control.faults import Faults
+from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Background, Device, do_at_once, outcome
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.control.faults import Faults
 from starhil.emulator.guard import one_line
+from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.frames import PipelineSetup, Warm
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
 from starhil.emulator.pipeline.worker_process import WorkerProcess
-from starhil.emulator.links.can import CanLink
-from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
 from starhil.emulator.revival import PipelineRevival
-from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.symlink_lock import claim_symlink
 from starhil.emulator.truth.config import FileConfig, LiveConfig, TruthConfig
 from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveFeed, LiveTruth
-from starhil.emulator.truth_log import TruthLog
 from starhil.emulator.truth.source import TruthSource
+from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition, load_icd
 from starhil.protocol.values import Value

@@ -18,7 +18,13 @@ from typing import Final
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import CanLoad, Spread
 from starhil.hil_tests.realtime import give_realtime
-from starhil.protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
+from starhil.protocol.can_framing import (
+    CanFrame,
+    CanHostReceiver,
+    CanIdentifier,
+    MessageType,
+    encode_request_frames,
+)
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition, load_icd
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request

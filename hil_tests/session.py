@@ -17,7 +17,15 @@ from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.png import write_png
 from starhil.hil_tests.raw_exchange import matches, pattern, send_and_listen
 from starhil.hil_tests.readings import Reading
-from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, percentile, summarize
+from starhil.hil_tests.results import (
+    FAILED,
+    PASSED,
+    SKIPPED,
+    SessionResult,
+    StepResult,
+    percentile,
+    summarize,
+)
 from starhil.hil_tests.script_model import (
     Command,
     DownloadImage,

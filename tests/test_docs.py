@@ -18,8 +18,8 @@ import pytest
 
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.profile import load_profile
+from starhil.emulator.sensor.model import SensorModel
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.own_hub import OwnBus
 from starhil.hil_tests.raw_exchange import format_frame

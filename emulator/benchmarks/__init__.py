@@ -1,1 +1,1 @@
-"""Benchmarks of the picture: accuracy of centroids against their bound, and speed stage by stage."""
+"""Benchmarks and campaigns: accuracy against its bound, and the speed of stages, links and solvers."""

@@ -106,8 +106,8 @@ def made_by() -> dict[str, str]:
     """Versions of all that decides the result of a plan: our version and sources, the catalogue and the libraries."""
     import starid
 
-    package = Path(__file__).parent
-    roots = (Path(starid.__file__).parent, package / "imaging", Path(__file__))
+    emulator = Path(__file__).parent.parent
+    roots = (Path(starid.__file__).parent, emulator / "sky", emulator / "sensor", emulator / "benchmarks")
     digest = hashlib.sha256()
     for root in roots:
         files = [root] if root.is_file() else sorted(root.rglob("*"))

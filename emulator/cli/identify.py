@@ -97,8 +97,8 @@ def _solved(
     """What is found on the image with the camera that the options name."""
     from starhil.emulator.errors import EmulatorError
     from starid.camera import Camera
-    from starid.photograph.field_sweep import solve_any_field
     from starid.files import read_number
+    from starid.photograph.field_sweep import solve_any_field
     from starid.photograph.solver import solve_image
 
     if fov is None:

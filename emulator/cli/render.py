@@ -14,8 +14,8 @@ from starhil.emulator.cli.output import output_help, prepare_output, report_stre
 from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
-    from starhil.emulator.sensor.renderer import Frame
     from starhil.emulator.sensor.model import SensorModel
+    from starhil.emulator.sensor.renderer import Frame
     from starhil.emulator.sky.objects import SkyObjects
     from starid.camera import Camera
 

@@ -41,15 +41,15 @@ import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.control.faults import FaultRequest
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.cycle import Measurement, as_quaternion
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.control.faults import FaultRequest
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from starhil.emulator.truth.config import FixedConfig, TruthConfig
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth_log import compare
 from starhil.emulator.truth.source import TruthState
+from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError, reason
 from starid.errors import StaridError

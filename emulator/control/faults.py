@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from pydantic import AfterValidator, Field
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
 
 if TYPE_CHECKING:

@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.control.faults import FaultRequest
 from starhil.emulator.device.scheduler import Action
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.control.faults import FaultRequest
 from starhil.emulator.profile import configs_folder
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import LiveConfig, Strict, TruthConfig

@@ -10,8 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from starhil.emulator.symlink_lock import NameTakenError, claim_name
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.symlink_lock import NameTakenError, claim_name
 from starhil.protocol.errors import reason
 
 PRIVATE_FOLDER: Final = 0o700

@@ -28,8 +28,8 @@ from starhil.emulator.pipeline.frames import (
 )
 from starhil.emulator.pipeline.identifiers import IdentifierChoice, Identifiers
 from starhil.emulator.pipeline.precompile import picture_was_compiled, start_helper
-from starhil.emulator.sensor.renderer import Frame, Renderer
 from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.renderer import Frame, Renderer
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera

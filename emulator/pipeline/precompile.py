@@ -22,7 +22,9 @@ def picture_was_compiled() -> bool:
 
 def start_helper() -> subprocess.Popen[bytes]:
     """Start the process that compiles the identifier; whoever starts it waits for it."""
-    return subprocess.Popen([sys.executable, "-m", "starhil.emulator.pipeline.precompile"], stdin=subprocess.DEVNULL)
+    return subprocess.Popen(
+        [sys.executable, "-m", "starhil.emulator.pipeline.precompile"], stdin=subprocess.DEVNULL
+    )
 
 
 def main() -> None:

@@ -9,8 +9,8 @@ import socket
 import sys
 from typing import Any, Final
 
-from starhil.emulator.pipeline.frames import LENGTH, Failure
 from starhil.emulator.parent_death_signal import end_with_parent
+from starhil.emulator.pipeline.frames import LENGTH, Failure
 
 NICE: Final = 5
 """How much the worker stands back where processors are short: the links of the emulator come first."""

@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
-from starhil.emulator.sensor.noise import digitize
-from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
-from starhil.emulator.sky.light import AreaLight, AreaPainter, add_cosmic_rays, icrs_vector
+from starhil.emulator.sensor.noise import digitize
+from starhil.emulator.sensor.particle_hits import add_cosmic_rays
+from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
+from starhil.emulator.sky.light import AreaLight, AreaPainter, icrs_vector
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -144,7 +145,7 @@ class Renderer:
         self.sensor = SensorModel() if sensor is None else sensor
         self.seed = _whole_number("seed", seed)
         self.objects = objects
-        self._painter = AreaPainter(camera, self.sensor)
+        self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
         brightness = self.sensor_magnitudes()
         limit = self.sensor.limiting_magnitude
         near = companions(catalog, limit, _COMPANION_PX * camera.pixel_scale_rad)

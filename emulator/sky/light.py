@@ -1,4 +1,4 @@
-"""Light and shadow over areas of a frame: the Moon, stray light, the Earth, things before the lens, particle hits."""
+"""Light and shadow over areas of an image: Sun, Moon, Earth and obstructions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -22,10 +21,6 @@ _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
 _SUN_SOFT_DEG: Final = 3.0
-_STREAK_STEP_PX: Final = 0.2
-_STREAK_MEAN_PX: Final = 8.0
-_STREAK_E_PER_PX: Final = 900.0
-_STREAK_SPREAD: Final = 0.6
 
 
 @dataclass(frozen=True)
@@ -85,13 +80,16 @@ class AreaPainter:
     ----------
     camera : Camera
         Where the pixels look.
-    sensor : SensorModel
-        Spot and electrons of light.
+    zero_magnitude_e_s : float
+        Electrons/s from a source of magnitude 0.
+    psf_sigma_px : float
+        Standard deviation of the spot that blurs edges, pixels.
     """
 
-    def __init__(self, camera: Camera, sensor: SensorModel) -> None:
+    def __init__(self, camera: Camera, zero_magnitude_e_s: float, psf_sigma_px: float) -> None:
         self._camera = camera
-        self._sensor = sensor
+        self._zero_magnitude_e_s = zero_magnitude_e_s
+        self._psf_sigma_px = psf_sigma_px
 
     @cached_property
     def _directions(self) -> Image:
@@ -135,7 +133,7 @@ class AreaPainter:
         centre = icrs_vector(moon.ra_deg, moon.dec_deg)
         source = attitude.to_sensor(centre)
         radius = math.radians(moon.diameter_deg) / 2.0
-        total = self._sensor.electrons(moon.magnitude, 1.0)
+        total = self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
         pixel = self._camera.pixel_scale_rad**2
         share = moon.glare_share / (2.0 * math.pi * math.log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
         soft2 = math.radians(_GLARE_FROM_DEG) ** 2
@@ -168,7 +166,7 @@ class AreaPainter:
         lit = inside * np.clip(0.5 + (u - edge) * scale, 0.0, 1.0)
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
         disc = (lit * (total / area)).astype(np.float32)
-        light.electrons_s[box] += cv2.GaussianBlur(disc, (0, 0), self._sensor.psf_sigma_px)
+        light.electrons_s[box] += cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px)
         light.transmission[box] *= (1.0 - inside).astype(np.float32)
 
     def _box(self, xy: npt.NDArray[np.float64], reach: float) -> tuple[slice, slice] | None:
@@ -193,7 +191,7 @@ class AreaPainter:
         glow = np.exp(-np.maximum(above_deg, 0.0) / np.float32(earth.atmosphere_deg))
         shine = np.float32(earth.electrons_s) * np.where(above_deg < 0.0, np.float32(1.0), glow)
         shine[above_deg > 20.0 * earth.atmosphere_deg] = 0.0
-        blurred = cv2.GaussianBlur(shine.astype(np.float32), (0, 0), self._sensor.psf_sigma_px)
+        blurred = cv2.GaussianBlur(shine.astype(np.float32), (0, 0), self._psf_sigma_px)
         light.electrons_s[:] = light.electrons_s * (1.0 - face) + blurred
         light.transmission[:] *= (1.0 - face).astype(np.float32)
 
@@ -216,31 +214,3 @@ class AreaPainter:
             return cover
         soft = cv2.GaussianBlur(cover, (0, 0), obstruction.softness_px, borderType=cv2.BORDER_REPLICATE)
         return np.asarray(soft, dtype=np.float32)
-
-
-def add_cosmic_rays(mean_e: Image, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
-    """Add the charge of particles to a frame, in place.
-
-    Each leaves a streak of exponentially distributed length (mean 8 px) in a random direction, some 900 electrons
-    a pixel with a log-normal spread along it.
-
-    Returns
-    -------
-    ndarray (count, 4)
-        x, y of both ends, pixels.
-    """
-    height, width = mean_e.shape
-    ends = np.empty((count, 4))
-    for k in range(count):
-        start = rng.uniform((-0.5, -0.5), (width - 0.5, height - 0.5))
-        angle, length = rng.uniform(0.0, 2.0 * math.pi), rng.exponential(_STREAK_MEAN_PX)
-        ends[k] = [*start, start[0] + length * math.cos(angle), start[1] + length * math.sin(angle)]
-        steps = max(math.ceil(length / _STREAK_STEP_PX), 1)
-        parts = (np.arange(steps) + 0.5) / steps
-        columns = np.rint(ends[k, 0] + parts * (ends[k, 2] - ends[k, 0])).astype(np.int64)
-        rows = np.rint(ends[k, 1] + parts * (ends[k, 3] - ends[k, 1])).astype(np.int64)
-        charge = _STREAK_E_PER_PX * max(length, 1.0) / steps
-        charges = (charge * np.exp(_STREAK_SPREAD * rng.standard_normal(steps))).astype(np.float32)
-        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        np.add.at(mean_e, (rows[inside], columns[inside]), charges[inside])
-    return ends

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from starhil.hil_tests.conformance.canopen_pdo import EVENT, SYNCHRONOUS, entry, first, send_sync, set_up, writable
+from starhil.hil_tests.conformance.canopen_pdo import (
+    EVENT,
+    SYNCHRONOUS,
+    entry,
+    first,
+    send_sync,
+    set_up,
+    writable,
+)
 from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe, size_of
 from starhil.hil_tests.conformance.case import Case, case, check, check_equal
 

@@ -22,7 +22,6 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.answer import Answer
-from starid.geometric.validation import checked_detections
 from starid.geometric.index_choice import (
     default_limiting_magnitude,
     index_settings,
@@ -50,6 +49,7 @@ from starid.geometric.settings import (
     WINDOW,
 )
 from starid.geometric.tracking import track_kernel
+from starid.geometric.validation import checked_detections
 from starid.geometric.verification import ROTATIONS
 from starid.solution import Mode, Reason, Solution
 

@@ -9,12 +9,12 @@ from typing import Final
 from starid.camera import Camera, Model
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.photograph.views import Counts, looks
-from starid.photograph.solver import ImageSolution, polished
 from starid.imaging.detection import DetectionSettings
 from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
-from starid.solution import Reason
+from starid.photograph.solver import ImageSolution, polished
 from starid.photograph.typical_camera import FIELD_STEP
+from starid.photograph.views import Counts, looks
+from starid.solution import Reason
 
 FIELDS_DEG: Final = tuple(FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21))
 """Widths of square fields that are tried, each within `TOLERANCE`: 5° to 46°, the middle ones first."""

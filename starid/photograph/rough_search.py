@@ -20,8 +20,8 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Effort, Identifier, scaled_camera
-from starid.solution import Reason, Solution
 from starid.photograph.typical_camera import typical_camera
+from starid.solution import Reason, Solution
 
 DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
 """Relative displacements at the corner of the image, of lenses that are tried."""

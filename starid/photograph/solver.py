@@ -15,10 +15,10 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
-from starid.photograph.views import Counts, Look, looks
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
+from starid.photograph.views import Counts, Look, looks
 from starid.solution import Reason, Solution
 
 _log = logging.getLogger(__name__)

@@ -23,9 +23,9 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.validation import checked_detections
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
+from starid.geometric.validation import checked_detections
 from starid.solution import Reason, Solution
 from starid.thesis.cell_search import stored_neighbours
 from starid.thesis.coarse_match import next_candidate

@@ -13,7 +13,7 @@ from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.state_store import MemoryStore, StateStore
 from starhil.emulator.emulation import Emulation, RunOptions
-from starhil.emulator.imaging import worker_process
+from starhil.emulator.pipeline import worker_process
 from starhil.emulator.pipeline.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
 from starhil.emulator.pipeline.imager import Answer, Asked, DirectImager
 from starhil.emulator.pipeline.worker_process import WorkerProcess

@@ -7,13 +7,13 @@ import resource
 import pytest
 
 from starhil.emulator.clock import SteppedClock
+from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.emulation import Emulation, RunOptions
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.frames import Warm
 from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.profile import Profile, RunConfig, configs_folder
-from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.protocol.errors import ProtocolError

@@ -1,8 +1,8 @@
 import pytest
 
+from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, configs_folder, load_profile
-from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.truth.config import SlewConfig
 
 

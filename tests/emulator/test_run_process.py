@@ -39,7 +39,12 @@ class Emulator:
 
     def __init__(self, *arguments: str) -> None:
         default = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)"  # nohup has it ignored
-        command = [sys.executable, "-c", f"{default}; from starhil.emulator.cli.app import main; main()", "run"]
+        command = [
+            sys.executable,
+            "-c",
+            f"{default}; from starhil.emulator.cli.app import main; main()",
+            "run",
+        ]
         self.process = subprocess.Popen(
             [*command, "--can", "off", "--control", "auto", *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -7,7 +7,7 @@ import pytest
 
 AHEAD = """
 import sys
-from starhil.emulator.imaging import worker_process
+from starhil.emulator.pipeline import worker_process
 class Worker:
     def __init__(self):
         print("worker", "typer" in sys.modules, "pydantic" in sys.modules)
@@ -47,7 +47,7 @@ def test_only_a_run_starts_its_worker_before_anything_else_is_imported(arguments
 
 
 def test_a_worker_that_was_started_ahead_is_taken_once(monkeypatch):
-    from starhil.emulator.imaging import worker_process
+    from starhil.emulator.pipeline import worker_process
 
     monkeypatch.setattr(worker_process, "WorkerProcess", object)
     worker_process.start_ahead()

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from starhil.emulator.symlink_lock import claim_symlink
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.symlink_lock import claim_symlink
 
 
 def test_a_claimed_path_is_refused_by_every_spelling_and_free_again_after(tmp_path):

@@ -6,7 +6,14 @@ import pytest
 
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.expect import AttitudeCheck, Expectation, Variable, measured_attitude, read_expectation, show
+from starhil.hil_tests.expect import (
+    AttitudeCheck,
+    Expectation,
+    Variable,
+    measured_attitude,
+    read_expectation,
+    show,
+)
 from starhil.hil_tests.script_reader import TableReader
 
 

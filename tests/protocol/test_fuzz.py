@@ -25,7 +25,13 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_icd
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver, encode_reply, encode_request
+from starhil.protocol.serial_framing import (
+    DeviceReceiver,
+    Dialect,
+    HostReceiver,
+    encode_reply,
+    encode_request,
+)
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "100000"))

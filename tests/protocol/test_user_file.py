@@ -5,10 +5,10 @@ import socket
 
 import pytest
 
+from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.state_store import STATE_FILE, FileStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
-from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.truth.file import read_truth_file
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.script import load_script

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.thesis.cme import estimate_motion
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -22,7 +23,6 @@ from starid.thesis.experiments.experiment import (
 )
 from starid.thesis.experiments.fsf_published import TABLES
 from starid.thesis.experiments.plots import colours, figure, save
-from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import FilterResult
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.metrics import Confusion

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from starid.cache import write_atomically
 from starid.thesis.experiments.experiment import Row
 from starid.thesis.experiments.runner import Finished
-from starid.cache import write_atomically
 
 REPORT_FILE: Final = "report.md"
 """Name of the report in the results' folder."""

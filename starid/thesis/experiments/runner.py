@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.cache import write_atomically
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -22,7 +23,6 @@ from starid.thesis.experiments.experiment import (
     ReproduceError,
     Results,
 )
-from starid.cache import write_atomically
 
 OUTCOME_FILE: Final = "outcome.json"
 """What an experiment ended with, in its folder."""

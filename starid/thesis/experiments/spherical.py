@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.attitude import Attitude, propagate, random_attitude
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -20,7 +21,6 @@ from starid.thesis.experiments.experiment import (
     row,
     write_csv,
 )
-from starid.attitude import Attitude, propagate, random_attitude
 
 _WRONG_ARCSEC: Final = 300.0
 _LIMIT: Final = 6.0

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import starhil.emulator.benchmarks.campaign
+from starhil.emulator.benchmarks import campaign
 from starhil.emulator.benchmarks.campaign import (
     RECORD,
     CampaignPlan,
@@ -23,8 +23,8 @@ from starhil.emulator.benchmarks.campaign import (
     run_chunk,
     summarise,
 )
-from starhil.emulator.errors import EmulatorError
 from starhil.emulator.benchmarks.hard_sky import HARD_SENSOR, hard_sky
+from starhil.emulator.errors import EmulatorError
 from starid.attitude import random_attitude
 
 PLAN = CampaignPlan(frames=5, seed=11, chunk=2)
@@ -60,7 +60,13 @@ def test_an_interrupted_campaign_goes_on_where_it_stopped(tmp_path):
 
 @pytest.mark.process
 def test_a_killed_campaign_goes_on_and_gives_the_same_figures(tmp_path):
-    command = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()", "campaign", "lost-in-space"]
+    command = [
+        sys.executable,
+        "-c",
+        "from starhil.emulator.cli.app import main; main()",
+        "campaign",
+        "lost-in-space",
+    ]
     command += ["--frames", "150", "--seed", "3", "--jobs", "2", "--json"]
 
     def run(folder: Path) -> dict[str, object]:
@@ -124,7 +130,9 @@ def test_a_folder_of_another_plan_is_refused(tmp_path):
 def test_a_folder_of_another_version_is_refused_and_what_differs_is_named(what, tmp_path, monkeypatch):
     CampaignStore(tmp_path, PLAN)
     CampaignStore(tmp_path, PLAN)
-    monkeypatch.setattr("starhil.emulator.benchmarks.campaign.made_by", lambda: {**made_by(), what: "another"})
+    monkeypatch.setattr(
+        "starhil.emulator.benchmarks.campaign.made_by", lambda: {**made_by(), what: "another"}
+    )
     with pytest.raises(EmulatorError, match=rf"made_by\.{what} is .* there and 'another' here: give another"):
         CampaignStore(tmp_path, PLAN)
 
@@ -132,11 +140,11 @@ def test_a_folder_of_another_version_is_refused_and_what_differs_is_named(what, 
 def test_the_sources_that_decide_a_result_are_part_of_the_plan(tmp_path, monkeypatch):
     before = made_by()["sources"]
     package = tmp_path / "emulator"
-    shutil.copytree(Path(emulator.campaign.__file__).parent / "imaging", package / "imaging")
-    shutil.copy(emulator.campaign.__file__, package / "campaign.py")
-    monkeypatch.setattr("starhil.emulator.benchmarks.campaign.__file__", str(package / "campaign.py"))
+    for room in ("sky", "sensor", "benchmarks"):
+        shutil.copytree(Path(campaign.__file__).parent.parent / room, package / room)
+    monkeypatch.setattr(campaign, "__file__", str(package / "benchmarks" / "campaign.py"))
     assert made_by()["sources"] == before
-    with (package / "imaging" / "noise.py").open("a") as noise:
+    with (package / "sensor" / "noise.py").open("a") as noise:
         noise.write("# another\n")
     assert made_by()["sources"] != before
 

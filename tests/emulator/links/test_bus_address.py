@@ -12,7 +12,7 @@ from starhil.protocol.can_framing import CanFrame, CanIdentifier, MessageType, e
 from starhil.protocol.hub import CanHub
 from starhil.protocol.messages import Request
 from starhil.protocol.transports import open_can
-from tests.emulator.test_links import Wire
+from tests.emulator.links.test_links import Wire
 
 BUS = "socketcand:127.0.0.1:1/test-of-addresses"
 REQUEST = encode_request_frames(Request.of(128), 1, 4)[0]

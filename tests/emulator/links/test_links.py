@@ -11,7 +11,13 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink, SerialPieces
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
-from starhil.protocol.can_framing import CanFrame, CanHostReceiver, CanIdentifier, MessageType, encode_request_frames
+from starhil.protocol.can_framing import (
+    CanFrame,
+    CanHostReceiver,
+    CanIdentifier,
+    MessageType,
+    encode_request_frames,
+)
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
 from starhil.protocol.transports.base import Transport

@@ -14,7 +14,7 @@ from starhil.emulator.pipeline.pipeline import make_picture
 from starhil.emulator.profile import Profile
 
 def kernels():
-    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("starid", "emulator")]
+    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("starid", "starhil")]
     return {
         f"{item.py_func.__module__}.{item.__name__}{signature}"
         for module in modules for item in vars(module).values() if isinstance(item, Dispatcher)
@@ -22,7 +22,7 @@ def kernels():
     }
 
 requests = []
-from starhil.emulator.imaging import picture as module
+from starhil.emulator.pipeline import pipeline as module
 frame = module.Picture._frame
 module.Picture._frame = lambda self, request: (requests.append(request), frame(self, request))[1]
 picture, _ = make_picture(pipeline_setup(Profile()))

@@ -18,7 +18,13 @@ from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
 from starhil.hil_tests.conformance.case import CaseFailed
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import CanopenSlave, DeviceDictionary, Picture, StandInApplication, build_dictionary
+from starhil.protocol.canopen import (
+    CanopenSlave,
+    DeviceDictionary,
+    Picture,
+    StandInApplication,
+    build_dictionary,
+)
 from starhil.protocol.canopen.storage import ParameterStorage
 
 NODE = 0x2C

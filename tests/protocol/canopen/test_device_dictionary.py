@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.canopen import AbortCode, DeviceDictionary, SdoAbortError, build_dictionary, check_status
+from starhil.protocol.canopen import (
+    AbortCode,
+    DeviceDictionary,
+    SdoAbortError,
+    build_dictionary,
+    check_status,
+)
 from starhil.protocol.canopen.layout import CanopenModel, load_layout
 from starhil.protocol.icd import load_icd
 from starhil.protocol.values import IcdError

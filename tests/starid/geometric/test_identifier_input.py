@@ -11,8 +11,8 @@ from starid.attitude import Attitude
 from starid.camera import Camera, Model
 from starid.catalog import load_catalog
 from starid.errors import StaridError
-from starid.geometric.validation import FARTHEST_PX
 from starid.geometric.identifier import Effort, Identifier
+from starid.geometric.validation import FARTHEST_PX
 from starid.solution import Reason, Solution
 from tests.starid.geometric.sky_points import identifier, sky
 

@@ -9,13 +9,13 @@ from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.photograph.field_sweep import solve_any_field
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_stars import pick_pattern_stars
-from starid.photograph.views import Look, has_dark_tail, looks
-from starid.photograph.solver import ImageSolution, solve_image
+from starid.photograph.field_sweep import solve_any_field
 from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_choice
+from starid.photograph.solver import ImageSolution, solve_image
 from starid.photograph.typical_camera import typical_camera
+from starid.photograph.views import Look, has_dark_tail, looks
 from tests.starid.photograph import FOV_DEG, HEIGHT, WIDTH, photograph
 
 CENTRE_ARCSEC = 10.0

@@ -1,0 +1,84 @@
+"""The built wheel, installed into a fresh environment, in a project with folders of the names that ours have."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+OUR_ROOMS = ("emulator", "protocol", "hil_tests", "configs", "tools", "tests")
+
+OBC_TEST = """
+import hil_tests, protocol, emulator, configs, tests  # the project's own
+
+def test_the_project_finds_its_own_packages():
+    assert {package.OWNER for package in (hil_tests, protocol, emulator, configs, tests)} == {"flight software"}
+
+def test_the_star_tracker_answers(starhil_serial, starhil_can):
+    for obc in (starhil_serial, starhil_can):
+        assert obc.read("identification")["interface_version"] > 0
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    _run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    )
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def project(wheel, tmp_path_factory) -> Path:
+    """A project of flight software, with an environment of its own in `.venv`."""
+    folder = tmp_path_factory.mktemp("flight_software")
+    for name in OUR_ROOMS:
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text('OWNER = "flight software"\n')
+    (folder / "tests" / "test_obc.py").write_text(OBC_TEST)
+    venv.create(folder / ".venv", with_pip=True)
+    _run([str(folder / ".venv/bin/python"), "-m", "pip", "install", "--quiet", str(wheel), "pytest"])
+    return folder
+
+
+def _run(command: list[str], folder: Path | None = None) -> str:
+    environment = {
+        key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def _starhil(project: Path, *arguments: str) -> str:
+    return _run([str(project / ".venv/bin/starhil"), *arguments], project)
+
+
+def test_the_wheel_brings_two_packages_and_no_more(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        tops = {name.split("/")[0] for name in archive.namelist()}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"starhil", "starid"}
+
+
+def test_plugin_and_fixtures_work_beside_folders_of_the_same_names(project):
+    out = _run([str(project / ".venv/bin/python"), "-m", "pytest", "-q", "tests"], project)
+    assert "2 passed" in out
+
+
+def test_a_session_starts_the_emulator_there(project):
+    _starhil(project, "session", "parameters", "--start")
+
+
+def test_conformance_runs_there(project):
+    out = _starhil(project, "conformance", "serial.framing", "--start", "--serial", "auto")
+    assert "0 failed" in out
