@@ -443,7 +443,10 @@ def test_an_observer_that_fails_stops_neither_the_frames_nor_the_other_observers
         seen = []
         device.on_frame[:0] = [lambda _measurement: 1 / 0]
         device.on_frame.append(seen.append)
-        device.telecommand("set_mode", {"mode": "lost_in_space"})
+        if emulation.stepper:
+            await emulation.stepper.step(1.0)  # the boot
+        code, _ = device.telecommand("set_mode", {"mode": "lost_in_space"})
+        assert code.name == "OK"
         while len(seen) < 3:
             await (emulation.stepper.step(1.0) if emulation.stepper else asyncio.sleep(0.01))
 
