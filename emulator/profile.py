@@ -36,22 +36,24 @@ class RunConfig(Strict):
     """How a run goes."""
 
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
+    """Seed of all noise and faults; the same seed, profile and commands give the same bytes on the stepped clock."""
     clock: str = "real"
-    """`real`, `scaled:FACTOR` or `stepped`."""
+    """`real`, `scaled:FACTOR` or `stepped` (time passes only by the control channel's `step`)."""
     algorithm: Literal["geometric", "lsi", "rsi"] = "geometric"
+    """Star identification: the product's own (`geometric`), or one of the thesis (`lsi`, `rsi`)."""
     worker: Literal["process", "thread"] = "process"
-    """Where frames are made and solved."""
+    """Where frames are rendered and solved: in a worker process, or in a thread of the emulator."""
     state_dir: str = ""
-    """Folder of what survives a restart; empty: kept until the process ends."""
+    """Folder for what survives a restart: saved parameters, boot count, CANopen settings. Empty: nothing does."""
     start_unix_s: Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S)] = 1_767_225_600.0
-    """The device's clock at run time zero, until it is set: 2026-01-01."""
+    """The device's clock at the start of the run, until it is set: 2026-01-01."""
 
 
 class CatalogConfig(Strict):
     """Which stars there are."""
 
     path: str = ""
-    """Hipparcos file of one's own; empty: the installed catalogue."""
+    """Another Hipparcos file; empty: the installed catalogue."""
     epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] = 2026.0
     """Julian year to which the stars are moved."""
 
@@ -60,11 +62,17 @@ class CameraConfig(Strict):
     """The optics and pixel array that make the picture."""
 
     width: Annotated[int, Field(ge=64, le=4096)] = 937
+    """Columns of the pixel array."""
     height: Annotated[int, Field(ge=64, le=4096)] = 937
+    """Rows of the pixel array."""
     fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
+    """Field of view from edge to edge along a row; 42 if neither this nor `focal_px` is given."""
     focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
+    """Focal length along x and y, in place of `fov_deg`."""
     centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
+    """Where the optical axis meets the pixel array; the middle if left out."""
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
+    """Projection of the lens."""
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
     """Brown–Conrady k1, k2, p1, p2, k3."""
 
@@ -80,9 +88,13 @@ class DeviceConfig(Strict):
     """What the unit says of itself, and how long it boots."""
 
     node_type: Annotated[int, Field(ge=0, le=255)] = 0x53
+    """Reported in `identification` (128)."""
     interface_version: Annotated[int, Field(ge=0, le=255)] = 1
+    """Reported in `identification` (128)."""
     firmware_major: Annotated[int, Field(ge=0, le=255)] = 1
+    """Reported in `identification` (128)."""
     firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
+    """Reported in `identification` (128)."""
     boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
     """Least time in boot mode."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
@@ -93,10 +105,15 @@ class TimingConfig(Strict):
     """How long the unit takes for a frame; reported in telemetry and kept before a result is published."""
 
     readout_s: FrameSeconds = 0.020
+    """Read-out of the detector."""
     detect_s: FrameSeconds = 0.040
+    """Detection, whatever the number of stars."""
     detect_per_star_s: Annotated[float, Field(ge=0.0, le=0.01)] = 0.00005
+    """Detection, in addition for each star."""
     identify_lost_s: FrameSeconds = 0.020
+    """Identification, lost in space."""
     identify_tracking_s: FrameSeconds = 0.010
+    """Identification, tracking."""
 
 
 class SerialConfig(Strict):
@@ -105,11 +122,13 @@ class SerialConfig(Strict):
     port: str = "auto"
     """`auto` (a pty), a device, `listen://HOST:PORT`, or `off`."""
     dialect: Literal["a", "b", "c"] = "b"
+    """Form of the replies: `a` as to a CubeComputer, `b` stand-alone node, `c` generation 2."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
+    """Bit rate."""
     pace: bool = True
     """Send bytes no faster than the baud rate lets them."""
     symlink: str = ""
-    """Link to the pty, made at start and removed at the end."""
+    """Path of a link to the pty, made at start and removed at the end."""
 
 
 class CanConfig(Strict):
@@ -118,7 +137,9 @@ class CanConfig(Strict):
     channel: str = "auto"
     """`auto` (vcan0, else the TCP hub), a channel of python-can, or `off`."""
     address: Annotated[int, Field(ge=1, le=254)] = 4
+    """CAN address of the device."""
     host_address: Annotated[int, Field(ge=1, le=254)] = 1
+    """CAN address of the OBC."""
     frame_gap_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Least time between two frames of one message."""
 
@@ -134,17 +155,24 @@ class LinksConfig(Strict):
     """The links to the OBC."""
 
     serial: SerialConfig = SerialConfig()
+    """The serial line."""
     can: CanConfig = CanConfig()
+    """The CAN bus."""
     canopen: CanopenConfig = CanopenConfig()
+    """The CANopen node on it."""
 
 
 class Profile(Strict):
     """A whole profile."""
 
     name: str = DEFAULT_PROFILE
+    """Name in messages and on the control channel."""
     run: RunConfig = RunConfig()
+    """Seed, clock, algorithm, files."""
     catalog: CatalogConfig = CatalogConfig()
+    """Stars."""
     camera: CameraConfig = CameraConfig()
+    """Optics and pixel array."""
     sensor: dict[str, Any] = Field(default_factory=dict)
     """Fields of `starhil.emulator.sensor.model.SensorModel`, but for those that are parameters of the device."""
     sky: dict[str, Any] = Field(default_factory=dict)
@@ -152,9 +180,13 @@ class Profile(Strict):
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
+    """Where the sensor really looks."""
     device: DeviceConfig = DeviceConfig()
+    """Identification and boot."""
     timing: TimingConfig = TimingConfig()
+    """Modelled processing times."""
     links: LinksConfig = LinksConfig()
+    """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)
     """What `starhil calibrate` notes about a camera: for people, not used."""
     parameters: dict[str, Any] = Field(default_factory=dict)

@@ -57,11 +57,17 @@ class WireFault(Strict):
     """What goes wrong on a wire; see `WireFaultSettings`."""
 
     drop: Chance = 0.0
+    """Chance that an outgoing serial reply or CAN frame is lost."""
     corrupt: Chance = 0.0
+    """Chance that one of its bits is flipped."""
     junk: Chance = 0.0
+    """Chance that random bytes, or a CAN frame with a random identifier, go before it."""
     delay_s: Seconds = 0.0
+    """Time by which everything sent is delayed."""
     split: Annotated[int, Field(ge=0, le=4096)] = 0
+    """Send serial replies in pieces of this many bytes; 0: whole."""
     gap_s: Seconds = 0.02
+    """Pause between these pieces."""
 
     def settings(self) -> WireFaultSettings:
         """Make the settings of a link."""
@@ -74,7 +80,9 @@ class FaultRequest(Strict):
     optical: SkyValues | None = None
     """What the sensor sees besides the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
+    """What goes wrong in the device."""
     serial: WireFault | None = None
+    """What goes wrong on the serial line."""
     can: WireFault | None = None
     """What the device sends on the CAN bus, CANopen's frames too."""
 

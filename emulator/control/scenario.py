@@ -45,9 +45,13 @@ class ScenarioEvent(Strict):
     """What happens at a run time."""
 
     run_time_s: Annotated[float, Field(ge=0.0, le=1e9)]
+    """When: seconds of simulation time since the start."""
     fault: FaultRequest | None = None
+    """Faults to inject, as in the control channel's `fault`."""
     clear_faults: bool = False
+    """End all faults first."""
     truth: TruthConfig | None = None
+    """Another truth, as in the control channel's `set_truth`; not `live`."""
 
     @model_validator(mode="after")
     def _something(self) -> Self:
@@ -81,7 +85,9 @@ class Scenario(Strict):
     """A whole scenario."""
 
     name: str = ""
+    """Name in messages."""
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
+    """Events, in any order."""
 
     def enter(self, emulation: Emulation) -> None:
         """Enter all events into a run whose links are open; what they need is read and checked now.

@@ -44,9 +44,13 @@ class AttitudeConfig(Strict):
     """An attitude: right ascension, declination and roll in degrees, or a quaternion."""
 
     ra_deg: Turn | None = None
+    """Right ascension of the boresight."""
     dec_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    """Declination of the boresight."""
     roll_deg: Turn | None = None
+    """Angle by which celestial north is turned counter-clockwise in the image; 0 if left out."""
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    """Quaternion ICRS to sensor, scalar last, of length 1; in place of the angles."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -75,7 +79,9 @@ class FixedConfig(Strict):
     """An attitude that does not change."""
 
     kind: Literal["fixed"]
+    """Which truth source this is."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    """The attitude."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
@@ -86,8 +92,11 @@ class RateConfig(Strict):
     """A turn at a constant body rate from an attitude."""
 
     kind: Literal["rate"]
+    """Which truth source this is."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    """Attitude at the start."""
     rate_deg_s: Rate
+    """Body rate about x, y and z of the sensor frame."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the turn begins now."""
@@ -98,7 +107,9 @@ class HoldConfig(Strict):
     """Rest for a time."""
 
     do: Literal["hold"]
+    """Which segment this is."""
     seconds: SegmentSeconds
+    """How long."""
 
     def build(self) -> Segment:
         """Make the segment."""
@@ -109,8 +120,11 @@ class TurnConfig(Strict):
     """Turn at a constant body rate for a time."""
 
     do: Literal["rate"]
+    """Which segment this is."""
     seconds: SegmentSeconds
+    """How long."""
     rate_deg_s: Rate
+    """Body rate about x, y and z of the sensor frame."""
 
     def build(self) -> Segment:
         """Make the segment."""
@@ -121,10 +135,15 @@ class SlewToConfig(Strict):
     """Turn about one axis to an attitude, starting and ending at rest."""
 
     do: Literal["slew"]
+    """Which segment this is."""
     to: AttitudeConfig
+    """Attitude at the end."""
     max_rate_deg_s: Annotated[float, Field(ge=1e-6, le=100.0)]
+    """Highest body rate."""
     shape: Literal["smooth", "limited"] = "smooth"
+    """Rate over time: `smooth` (no jump in acceleration), or `limited` (constant acceleration, constant rate, constant deceleration)."""
     acceleration_deg_s2: Annotated[float, Field(ge=1e-6, le=1e6)] = 0.1
+    """Acceleration of `limited`."""
 
     def build(self) -> Segment:
         """Make the segment."""
@@ -143,9 +162,13 @@ class SlewConfig(Strict):
     """A profile of rests, turns and slews."""
 
     kind: Literal["slew"]
+    """Which truth source this is."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    """Attitude at the start."""
     segments: Annotated[list[SegmentConfig], Field(min_length=1)]
+    """Segments, one after the other."""
     repeat: bool = False
+    """Begin again after the last segment."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -157,10 +180,13 @@ class FileConfig(Strict):
     """A table of times and attitudes; a relative path counts from the profile's folder."""
 
     kind: Literal["file"]
+    """Which truth source this is."""
     path: str
+    """CSV file of times and attitudes."""
     start: Literal["run", "now"] = "run"
     """What the file's time zero is: the start of the run, or the moment the source is taken into use."""
     repeat: bool = False
+    """Begin again after the last row."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
@@ -172,12 +198,17 @@ class LiveConfig(Strict):
     """A feed of JSON lines, the message of `starhil.emulator.truth.live`."""
 
     kind: Literal["live"]
+    """Which truth source this is."""
     protocol: Literal["udp", "tcp"] = "udp"
+    """Transport of the feed."""
     host: str = "127.0.0.1"
+    """Address to listen at."""
     port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """0 takes a free port; the ready line tells which."""
+    """Port to listen at; 0 takes a free one, which the ready line names."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
+    """Silence after which the attitude stands still and is flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
+    """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds of simulation time."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude until the first message comes."""
 
