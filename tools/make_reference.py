@@ -1,0 +1,453 @@
+"""Write the tables of docs/ that mirror the code: `python tools/make_reference.py`, after a change of what they show.
+
+A page holds its own text, and between two comments that name it a table that is written here::
+
+    <!-- begin: profile -->
+    …
+    <!-- end: profile -->
+
+tests/test_reference.py compares every table with the code.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import json
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, cast, get_args, get_type_hints
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+DOCS: Final = Path(__file__).resolve().parent.parent / "docs"
+
+UNITS: Final = {
+    "baud": "Bd",
+    "cosmic_rays_s": "1/s",
+    "electrons_s": "electrons/s/px",
+    "epoch": "Julian year",
+    "false_star_magnitudes": "V",
+    "height": "px",
+    "magnitude": "V",
+    "rate_window": "frames",
+    "split": "bytes",
+    "start_unix_s": "Unix time, s",
+    "width": "px",
+}
+"""Units of keys whose names do not end in one."""
+
+SUFFIXES: Final = {"_deg_s2": "°/s²", "_deg_s": "°/s", "_deg": "°", "_px": "px", "_s": "s"}
+"""End of a key → unit, longest first."""
+
+OF_PARAMETERS: Final = ("exposure_s", "gain")
+"""Fields of the sensor model that are parameters of the device, and so no keys of `[sensor]`."""
+
+LARGE: Final = 1e6
+"""Numbers from here on are shown with an exponent."""
+
+Row = tuple[str, str, str, str, str]
+HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
+
+
+# --- parts of a table ---
+
+
+def table(rows: list[Row]) -> str:
+    """Return a Markdown table, without the columns in which no row has anything."""
+    shown = [column for column in range(len(HEAD)) if any(row[column] for row in rows)]
+    lines = [
+        "| " + " | ".join(row[column].replace("|", "\\|") for column in shown) + " |" for row in (HEAD, *rows)
+    ]
+    return "\n".join([lines[0], "|" + "---|" * len(shown), *lines[1:]])
+
+
+def unit(key: str) -> str:
+    """Return the unit of a key, empty if it has none."""
+    return UNITS.get(key) or next((name for end, name in SUFFIXES.items() if key.endswith(end)), "")
+
+
+def literal(value: object) -> str:
+    """Return a value as a TOML file has it."""
+    if isinstance(value, BaseModel):
+        return ", ".join(f"{key} {item:g}" for key, item in value.model_dump(exclude_none=True).items())
+    if value is None or value in ({}, ""):
+        return ""
+    if isinstance(value, float) and value >= LARGE:
+        return f"`{value:g}`"
+    plain = list(value) if isinstance(value, tuple) else value
+    return f"`{json.dumps(plain, ensure_ascii=False)}`"
+
+
+def plain_text(text: str) -> str:
+    """Return a docstring as one line of Markdown: ``name`` becomes `name`."""
+    return " ".join(text.replace("``", "`").split())
+
+
+def attribute_docstrings(model: type) -> dict[str, str]:
+    """Return the docstring under each field of a class.
+
+    Raises
+    ------
+    SystemExit
+        A field has none; the text names it.
+    """
+    module = ast.parse(textwrap.dedent(inspect.getsource(model)))
+    body = next(node.body for node in module.body if isinstance(node, ast.ClassDef))
+    found: dict[str, str] = {}
+    for statement, after in zip(body, [*body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            text = (
+                after.value.value
+                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                else ""
+            )
+            found[statement.target.id] = plain_text(str(text))
+    bare = [name for name, text in found.items() if not text and not name.startswith("_")]
+    if bare:
+        raise SystemExit(
+            f"{model.__module__}.{model.__qualname__}.{bare[0]}: has no docstring; write one under it"
+        )
+    return found
+
+
+def documented_names(item: Any) -> dict[str, str]:
+    """Return name → description from the sections of a numpy docstring."""
+    lines = inspect.cleandoc(item.__doc__ or "").splitlines()
+    found: dict[str, str] = {}
+    names: list[str] = []
+    for line, after in zip(lines, [*lines[1:], ""], strict=True):
+        if line.startswith("    "):
+            for name in names:
+                found[name] = f"{found.get(name, '')} {line.strip()}".strip()
+        elif line and not after.startswith("---"):
+            names = [name.strip() for name in line.partition(" : ")[0].split(",")]
+    return {name: plain_text(text) for name, text in found.items()}
+
+
+# --- pydantic models ---
+
+
+def limits(schema: Mapping[str, Any]) -> str:
+    """Return what a JSON schema allows, in words."""
+    for inner in schema.get("anyOf", ()):
+        if inner.get("type") != "null":
+            return limits(inner)
+    if "enum" in schema or "const" in schema:
+        return ", ".join(f"`{item}`" for item in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        items = limits(schema.get("items", {}))
+        least, most = schema.get("minItems"), schema.get("maxItems")
+        count = f"{least} values" if least == most and least else f"up to {most} values" if most else "list"
+        return f"{count}, each {items}" if items else count
+    low, high = schema.get("minimum"), schema.get("maximum")
+    if "exclusiveMinimum" in schema:
+        above = f"above {schema['exclusiveMinimum']:g}"
+        return above if high is None else f"{above}, to {high:g}"
+    if low is None:
+        return "" if schema.get("type") != "boolean" else "`true`, `false`"
+    if high is None:
+        return f"{low:g} or more"
+    return f"{number(low)} to {number(high)}"
+
+
+def number(value: float) -> str:
+    """Return a number as short as it can be."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def model_rows(model: type[BaseModel]) -> list[Row]:
+    """Return a row for each plain key of a model."""
+    texts, properties = attribute_docstrings(model), model.model_json_schema()["properties"]
+    return [
+        (f"`{name}`", unit(name), limits(properties[name]), default(field), texts[name])
+        for name, field in model.model_fields.items()
+    ]
+
+
+def default(field: FieldInfo) -> str:
+    """Return the default of a field."""
+    if field.is_required():
+        return "required"
+    return "" if field.default is PydanticUndefined else literal(field.default)
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models that an annotation names."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for inner in get_args(annotation) for model in models_in(inner)]
+
+
+# --- the tables ---
+
+
+def profile() -> str:
+    """Every section of a profile whose keys are those of a model, but for the truth."""
+    from starhil.emulator.profile import Profile
+
+    return "\n\n".join(section(name, text, field) for name, text, field in plain_sections(Profile))
+
+
+def plain_sections(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
+    """Yield name, description and model of each section of a profile, sections of sections too."""
+    texts = attribute_docstrings(model)
+    for name, field in model.model_fields.items():
+        models = models_in(field.annotation)
+        if len(models) != 1:
+            continue
+        (inner,) = models
+        if all(models_in(item.annotation) for item in inner.model_fields.values()):
+            yield from plain_sections(inner, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", texts[name], inner
+
+
+def section(name: str, text: str, model: type[BaseModel]) -> str:
+    """Return one section of a profile: heading and table."""
+    return f"### `[{name}]`\n\n{text}\n\n{table(model_rows(model))}"
+
+
+def truth() -> str:
+    """The truth sources, segments of a slew, and an attitude."""
+    from starhil.emulator.truth.config import AttitudeConfig, SegmentConfig, TruthConfig
+
+    parts = [
+        f'### `kind = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
+        for model in models_in(TruthConfig)
+    ]
+    parts += [
+        f'### Segment `do = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
+        for model in models_in(SegmentConfig)
+    ]
+    parts.append(
+        f"### An attitude\n\n{plain_text(AttitudeConfig.__doc__ or '')}\n\n{table(model_rows(AttitudeConfig))}"
+    )
+    return "\n\n".join(parts)
+
+
+def kind_of(model: type[BaseModel]) -> str:
+    """Return the value of a model's first key, by which it is told from its alternatives."""
+    field = next(iter(model.model_fields.values()))
+    return str(get_args(field.annotation)[0])
+
+
+def sensor() -> str:
+    """Keys of `[sensor]`."""
+    from starhil.emulator.sensor.model import _RANGES, SensorModel
+
+    texts = documented_names(SensorModel)
+    rows: list[Row] = []
+    for field in dataclasses.fields(SensorModel):
+        if field.name in OF_PARAMETERS:
+            continue
+        low, high, of = _RANGES.get(field.name, (0, 0, ""))
+        allowed = f"{low:g} to {high:g}" if of else "`8`, `12`, `16`"
+        rows.append((f"`{field.name}`", of, allowed, literal(field.default), texts[field.name]))
+    return table(rows)
+
+
+def sky() -> str:
+    """Keys of `[sky]` and of the tables in it."""
+    from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
+
+    bodies = {
+        "moon": Moon,
+        "sun": SunGlare,
+        "earth": EarthLimb,
+        "planets": PointSource,
+        "obstructions": Obstruction,
+    }
+    parts = [table(dataclass_rows(SkyObjects, skipped=bodies))]
+    for name, body in bodies.items():
+        listed = name.endswith("s")
+        head = f"### `[[sky.{name}]]`" if listed else f"### `[sky.{name}]`"
+        about = plain_text((body.__doc__ or "").partition("\n\n")[0])
+        parts.append(f"{head}\n\n{about}\n\n{table(dataclass_rows(body))}")
+    return "\n\n".join(parts)
+
+
+def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> list[Row]:
+    """Return a row for each field of one of the sky's classes."""
+    from starhil.emulator.sky.objects import _RANGES
+
+    texts = documented_names(kind)
+    rows: list[Row] = []
+    for field in dataclasses.fields(kind):
+        if field.name in (skipped or {}):
+            continue
+        low, high = _RANGES.get(field.name, (None, None))
+        free = low is None or abs(low) >= 1e5
+        allowed = "" if free else f"{number(low)} to {number(high)}"
+        value = "required" if field.default is dataclasses.MISSING else literal(field.default)
+        rows.append((f"`{field.name}`", unit(field.name), allowed, value, texts[field.name]))
+    return rows
+
+
+def identifier() -> str:
+    """Options of each algorithm, as the emulator accepts them in `[identifier]`."""
+    import importlib
+
+    from starid.interface import ALGORITHMS
+
+    parts = []
+    for algorithm, (module, name) in ALGORITHMS.items():
+        solver = getattr(importlib.import_module(module), name)
+        texts = documented_names(solver)
+        for options in get_args(get_type_hints(solver.__init__).get("options")):
+            if dataclasses.is_dataclass(options):
+                for kind in reversed(inspect.getmro(cast("type", options))[:-1]):
+                    texts |= documented_names(kind)
+        rows: list[Row] = [(f"`{name}`", "", "", "", texts[name]) for name in accepted_options(algorithm)]
+        parts.append(f'### With `run.algorithm = "{algorithm}"`\n\n{table(rows)}')
+    return "\n\n".join(parts)
+
+
+def accepted_options(algorithm: str) -> list[str]:
+    """Return the options that the emulator names when it rejects another."""
+    from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.pipeline.identifiers import IdentifierChoice
+    from starid.camera import DEFAULT_CAMERA
+    from starid.catalog import load_catalog
+
+    try:
+        IdentifierChoice(algorithm, DEFAULT_CAMERA, 1.0, (("no_option", 1),)).make(load_catalog())
+    except EmulatorError as error:
+        return str(error).partition("known: ")[2].split(", ")
+    raise SystemExit(f"{algorithm}: accepts an option that it does not have")
+
+
+def faults() -> str:
+    """Keys of the tables of a `fault` request, but for the optical ones, which are those of `[sky]`."""
+    from starhil.emulator.control.faults import DeviceFault, WireFault
+    from starhil.protocol.icd import load_icd
+
+    enums = load_icd().enums
+    rows = []
+    for row in model_rows(DeviceFault):
+        enum = enums.get({"`error`": "device_error", "`reset`": "reset_cause"}.get(row[0], ""))
+        allowed = row[2] if enum is None else ", ".join(f"`{name}`" for name in enum.values)
+        rows.append((row[0], row[1], allowed, row[3], row[4]))
+    return (
+        f"### `device`\n\n{table(rows)}\n\n### `serial`, `can`\n\n"
+        f"`can` is what the device sends on the CAN bus, CANopen included.\n\n{table(model_rows(WireFault))}"
+    )
+
+
+def scenario() -> str:
+    """Keys of an event of a scenario."""
+    from starhil.emulator.control.scenario import ScenarioEvent
+
+    return table(model_rows(ScenarioEvent))
+
+
+def commands() -> str:
+    """Every command of the command line, with its arguments and options."""
+    import typer.main
+
+    from starhil.emulator.cli.app import COMMANDS, build_app
+
+    app: Any = typer.main.get_command(build_app())
+    return "\n\n".join(
+        part for name in COMMANDS for part in command_parts(f"starhil {name}", app.commands[name])
+    )
+
+
+def command_parts(name: str, command: Any) -> Iterator[str]:
+    """Yield the section of a command, or those of the commands of a group."""
+    if hasattr(command, "commands"):
+        for inner, item in command.commands.items():
+            yield from command_parts(f"{name} {inner}", item)
+        return
+    shown = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
+    arguments = [parameter for parameter in shown if parameter.param_type_name == "argument"]
+    usage = " ".join([name, *("[options]",), *(argument_usage(item) for item in arguments)])
+    rows = ["| option | default | meaning |\n|---|---|---|", *(option_row(item) for item in shown)]
+    text = "\n\n".join(plain_text(part) for part in inspect.cleandoc(command.help or "").split("\n\n"))
+    yield f"## {name}\n\n{text}\n\n    {usage}\n\n" + "\n".join(rows)
+
+
+def argument_usage(parameter: Any) -> str:
+    """Return an argument as a usage line has it."""
+    name = argument_name(parameter) + ("…" if parameter.nargs == -1 else "")
+    return name if parameter.required else f"[{name}]"
+
+
+def argument_name(parameter: Any) -> str:
+    """Return the name of an argument; one that would hide a Python name ends in an underscore there."""
+    return str(parameter.name).rstrip("_").upper()
+
+
+def option_row(parameter: Any) -> str:
+    """Return the row of an argument or option."""
+    argument = parameter.param_type_name == "argument"
+    names = [argument_name(parameter)] if argument else [*parameter.opts, *parameter.secondary_opts]
+    value = (
+        "required"
+        if parameter.required
+        else ""
+        if callable(parameter.default)
+        else shown_default(parameter.default)
+    )
+    low, high = getattr(parameter, "min", None), getattr(parameter, "max", None)
+    bounds = (
+        ""
+        if low is None and high is None
+        else f" {low:g} or more."
+        if high is None
+        else f" {low:g} to {high:g}."
+    )
+    text = plain_text(parameter.help or "").replace("|", "\\|") + bounds
+    return f"| {', '.join(f'`{name}`' for name in names)} | {value} | {text} |"
+
+
+def shown_default(value: Any) -> str:
+    """Return the default of an option; flags that are off and options that are not given have none."""
+    if value is None or value is False or value in ("", (), []):
+        return ""
+    return f"`{' '.join(str(item) for item in value)}`" if isinstance(value, tuple | list) else f"`{value}`"
+
+
+TABLES: Final[dict[str, Callable[[], str]]] = {
+    "commands": commands,
+    "faults": faults,
+    "identifier": identifier,
+    "profile": profile,
+    "scenario": scenario,
+    "sensor": sensor,
+    "sky": sky,
+    "truth": truth,
+}
+"""Name of a table in a page → what writes it."""
+
+_BLOCK: Final = re.compile(r"(<!-- begin: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
+
+
+def with_tables(page: str) -> str:
+    """Return a page with its tables as the code is now."""
+    return _BLOCK.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n\n{found[3]}", page)
+
+
+def pages() -> list[Path]:
+    """Pages that hold tables of the code."""
+    return [path for path in sorted(DOCS.glob("*.md")) if _BLOCK.search(path.read_text(encoding="utf-8"))]
+
+
+def main() -> None:
+    """Write the tables of all pages."""
+    for path in pages():
+        text = path.read_text(encoding="utf-8")
+        new = with_tables(text)
+        if new != text:
+            path.write_text(new, encoding="utf-8")
+            print(f"{path.name}: written", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
