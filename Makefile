@@ -1,6 +1,7 @@
 # make demo        set up and run the product end to end; results in out/demo
 # make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
 # make lint        ruff, mypy --strict and the contracts of imports
+# make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
 # make cosmos      the COSMOS export, read by OpenC3's own reader (installed apart, 220 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
@@ -12,7 +13,7 @@ BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint reproduce fuzz soak cosmos clean
+.PHONY: help demo test lint docs reproduce fuzz soak cosmos clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -38,6 +39,16 @@ lint: $(VENV)/.developer
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+$(VENV)/.docs: $(VENV)/.product
+	$(BIN)/pip install --quiet --editable '.[docs]'
+	@touch $@
+
+docs: $(VENV)/.docs
+	$(BIN)/python tools/make_reference.py
+	rm -rf out/docs
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html --doctree-dir out/doctrees docs out/docs
+	@echo "out/docs/index.html"
 
 reproduce: $(VENV)/.product
 	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)

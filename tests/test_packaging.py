@@ -1,0 +1,47 @@
+"""The version stands once, and whatever repeats it agrees; the long description needs nothing beside it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def project_version() -> str:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+
+
+def test_the_installed_version_is_that_of_the_project():
+    assert importlib.metadata.version("starhil") == project_version()
+
+
+def test_the_command_prints_the_version():
+    done = subprocess.run(
+        [sys.executable, "-c", "from starhil.emulator.cli import main; main()", "--version"],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert done.stdout == f"starhil {project_version()}\n"
+
+
+def test_the_citation_names_the_version():
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (.*)$", text, re.MULTILINE) == [project_version()]
+
+
+def test_the_changelog_begins_with_what_is_unreleased_and_then_the_version():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    titles = re.findall(r"^## \[(.*?)\]( - \d{4}-\d\d-\d\d)?$", text, re.MULTILINE)
+    assert titles[0] == ("Unreleased", "")
+    assert titles[1][0] == project_version()
+    assert titles[1][1]
+
+
+def test_the_long_description_has_no_relative_link_or_image():
+    description = importlib.metadata.metadata("starhil").get_payload()
+    assert description.startswith("# starhil")
+    assert not re.findall(r"\]\((?!https?:)", description)
