@@ -46,7 +46,7 @@ $(VENV)/.docs: $(VENV)/.product
 
 docs: $(VENV)/.docs
 	$(BIN)/python tools/make_reference.py
-	rm -rf out/docs
+	rm -rf out/docs out/doctrees
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html --doctree-dir out/doctrees docs out/docs
 	@echo "out/docs/index.html"
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
@@ -16,7 +18,7 @@ exclude_patterns = ["_build"]
 
 html_theme = "furo"
 html_static_path = ["_static"]
-html_css_files = ["wide_tables.css"]
+html_css_files = ["starhil.css"]
 html_copy_source = False
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#1f4e79", "color-brand-content": "#1f4e79"},
@@ -35,14 +37,47 @@ napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 
+LINKS = {
+    "docs/": "",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "CITATION.cff": "../CITATION.cff",
+}
+"""Beginning of a link in the README → what it is among the pages."""
+
 
 def put_readme_first(_app: Sphinx, page: str, source: list[str]) -> None:
-    """Begin the front page with the README, whose links count from the folder above."""
+    """Begin the front page with the README, its links turned to those of the pages here."""
     if page == "index":
-        readme = Path(__file__).resolve().parent.parent / "README.md"
-        source[0] = readme.read_text(encoding="utf-8").replace("](docs/", "](") + "\n" + source[0]
+        text = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
+        for there, here in LINKS.items():
+            text = text.replace(f"]({there}", f"]({here}")
+        source[0] = f"{text}\n{source[0]}"
+
+
+ARRAY = re.compile(r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[(~[\w.]+)\]\]")
+ARRAY_LIKE = re.compile(r"~numpy\._typing\._array_like\._Buffer \|.*?\[complex \| bytes \| str\]")
+
+
+def shorten_array_types(_app: Sphinx, *signature: Any) -> tuple[str | None, str | None]:
+    """Write the types of numpy in a signature as its documentation does; docstrings give shapes and units."""
+    arguments, returned = (
+        ARRAY_LIKE.sub("ArrayLike", ARRAY.sub(r"~numpy.ndarray[\1]", text)) if text else text
+        for text in signature[-2:]
+    )
+    return arguments, returned
+
+
+def keep_whole_sentences(
+    _app: Sphinx, what: str, _name: str, _item: Any, _options: Any, lines: list[str]
+) -> None:
+    """Put an empty line before a property's text: napoleon takes what is before a colon in the first one for a type."""
+    if what in ("property", "attribute"):
+        lines.insert(0, "")
 
 
 def setup(app: Sphinx) -> None:
     """Connect what this file adds."""
+    app.connect("autodoc-process-signature", shorten_array_types)
+    app.connect("autodoc-process-docstring", keep_whole_sentences, priority=400)
     app.connect("source-read", put_readme_first)

@@ -32,7 +32,7 @@ T = TypeVar("T")
 class ObcClient:
     """The same client as plain calls, for scripts, tests and the prompt; its event loop runs in a thread of its own.
 
-    Make one with `ObcClient.open(...)` and use it as a context manager:
+    Make one with `ObcClient.open(...)` and use it as a context manager::
 
         with ObcClient.open(serial="/dev/pts/3") as obc:
             obc.command("set_mode", mode="lost_in_space")

@@ -1,4 +1,4 @@
-"""Pytest plugin: fixtures that put a star sensor on a serial line or a CAN bus, emulated or real.
+"""Pytest plugin: fixtures that put a star sensor on a serial line or a CAN bus, emulated or real::
 
     def test_it_tracks(starhil_serial):
         starhil_serial.command("set_mode", mode="lost_in_space")

@@ -50,7 +50,7 @@ OF_PARAMETERS: Final = ("exposure_s", "gain")
 """Fields of the sensor model that are parameters of the device, and so no keys of `[sensor]`."""
 
 LARGE: Final = 1e6
-"""Numbers from here on are shown with an exponent."""
+"""Numbers from here on are shown with an exponent where that loses nothing."""
 
 Row = tuple[str, str, str, str, str]
 HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
@@ -79,7 +79,7 @@ def literal(value: object) -> str:
         return ", ".join(f"{key} {item:g}" for key, item in value.model_dump(exclude_none=True).items())
     if value is None or value in ({}, ""):
         return ""
-    if isinstance(value, float) and value >= LARGE:
+    if isinstance(value, float) and value >= LARGE and float(f"{value:g}") == value:
         return f"`{value:g}`"
     plain = list(value) if isinstance(value, tuple) else value
     return f"`{json.dumps(plain, ensure_ascii=False)}`"
