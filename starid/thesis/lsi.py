@@ -24,11 +24,13 @@ from starid.thesis.database import DatabaseError, FeatureDatabase
 from starid.thesis.features import FeatureVector
 from starid.thesis.frame_grid import DICTIONARY_SIZE, dictionary_cells
 from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
+from starid.thesis.matlab_lasso import matlab_path
 
 Precision = Literal["exact", "stored"]
 Choice = Literal["mse", "1se"]
+Solver = Literal["exact", "matlab"]
 
-_FULL_TURN: Final = 360.0
+_WHOLE_SKY_DEG: Final = 720.0
 _RESULT_SIZE: Final = 16
 _LEAST_WEIGHT: Final = 1e-3
 
@@ -47,12 +49,15 @@ class SearchedCells(NamedTuple):
         Stored codes, (m, 5) and (m,); a cell without stars has the polar angle 255.
     exact
         Distances and dictionaries in full precision, not from the codes.
+    matlab
+        The LASSO as MATLAB's function `lasso` solves it, not its exact path.
     """
 
     arrays: CellArrays
     features: NDArray[np.uint8]
     theta: NDArray[np.uint8]
     exact: bool
+    matlab: bool
 
 
 class LsiWork(NamedTuple):
@@ -315,7 +320,10 @@ def estimate_from_cell(
     fill_dictionary(searched, cell, work)
     path = np.empty((lambdas.size, 9))
     error = np.empty(lambdas.size)
-    lasso_path(work.dictionary, observation, lambdas, path)
+    if searched.matlab:
+        matlab_path(work.dictionary, observation, lambdas, path)
+    else:
+        lasso_path(work.dictionary, observation, lambdas, path)
     chosen = choose_lambdas(work.dictionary, observation, path, error)
     estimate_from_path(searched, cell, observation, lambdas, path, chosen, work)
 
@@ -349,14 +357,19 @@ def region_nearest(
     ra_deg: float,
     dec_deg: float,
     side_deg: float,
+    theta: float,
     found: NDArray[np.float64],
 ) -> int:
     """Find the nearest neighbour among the cells of a square region of search; −1 if the region holds no cell.
+
+    The cells are looked at one by one, as in the thesis; a side of 720° takes in the whole database.
 
     Parameters
     ----------
     ra_deg, dec_deg, side_deg
         Centre and side Γ of the square, degrees; it wraps in right ascension and is cut off at the grid's edges.
+    theta
+        Polar angle of the frame object, radians, to count as a sixth feature with 100 for a full turn; NaN leaves it out.
     found
         Output (2,): distance on the normalised scale and number of cells in the region.
     """
@@ -391,11 +404,17 @@ def region_nearest(
             if d >= best:
                 continue
             if searched.exact:
-                exact_vector(arrays, cell, sums, vector)
+                angle = exact_vector(arrays, cell, sums, vector)
                 d = 0.0
                 for f in range(5):
                     gap = (vector[f] - observation[f]) * 2.55
                     d += gap * gap
+            else:
+                angle = searched.theta[cell] * (2.0 * math.pi / 255.0)
+            if not math.isnan(theta):
+                turn = (angle - theta) / (2.0 * math.pi)
+                gap = 255.0 * (turn - round(turn))
+                d += gap * gap
             if d < best:
                 best = d
                 best_cell = cell
@@ -417,20 +436,29 @@ class LostInSpace:
     precision
         "exact": distances and dictionaries in full precision, computed from the stars where the stored codes leave a
         doubt; this is what the published accuracy was made with. "stored": the 8-bit codes as they are.
+    solver
+        "exact": the LASSO's path, exactly. "matlab": as MATLAB's function `lasso` solves it by default, which is what
+        the published accuracy was made with.
 
     Raises
     ------
     DatabaseError
-        If the precision is unknown.
+        If the precision or the solver is unknown.
     """
 
-    def __init__(self, database: FeatureDatabase, *, precision: Precision = "exact") -> None:
+    def __init__(
+        self, database: FeatureDatabase, *, precision: Precision = "exact", solver: Solver = "exact"
+    ) -> None:
         if precision not in ("exact", "stored"):
             raise DatabaseError(f"LSI: precision {precision!r} is unknown; one of exact, stored is needed")
+        if solver not in ("exact", "matlab"):
+            raise DatabaseError(f"LSI: solver {solver!r} is unknown; one of exact, matlab is needed")
         self.database = database
         self.index = make_cell_index(database)
         self.arrays = cell_arrays(database)
-        self.searched = SearchedCells(self.arrays, database.features, database.theta, precision == "exact")
+        self.searched = SearchedCells(
+            self.arrays, database.features, database.theta, precision == "exact", solver == "matlab"
+        )
 
     def solve(self, features: FeatureVector) -> LsiSolution:
         """Estimate boresight and roll from the features of one frame, searching the whole database."""
@@ -449,10 +477,16 @@ class LostInSpace:
         nearest = lsi_kernel(self.index, self.searched, observation, LAMBDAS, work)
         return _solution(observation, nearest, float(work.found[0]), work)
 
-    def nearest(self, observation: NDArray[np.float64]) -> tuple[int, float]:
-        """Nearest cell of the whole database and its distance, for a normalised observation; the search alone."""
+    def nearest(self, observation: NDArray[np.float64], *, theta_rad: float = math.nan) -> tuple[int, float]:
+        """Nearest cell of the whole database and its distance, for a normalised observation; the search alone.
+
+        With a polar angle that counts as a sixth feature, 100 for a full turn; the answer then depends on the roll.
+        """
         self._check(observation)
         found = np.empty(2)
+        if not math.isnan(theta_rad):
+            cell = region_nearest(self.searched, observation, 0.0, 0.0, _WHOLE_SKY_DEG, theta_rad, found)
+            return cell, float(found[0])
         if self.searched.exact:
             return exact_nearest(self.index, self.arrays, observation, found), float(found[0])
         cells = np.empty(1, dtype=np.int64)
@@ -460,12 +494,21 @@ class LostInSpace:
         return int(cells[0]), math.sqrt(found[0]) / 2.55
 
     def nearest_in_region(
-        self, observation: NDArray[np.float64], ra_deg: float, dec_deg: float, side_deg: float
+        self,
+        observation: NDArray[np.float64],
+        ra_deg: float,
+        dec_deg: float,
+        side_deg: float,
+        *,
+        theta_rad: float = math.nan,
     ) -> tuple[int, float, int]:
-        """Nearest cell of a square region, its distance, and how many cells the region holds; cell −1 if none."""
+        """Nearest cell of a square region, its distance, and how many cells the region holds; cell −1 if none.
+
+        A polar angle counts as in `nearest`.
+        """
         self._check(observation)
         found = np.empty(2)
-        cell = region_nearest(self.searched, observation, ra_deg, dec_deg, side_deg, found)
+        cell = region_nearest(self.searched, observation, ra_deg, dec_deg, side_deg, theta_rad, found)
         return cell, float(found[0]), int(found[1])
 
     def estimate(self, observation: NDArray[np.float64], cell: int, distance: float) -> LsiSolution:
