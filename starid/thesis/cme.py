@@ -1,10 +1,14 @@
-"""Camera motion between two frames: rotation and translation of the matched stars, by maximum likelihood (MLESAC)."""
+"""Camera motion between two frames: a transformation of the matched stars, by maximum likelihood (MLESAC).
+
+The thesis fits an affine transformation, which has six degrees of freedom; a camera's motion has three, and the rigid
+transformation that is fitted unless asked otherwise uses the stars for these alone.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +16,10 @@ from numpy.typing import NDArray
 from starid.jit import compiled
 from starid.thesis.false_stars import FilterError
 
+MotionModel = Literal["rigid", "affine"]
+
 MAX_TRIALS: Final = 300
-"""Most pairs of stars that hypotheses are drawn from; fewer stars are tried in all pairs."""
+"""Most pairs (affine: triples) of stars that hypotheses are drawn from; fewer pairs are all tried."""
 
 LIKELY_FLOOR_DEG: Final = 1e-3
 """Least standard deviation assumed of a star's displacement in the likelihood, degrees."""
@@ -21,6 +27,8 @@ LIKELY_FLOOR_DEG: Final = 1e-3
 _EM_ROUNDS: Final = 3
 _SEED: Final = 20_221_017
 _OUTLIER_SPAN_DEG: Final = 42.0
+_AFFINE_SAMPLE: Final = 3
+_IN_A_LINE: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +40,7 @@ class CameraMotion:
     matrix
         Transformation matrix H, (3, 3), of homogeneous positions in degrees: c' = H·c, eq. 3.2.
     rotation_deg
-        Rotation angle γ̃ of its rotation matrix (eq. 3.12), degrees.
+        Rotation angle γ̃ of its rotation matrix (eq. 3.12), of an affine one the rotation nearest to it, degrees.
     translation_deg
         Translation ρ̃, (2,), degrees.
     mean_distance_deg
@@ -97,16 +105,85 @@ def rigid_fit(
 
 
 @compiled
+def affine_fit(
+    before: NDArray[np.float64],
+    now: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    matrix: NDArray[np.float64],
+) -> bool:
+    """Least-squares affine transformation of the chosen stars into `matrix` (2, 3); False below three, or in a line."""
+    count = 0
+    centre = np.zeros(4)
+    for i in range(chosen.size):
+        if chosen[i]:
+            count += 1
+            centre[0] += before[i, 0]
+            centre[1] += before[i, 1]
+            centre[2] += now[i, 0]
+            centre[3] += now[i, 1]
+    if count < _AFFINE_SAMPLE:
+        return False
+    centre /= count
+    xx = xy = yy = xu = yu = xv = yv = 0.0
+    for i in range(chosen.size):
+        if chosen[i]:
+            x = before[i, 0] - centre[0]
+            y = before[i, 1] - centre[1]
+            u = now[i, 0] - centre[2]
+            v = now[i, 1] - centre[3]
+            xx += x * x
+            xy += x * y
+            yy += y * y
+            xu += x * u
+            yu += y * u
+            xv += x * v
+            yv += y * v
+    determinant = xx * yy - xy * xy
+    if determinant <= _IN_A_LINE * (xx + yy) ** 2:
+        return False
+    matrix[0, 0] = (xu * yy - yu * xy) / determinant
+    matrix[0, 1] = (yu * xx - xu * xy) / determinant
+    matrix[1, 0] = (xv * yy - yv * xy) / determinant
+    matrix[1, 1] = (yv * xx - xv * xy) / determinant
+    for row in range(2):
+        matrix[row, 2] = centre[2 + row] - matrix[row, 0] * centre[0] - matrix[row, 1] * centre[1]
+    return True
+
+
+@compiled
+def fit(
+    before: NDArray[np.float64],
+    now: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    affine: bool,
+    matrix: NDArray[np.float64],
+) -> bool:
+    """Least-squares transformation of the chosen stars, rigid or affine, into `matrix` (2, 3); False with too few."""
+    if affine:
+        return affine_fit(before, now, chosen, matrix)
+    motion = np.empty(4)
+    if not rigid_fit(before, now, chosen, motion):
+        return False
+    matrix[0, 0] = motion[0]
+    matrix[0, 1] = -motion[1]
+    matrix[1, 0] = motion[1]
+    matrix[1, 1] = motion[0]
+    matrix[0, 2] = motion[2]
+    matrix[1, 2] = motion[3]
+    return True
+
+
+@compiled
 def transform_distances(
     before: NDArray[np.float64],
     now: NDArray[np.float64],
-    motion: NDArray[np.float64],
+    matrix: NDArray[np.float64],
     distances: NDArray[np.float64],
 ) -> None:
     """Write the distance of each transformed star from where it was seen."""
     for i in range(distances.size):
-        x = motion[0] * before[i, 0] - motion[1] * before[i, 1] + motion[2] - now[i, 0]
-        y = motion[1] * before[i, 0] + motion[0] * before[i, 1] + motion[3] - now[i, 1]
+        x = matrix[0, 0] * before[i, 0] + matrix[0, 1] * before[i, 1] + matrix[0, 2] - now[i, 0]
+        y = matrix[1, 0] * before[i, 0] + matrix[1, 1] * before[i, 1] + matrix[1, 2] - now[i, 1]
         distances[i] = math.sqrt(x * x + y * y)
 
 
@@ -132,16 +209,48 @@ def _negative_log_likelihood(distances: NDArray[np.float64], sigma: float) -> fl
 
 
 @compiled
+def _draw(
+    stars: int,
+    affine: bool,
+    every: bool,
+    trial: int,
+    state: int,
+    chosen: NDArray[np.bool_],
+) -> int:
+    """Choose the stars of a hypothesis, the next pair in order or some at random; return the generator's state."""
+    chosen[:] = False
+    if every:
+        first = 0
+        left = trial
+        while left >= stars - 1 - first:
+            left -= stars - 1 - first
+            first += 1
+        chosen[first] = True
+        chosen[first + 1 + left] = True
+        return state
+    wanted = _AFFINE_SAMPLE if affine else 2
+    count = 0
+    while count < wanted:
+        state = (state * 1103515245 + 12345) & 0x7FFFFFFF
+        pick = (state >> 8) % stars
+        if not chosen[pick]:
+            chosen[pick] = True
+            count += 1
+    return state
+
+
+@compiled
 def mlesac(
     before: NDArray[np.float64],
     now: NDArray[np.float64],
     threshold: float,
     trials: int,
     seed: int,
-    motion: NDArray[np.float64],
+    affine: bool,
+    matrix: NDArray[np.float64],
     inliers: NDArray[np.bool_],
 ) -> bool:
-    """Find the rigid motion of greatest likelihood and refit it to its inliers; False if there is none.
+    """Find the transformation of greatest likelihood and refit it to its inliers; False if there is none.
 
     Parameters
     ----------
@@ -153,52 +262,41 @@ def mlesac(
         Most hypotheses; all pairs are tried if they are fewer.
     seed
         Of the draws.
-    motion, inliers
-        Output: (cos, sin, x, y) and (m,).
+    affine
+        Fit an affine transformation to three stars or more, not a rigid one to two or more.
+    matrix, inliers
+        Output: transformation (2, 3) and (m,).
     """
     m = before.shape[0]
-    if m < 2:
+    if m < (_AFFINE_SAMPLE if affine else 2):
         return False
     pairs = m * (m - 1) // 2
+    every = not affine and pairs <= trials
     state = seed & 0x7FFFFFFF
-    trial = np.empty(4)
+    trial = np.empty((2, 3))
     chosen = np.zeros(m, dtype=np.bool_)
     distances = np.empty(m)
     sigma = max(threshold / 3.0, LIKELY_FLOOR_DEG)
     best = math.inf
-    first = 0
-    second = 0
-    for _ in range(min(pairs, trials)):
-        if pairs <= trials:
-            second += 1
-            if second >= m:
-                first += 1
-                second = first + 1
-        else:
-            state = (state * 1103515245 + 12345) & 0x7FFFFFFF
-            first = (state >> 8) % m
-            state = (state * 1103515245 + 12345) & 0x7FFFFFFF
-            second = (first + 1 + (state >> 8) % (m - 1)) % m
-        chosen[:] = False
-        chosen[first] = True
-        chosen[second] = True
-        if not rigid_fit(before, now, chosen, trial):
+    for number in range(pairs if every else trials):
+        state = _draw(m, affine, every, number, state, chosen)
+        if not fit(before, now, chosen, affine, trial):
             continue
         transform_distances(before, now, trial, distances)
         cost = _negative_log_likelihood(distances, sigma)
         if cost < best:
             best = cost
-            motion[:] = trial
+            matrix[:] = trial
     if best == math.inf:
         return False
     for _ in range(_EM_ROUNDS):
-        transform_distances(before, now, motion, distances)
+        transform_distances(before, now, matrix, distances)
         for i in range(m):
             inliers[i] = distances[i] <= threshold
-        if not rigid_fit(before, now, inliers, trial):
+        if not fit(before, now, inliers, affine, trial):
             break
-        motion[:] = trial
-    transform_distances(before, now, motion, distances)
+        matrix[:] = trial
+    transform_distances(before, now, matrix, distances)
     for i in range(m):
         inliers[i] = distances[i] <= threshold
     return True
@@ -211,6 +309,7 @@ def estimate_motion(
     threshold_deg: float = 1.0,
     trials: int = MAX_TRIALS,
     seed: int = _SEED,
+    model: MotionModel = "rigid",
 ) -> CameraMotion:
     """Estimate the camera motion from matched stars (line 5 of algorithm 2).
 
@@ -222,33 +321,34 @@ def estimate_motion(
         Distance η beyond which a match is an outlier.
     trials, seed
         Most hypotheses drawn, and the seed of the draws.
+    model
+        "rigid": rotation and translation. "affine": any 2×2 matrix and translation, as the thesis has it.
 
     Raises
     ------
     FilterError
-        If there are fewer than two matches, or all of them fall together.
+        If there are fewer than two matches (affine: three), or all of them fall together (affine: in a line).
     """
+    if model not in ("rigid", "affine"):
+        raise FilterError(f"motion: model {model!r} is unknown; one of rigid, affine is needed")
     first = np.ascontiguousarray(before, dtype=np.float64)
     second = np.ascontiguousarray(now, dtype=np.float64)
-    motion = np.empty(4)
+    matrix = np.empty((2, 3))
     inliers = np.zeros(first.shape[0], dtype=np.bool_)
     if (
         first.shape != second.shape
         or first.ndim != 2
-        or not mlesac(first, second, threshold_deg, trials, seed, motion, inliers)
+        or not mlesac(first, second, threshold_deg, trials, seed, model == "affine", matrix, inliers)
     ):
-        raise FilterError(
-            f"motion: {first.shape[0]} matched stars; at least two in different places are needed"
-        )
+        needed = "three in a triangle" if model == "affine" else "two in different places"
+        raise FilterError(f"motion: {first.shape[0]} matched stars; at least {needed} are needed")
     distances = np.empty(first.shape[0])
-    transform_distances(first, second, motion, distances)
+    transform_distances(first, second, matrix, distances)
     kept = distances[inliers] if inliers.any() else distances
-    cosine, sine, x, y = motion.tolist()
-    matrix = np.array([[cosine, -sine, x], [sine, cosine, y], [0.0, 0.0, 1.0]])
     return CameraMotion(
-        matrix,
-        math.degrees(math.atan2(sine, cosine)),
-        motion[2:].copy(),
+        np.vstack([matrix, [0.0, 0.0, 1.0]]),
+        math.degrees(math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])),
+        matrix[:, 2].copy(),
         float(kept.mean()),
         float(kept.std(ddof=1)) if kept.size > 1 else 0.0,
         inliers,

@@ -1,6 +1,6 @@
 """The thesis's false-star filter: pairs of objects in two frames, and the cluster of their differences (algorithm 2).
 
-The list of differences grows with the fourth power of the number of objects; beyond two dozen objects the filter of
+The list of differences grows with the fourth power of the number of objects; beyond four dozen objects the filter of
 `starid.thesis.scalable_filter` takes its place.
 """
 
@@ -22,8 +22,10 @@ EPSILON: Final = 0.4
 MIN_SAMPLES_SHARE: Final = 0.5
 """Least number of members of a neighbourhood, as a share of the number of objects."""
 
-MAX_OBJECTS: Final = 24
-"""Most objects in a frame: 276 pairs, 76 176 disparities."""
+MAX_OBJECTS: Final = 48
+"""Most objects in a frame: 1 128 pairs, 1 272 384 disparities."""
+
+_MOST_BINS: Final = 1_048_576
 
 
 def pair_count(objects: int) -> int:
@@ -76,26 +78,58 @@ def disparity_list(
 
 
 @compiled
+def _bin_points(
+    points: NDArray[np.float64], side: float, order: NDArray[np.int64], shape: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Sort points into square bins of their second and third coordinate; return each point's bin and the bins' starts.
+
+    `order` (n,) receives the points bin by bin, in their own order within each, `shape` (2,) the number of bins.
+    """
+    n = points.shape[0]
+    low = np.array([points[:, 1].min(), points[:, 2].min()])
+    for axis in range(2):
+        shape[axis] = int((points[:, 1 + axis].max() - low[axis]) / side) + 1
+    where = np.empty(n, dtype=np.int64)
+    start = np.zeros(shape[0] * shape[1] + 1, dtype=np.int64)
+    for i in range(n):
+        first = int((points[i, 1] - low[0]) / side)
+        second = int((points[i, 2] - low[1]) / side)
+        where[i] = first * shape[1] + second
+        start[where[i] + 1] += 1
+    for b in range(start.size - 1):
+        start[b + 1] += start[b]
+    fill = start.copy()
+    for i in range(n):
+        order[fill[where[i]]] = i
+        fill[where[i]] += 1
+    return where, start
+
+
+@compiled
 def _neighbours(
-    points: NDArray[np.float64], order: NDArray[np.int64], at: int, epsilon: float, found: NDArray[np.int64]
+    points: NDArray[np.float64],
+    bins: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+    here: int,
+    epsilon: float,
+    found: NDArray[np.int64],
 ) -> int:
-    """Write the places (in sorted order) of all points within ε of the one at place `at`; return how many."""
+    """Write all points within ε of one, itself included; return how many. The bins are not narrower than ε."""
+    order, shape, where, start = bins
     count = 0
     limit = epsilon * epsilon
-    here = order[at]
-    for side in range(2):
-        place = at if side == 0 else at - 1
-        while 0 <= place < order.size:
-            there = order[place]
-            d1 = points[there, 1] - points[here, 1]
-            if abs(d1) > epsilon:
-                break
+    row = where[here] // shape[1]
+    column = where[here] % shape[1]
+    for r in range(max(row - 1, 0), min(row + 2, shape[0])):
+        begin = start[r * shape[1] + max(column - 1, 0)]
+        end = start[r * shape[1] + min(column + 1, shape[1] - 1) + 1]
+        for k in range(begin, end):
+            there = order[k]
             d0 = points[there, 0] - points[here, 0]
+            d1 = points[there, 1] - points[here, 1]
             d2 = points[there, 2] - points[here, 2]
             if d0 * d0 + d1 * d1 + d2 * d2 <= limit:
-                found[count] = place
+                found[count] = there
                 count += 1
-            place += 1 if side == 0 else -1
     return count
 
 
@@ -104,19 +138,26 @@ def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: f
     """Label the density-based clusters of a list of points (n, 3); −1 is an outlier (eq. 3.1).
 
     The same labels as scikit-learn's DBSCAN: clusters are numbered by their first core point, a border point goes to
-    the first cluster that reaches it. Neighbours are sought along the sorted second coordinate, the separation,
-    which spreads most.
+    the first cluster that reaches it. Neighbours are sought in bins of the second and third coordinate, the separation
+    and the slope, which spread most.
     """
     n = points.shape[0]
     labels = np.full(n, -1, dtype=np.int64)
-    order = np.argsort(points[:, 1], kind="mergesort")
-    place = np.empty(n, dtype=np.int64)
-    for i in range(n):
-        place[order[i]] = i
+    if n == 0:
+        return labels
+    width = points[:, 1].max() - points[:, 1].min()
+    height = points[:, 2].max() - points[:, 2].min()
+    # a little wider than ε, as the quotient of a point on a bin's edge may round either way
+    side = max(1.000001 * epsilon, math.sqrt((width + epsilon) * (height + epsilon) / _MOST_BINS))
+    side = max(side, max(width, height) / _MOST_BINS)
+    order = np.empty(n, dtype=np.int64)
+    shape = np.empty(2, dtype=np.int64)
+    where, start = _bin_points(points, side, order, shape)
+    bins = (order, shape, where, start)
     found = np.empty(n, dtype=np.int64)
     core = np.zeros(n, dtype=np.bool_)
     for i in range(n):
-        core[i] = _neighbours(points, order, place[i], epsilon, found) >= min_samples
+        core[i] = _neighbours(points, bins, i, epsilon, found) >= min_samples
     stack = np.empty(n, dtype=np.int64)
     label = 0
     for i in range(n):
@@ -127,9 +168,9 @@ def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: f
         top = 1
         while top > 0:
             top -= 1
-            count = _neighbours(points, order, place[stack[top]], epsilon, found)
+            count = _neighbours(points, bins, stack[top], epsilon, found)
             for k in range(count):
-                j = order[found[k]]
+                j = found[k]
                 if labels[j] == -1:
                     labels[j] = label
                     if core[j]:

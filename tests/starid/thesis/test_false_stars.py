@@ -41,6 +41,18 @@ def test_clusters_are_those_of_scikit_learn(seed):
     np.testing.assert_array_equal(density_clusters(disparities, 0.4, least), expected)
 
 
+@pytest.mark.parametrize("spread", [0.01, 0.3, 5.0, 500.0])
+def test_clusters_of_any_extent_are_those_of_scikit_learn(spread):
+    points = np.random.default_rng(8).normal(0.0, spread, (400, 3))
+    points[::3] = np.round(points[::3] / 0.4) * 0.4
+    expected = DBSCAN(eps=0.4, min_samples=3).fit(points).labels_
+    np.testing.assert_array_equal(density_clusters(points, 0.4, 3.0), expected)
+
+
+def test_no_points_have_no_clusters():
+    assert density_clusters(np.empty((0, 3)), 0.4, 3.0).size == 0
+
+
 @pytest.mark.parametrize("false_stars", [0, 3, 5])
 def test_without_noise_all_stars_are_found_and_the_motion_is_exact(false_stars):
     noise = NoiseModel(false_stars=false_stars, magnitude_range=(-1.5, 3.0))
@@ -129,7 +141,7 @@ def test_too_few_objects_are_no_stars(count):
 
 
 def test_what_is_refused():
-    many = ObservedFrame(np.ones(30), np.random.default_rng(0).uniform(-10.0, 10.0, (30, 2)))
+    many = ObservedFrame(np.ones(49), np.random.default_rng(0).uniform(-10.0, 10.0, (49, 2)))
     with pytest.raises(FilterError, match="scalable"):
         ClusterFilter()(many, many)
     with pytest.raises(FilterError, match="not finite"):
@@ -149,3 +161,41 @@ def test_motion_shrugs_off_outliers():
     assert motion.rotation_deg == pytest.approx(3.0, abs=1e-9)
     assert motion.inliers[12:].all()
     np.testing.assert_allclose(motion.apply(before[12:]), now[12:], atol=1e-9)
+
+
+def affine(positions):
+    return positions @ np.array([[1.02, -0.03], [0.05, 0.97]]).T + np.array([0.5, -0.2])
+
+
+def test_an_affine_motion_is_found_exactly_and_shrugs_off_outliers():
+    rng = np.random.default_rng(6)
+    before = rng.uniform(-20.0, 20.0, (30, 2))
+    now = affine(before)
+    now[:6] = rng.uniform(-20.0, 20.0, (6, 2))
+    motion = estimate_motion(before, now, threshold_deg=0.1, model="affine")
+    assert motion.inliers[6:].all()
+    np.testing.assert_allclose(motion.apply(before[6:]), now[6:], atol=1e-9)
+    assert motion.mean_distance_deg < 1e-9
+
+
+def test_an_affine_motion_follows_the_noise_closer_than_a_rigid_one():
+    rng = np.random.default_rng(7)
+    before = seven_stars()[1]
+    ratio = []
+    for _ in range(200):
+        now = turned(before, 2.0) + rng.normal(0.0, 0.05, before.shape)
+        rigid, free = (estimate_motion(before, now, model=model) for model in ("rigid", "affine"))
+        ratio.append(free.mean_distance_deg / rigid.mean_distance_deg)
+    # residuals fall as the degrees of freedom that are left: 14 − 3 and 14 − 6
+    assert np.mean(ratio) == pytest.approx(np.sqrt((14 - 6) / (14 - 3)), abs=0.03)
+
+
+@pytest.mark.parametrize("before", [np.zeros((2, 2)), np.outer(np.arange(5.0), [1.0, 2.0])])
+def test_an_affine_motion_needs_three_stars_in_a_triangle(before):
+    with pytest.raises(FilterError, match="three in a triangle"):
+        estimate_motion(before, before, model="affine")
+
+
+def test_an_unknown_model_of_motion_is_rejected():
+    with pytest.raises(FilterError, match="one of rigid, affine"):
+        estimate_motion(np.eye(2), np.eye(2), model="projective")
