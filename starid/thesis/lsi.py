@@ -31,6 +31,7 @@ Choice = Literal["mse", "1se"]
 Solver = Literal["exact", "matlab"]
 
 _WHOLE_SKY_DEG: Final = 720.0
+_CODES_PER_RADIAN: Final = 255.0 / (2.0 * math.pi)
 _RESULT_SIZE: Final = 16
 _LEAST_WEIGHT: Final = 1e-3
 
@@ -351,6 +352,13 @@ def lsi_kernel(
 
 
 @compiled
+def _angle_gap(code: float, other: float, slack: float) -> float:
+    """Difference of two polar angles on the circle of 255 code steps, less what a stored code leaves open."""
+    turn = (code - other) / 255.0
+    return max(255.0 * abs(turn - round(turn)) - slack, 0.0)
+
+
+@compiled
 def region_nearest(
     searched: SearchedCells,
     observation: NDArray[np.float64],
@@ -380,6 +388,9 @@ def region_nearest(
     best = math.inf
     count = 0
     half = 0.5 * side_deg
+    counts_angle = not math.isnan(theta)
+    theta_code = theta * _CODES_PER_RADIAN if counts_angle else 0.0
+    slack = 0.5 + 1e-9 if searched.exact else 0.0
     for row in range(arrays.row_dec.size):
         if abs(arrays.row_dec[row] - dec_deg) > half:
             continue
@@ -398,9 +409,12 @@ def region_nearest(
             d = 0.0
             for f in range(5):
                 gap = abs(searched.features[cell, f] - observation[f] * 2.55)
-                if searched.exact:
-                    gap = max(gap - 0.5 - 1e-9, 0.0)
+                gap = max(gap - slack, 0.0)
                 d += gap * gap
+                if d >= best:
+                    break
+            if counts_angle:
+                d += _angle_gap(searched.theta[cell], theta_code, slack) ** 2
             if d >= best:
                 continue
             if searched.exact:
@@ -409,12 +423,8 @@ def region_nearest(
                 for f in range(5):
                     gap = (vector[f] - observation[f]) * 2.55
                     d += gap * gap
-            else:
-                angle = searched.theta[cell] * (2.0 * math.pi / 255.0)
-            if not math.isnan(theta):
-                turn = (angle - theta) / (2.0 * math.pi)
-                gap = 255.0 * (turn - round(turn))
-                d += gap * gap
+                if counts_angle:
+                    d += _angle_gap(angle * _CODES_PER_RADIAN, theta_code, 0.0) ** 2
             if d < best:
                 best = d
                 best_cell = cell

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
+from starid.thesis.experiments.comparison import agreement, rounding
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -45,7 +47,9 @@ _NOMINAL: Final = {
     99.5: 1469388,
     99.6: 2295918,
 }
-_CELLS: Final = {96.0: 19_800, 97.0: 35_100, 99.0: 315_000, 99.1: 389_000, 99.5: 1_260_000, 99.75: 5_040_000}
+_BYTES: Final = 5
+_INCLUSIVE: Final = (99.75,)
+"""Overlaps of the databases that count both ends of their ranges."""
 _FILE_LIMIT_BYTES: Final = 32_000_000
 _BUILD_LIMIT_S: Final = 10.0
 _THREADS: Final = 2
@@ -82,22 +86,27 @@ def _work(context: Context, part: Part) -> Results:
     return {"cells": np.int64(cells), **built}  # type: ignore[dict-item]
 
 
+def _inclusive_cells(percent: float) -> float:
+    """Cells of a grid whose rows and columns include both ends of 360° × 140°."""
+    step = 40.0 * (1.0 - percent / 100.0)
+    return float((round(360.0 / step) + 1) * (round(140.0 / step) + 1))
+
+
 def _size_row(percent: float, kilobytes: float) -> Row:
-    published = _SIZES_KB[percent]
     remark = {
         98.0: "392 kB are 448 · 175 frames; 360° at a step of 0.8° take 450 columns.",
-        99.3: "The step of 0.28° does not divide 360°; how the thesis rounded is not recoverable.",
-        99.75: "The published value is 5 000 frames more than 3 600 · 1 400; where they come from is not recoverable.",
+        99.3: "The step of 0.28° does not divide 360°.",
+        99.75: "3 601 · 1 401 frames: both ends of the two ranges are counted, which no other size has.",
     }.get(percent, "")
-    close = abs(kilobytes - published) <= 1.0
-    return row(
+    author = _BYTES * _inclusive_cells(percent) / 1000.0 if percent in _INCLUSIVE else kilobytes
+    return agreement(
         f"table 6.1: database size, p = {percent:g} %",
-        published=float(published),
-        ours=kilobytes,
+        published=float(_SIZES_KB[percent]),
+        tolerance=rounding(0, "kB"),
+        author=author,
+        printed=kilobytes,
         unit="kB",
         digits=1,
-        passed=None if remark else close,
-        target="" if remark else "± 1 kB",
         remark=remark,
     )
 
@@ -106,16 +115,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     from starid.thesis.frame_grid import minimum_overlap, nominal_cells
 
     least = minimum_overlap()
-    rows = [
-        row(
-            "p_min, eq. 2.27",
-            published=0.2929,
-            ours=least,
-            digits=4,
-            passed=round(least, 4) == 0.2929,
-            target="0.2929",
-        )
-    ]
+    rows = [agreement("p_min, eq. 2.27", published=0.2929, tolerance=rounding(4), printed=least, digits=4)]
     columns: dict[str, list[Any]] = {
         "percent": [],
         "nominal_N_42_deg": [],
@@ -131,36 +131,24 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
         result = results[f"p{percent:g}"]
         cells, nominal = int(result["cells"]), nominal_cells(42.0, percent / 100.0)
         if percent in _NOMINAL:
-            right = abs(nominal - _NOMINAL[percent]) <= 1.0
             rows.append(
-                row(
+                agreement(
                     f"nominal N, eq. 2.23, φ = 42°, p = {percent:g} %",
                     published=float(_NOMINAL[percent]),
-                    ours=nominal,
+                    tolerance=rounding(0),
+                    author=math.floor(nominal),
+                    printed=nominal,
                     digits=0,
-                    passed=right,
-                    target="± 1",
                 )
             )
         if percent in _SIZES_KB:
-            rows.append(_size_row(percent, cells * 5 / 1000.0))
-        if percent in _CELLS:
-            right = abs(cells - _CELLS[percent]) <= 0.0005 * _CELLS[percent]
-            rows.append(
-                row(
-                    f"frames in the database, p = {percent:g} %",
-                    ours=float(cells),
-                    digits=0,
-                    passed=right,
-                    target=f"{_CELLS[percent]}",
-                )
-            )
+            rows.append(_size_row(percent, _BYTES * cells / 1000.0))
         for name, value in (
             ("percent", percent),
             ("nominal_N_42_deg", nominal),
             ("published_N", _NOMINAL.get(percent, "")),
             ("cells", cells),
-            ("bytes_features", 5 * cells),
+            ("bytes_features", _BYTES * cells),
             ("published_kB", _SIZES_KB.get(percent, "")),
             ("build_s", float(result["seconds"])),
             ("build_processor_s", float(result["processor_s"])),

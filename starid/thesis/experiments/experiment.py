@@ -9,18 +9,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starhil.emulator.errors import EmulatorError
+from starid.errors import StaridError
 
 if TYPE_CHECKING:
     from starid.catalog import StarCatalog
     from starid.thesis.database import FeatureDatabase
     from starid.thesis.frame_sky import FrameSky
-    from starid.thesis.lsi import LostInSpace
+    from starid.thesis.lsi import LostInSpace, Solver
 
 Results = dict[str, NDArray[Any]]
 """What one part yields: named arrays."""
@@ -31,8 +31,11 @@ Parameters = Mapping[str, Any]
 EPOCH: Final = 1991.25
 """The catalogue's own epoch: the published numbers know no proper motion."""
 
+Kind = Literal["", "agrees", "better", "ours"]
+"""Class of a check: against a published number on both sides, on one side, or against a bound of this project; "" is none."""
 
-class ReproduceError(EmulatorError):
+
+class ReproduceError(StaridError):
     """A reproduction that cannot be run as asked for."""
 
 
@@ -61,13 +64,19 @@ class Row:
     quantity
         What was measured, with its conditions.
     published, ours
-        The values as they are printed; published is "—" where there is none.
+        The published value and this project's, as they are printed; "—" where there is none.
     target
-        What ours is checked against, "" if it is not.
+        What is checked, and the tolerance with its origin; "" without a check.
     passed
         Outcome of the check; None if there is none.
     remark
-        Why the two differ, or what to know about them.
+        Why the values differ, or what to know about them.
+    author, printed
+        The value of the algorithm as the thesis's author ran it, and as the thesis prints it; "—" where there is none.
+    kind
+        Class of the check.
+    met, of
+        How many of the published numbers that the row stands for agree, and how many they are.
     """
 
     quantity: str
@@ -76,6 +85,11 @@ class Row:
     target: str = ""
     passed: bool | None = None
     remark: str = ""
+    author: str = "—"
+    printed: str = "—"
+    kind: Kind = ""
+    met: int = 0
+    of: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +102,7 @@ class Outcome:
 
     @property
     def failed(self) -> tuple[Row, ...]:
-        """Rows whose check failed."""
+        """Rows whose check was missed."""
         return tuple(row for row in self.rows if row.passed is False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -189,9 +203,9 @@ class Context:
         """Where that database is kept."""
         return _database_file(self.databases, overlap)
 
-    def lost_in_space(self, overlap: float) -> LostInSpace:
+    def lost_in_space(self, overlap: float, solver: Solver = "exact") -> LostInSpace:
         """The LSI algorithm on that database, kept in this process."""
-        return _lost_in_space(self.databases, overlap)
+        return _lost_in_space(self.databases, overlap, solver)
 
     def sky(self) -> FrameSky:
         """The stars of the planar databases."""
@@ -211,7 +225,9 @@ def row(
     target: str = "",
     remark: str = "",
 ) -> Row:
-    """Make a row for the report; a bound makes it a check.
+    """Make a row for the report; a bound, which is this project's own, makes it a check of the class "ours".
+
+    `starid.thesis.experiments.comparison` makes the checks against published numbers.
 
     Parameters
     ----------
@@ -220,19 +236,13 @@ def row(
     ours, published
         Values: numbers (printed with `digits` decimals and `unit`) or text; published may be None.
     at_least, at_most
-        Bounds on `ours`, which must then be a number.
+        Bounds of this project on `ours`, which must then be a number.
     passed, target
         A check of another kind, and its wording.
     remark
         Why the two differ.
     """
-    space = "" if unit in ("", "°", "″") else " "
-
-    def text(value: float | str | None) -> str:
-        if value is None:
-            return "—"
-        return value if isinstance(value, str) else f"{value:.{digits}f}{space}{unit}"
-
+    space = space_before(unit)
     if isinstance(ours, str) and not (at_least is None and at_most is None):
         raise ReproduceError(f"reproduce: {quantity}: a text has no bounds; give a number")
     bounds = []
@@ -243,7 +253,29 @@ def row(
         bounds.append(f"≤ {at_most:g}{space}{unit}")
         passed = bool(ours <= at_most) and passed is not False
     verdict = None if passed is None else bool(passed)
-    return Row(quantity, text(published), text(ours), target or ", ".join(bounds), verdict, remark)
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        target or ", ".join(bounds),
+        verdict,
+        remark,
+        kind="" if verdict is None else "ours",
+        met=int(verdict is True),
+        of=int(verdict is not None),
+    )
+
+
+def space_before(unit: str) -> str:
+    """What stands between a number and its unit."""
+    return "" if unit in ("", "°", "″") else " "
+
+
+def value_text(value: float | str | None, unit: str, digits: int) -> str:
+    """A value as the report prints it; "—" for none."""
+    if value is None:
+        return "—"
+    return value if isinstance(value, str) else f"{value:.{digits}f}{space_before(unit)}{unit}"
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
@@ -286,6 +318,23 @@ def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None
     return sky_of(star_catalog(), parameters)
 
 
+@lru_cache(maxsize=4)
+def author_database(overlap: float) -> FeatureDatabase:
+    """Planar database whose brightness counts from the brightest star of the catalogue.
+
+    These are the weights of the thesis's frame object, a − min(a); the normalised features differ in r alone, by
+    hundredths of a degree before they are normalised. The mean brightness A is greater by −min(a).
+    """
+    from dataclasses import replace
+
+    from starid.thesis.database import DatabaseParameters, build_database
+
+    stars, parameters = star_catalog(), DatabaseParameters(overlap=overlap)
+    least = float(stars.hp.min())
+    shifted = replace(stars, hp=stars.hp - least)
+    return build_database(shifted, replace(parameters, kappa=parameters.kappa - least))
+
+
 def _database_file(folder: Path, overlap: float) -> Path:
     return folder / f"planar-{100 * overlap:g}.features"
 
@@ -306,8 +355,8 @@ def _database(folder: Path, overlap: float) -> FeatureDatabase:
     return load_database(path)
 
 
-@lru_cache(maxsize=3)
-def _lost_in_space(folder: Path, overlap: float) -> LostInSpace:
+@lru_cache(maxsize=6)
+def _lost_in_space(folder: Path, overlap: float, solver: Solver) -> LostInSpace:
     from starid.thesis.lsi import LostInSpace
 
-    return LostInSpace(_database(folder, overlap))
+    return LostInSpace(_database(folder, overlap), solver=solver)

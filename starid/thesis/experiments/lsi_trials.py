@@ -63,8 +63,9 @@ def solve_frames(
     roll_deg: float = 0.0,
     every: int = 1,
     compares: bool = False,
+    with_angle: bool = False,
 ) -> Results:
-    """Run LSI, and the sub-cell search after it, on the test frames.
+    """Run LSI, with the exact LASSO and with MATLAB's, and the sub-cell search after it, on the test frames.
 
     Parameters
     ----------
@@ -84,23 +85,28 @@ def solve_frames(
         Use only every so-many-th frame.
     compares
         Run the sub-cell search that compares the stars, too.
+    with_angle
+        Look for the cell that is nearest with the polar angle as a sixth feature, too.
 
     Returns
     -------
     Results
-        `frames` (n, 2) degrees; `f_mse`, `f_1se`, `f_fine`, and `f_stars` if asked for, (n,): ε_f in degrees of the two LSI estimates, of
-        the sub-cell search, and of the one that compares the stars; `theta_…` likewise: ε_θ in degrees; `psi_mse`,
-        `residual`: ε_ψ of LSI and of the sub-cell search.
+        `frames` (n, 2) degrees; `f_…` (n,): ε_f in degrees of the estimates `mse` and `1se` with the exact LASSO, `author_mse`
+        and `author_1se` with MATLAB's, `fine` of the sub-cell search, and, if asked for, `stars` of the one that compares the
+        stars and `six` of the cell nearest in six features; `theta_…` likewise: ε_θ in degrees; `psi_mse`, `psi_author`,
+        `residual`: ε_ψ of the two kinds of LSI and of the sub-cell search.
     """
     lsi = context.lost_in_space(overlap)
+    author = context.lost_in_space(overlap, "matlab")
     fine = SubcellSearch(lsi)
     compared = SubcellSearch(lsi, neighbours=_COMPARED_NEIGHBOURS)
     sky = context.sky()
     frames = frames_under_test(rng, grid, lsi.database.grid.step_deg, every)
-    names = ("mse", "1se", "fine", *(("stars",) if compares else ()))
+    names = ["mse", "1se", "author_mse", "author_1se", "fine"]
+    names += ["stars"] * compares + ["six"] * with_angle
     answers = np.empty((len(names), len(frames), 2))
     angles = np.empty((len(names), len(frames)))
-    psi = np.empty((2, len(frames)))
+    psi = np.empty((3, len(frames)))
     for i, (ra, dec) in enumerate(frames):
         brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
         if noise is not None:
@@ -109,22 +115,33 @@ def solve_frames(
             places = turned(places, roll_deg)
         features = extract_features(brightness, places)
         solution = lsi.solve(features)
+        other = author.estimate(solution.observation, solution.nearest, solution.distance)
         better = fine.solve(features)
-        estimates: list[LsiEstimate | FineEstimate] = [solution.mse, solution.one_se, better]
+        estimates: list[LsiEstimate | FineEstimate] = [
+            *(solution.mse, solution.one_se),
+            *(other.mse, other.one_se),
+            better,
+        ]
         if compares:
             estimates.append(compared.solve(features, places))
         for j, estimate in enumerate(estimates):
             answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
             turn = features.theta_rad - estimate.theta_rad
             angles[j, i] = rotation_error(math.degrees(turn), roll_deg)
-        psi[:, i] = solution.mse.error_psi, better.residual
+        psi[:, i] = solution.mse.error_psi, other.mse.error_psi, better.residual
+        if with_angle:
+            cell, _ = lsi.nearest(solution.observation, theta_rad=features.theta_rad)
+            answers[-1, i] = lsi.database.grid.centre(cell)
+            theta = lsi.database.exact_features(cell).theta_rad
+            angles[-1, i] = rotation_error(math.degrees(features.theta_rad - theta), roll_deg)
     errors = boresight_error(answers[..., 0], answers[..., 1], frames[:, 0], frames[:, 1])
     return {
         "frames": frames,
         **{f"f_{name}": errors[j] for j, name in enumerate(names)},
         **{f"theta_{name}": angles[j] for j, name in enumerate(names)},
         "psi_mse": psi[0],
-        "residual": psi[1],
+        "psi_author": psi[1],
+        "residual": psi[2],
     }
 
 

@@ -1,0 +1,164 @@
+"""Checks against published numbers: on both sides within a stated tolerance, or on the better side of the number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from starid.thesis.experiments.experiment import ReproduceError, Row, space_before, value_text
+
+Tolerance = tuple[float, str]
+"""Greatest difference from the published number, and where that comes from."""
+
+
+def rounding(digits: int, unit: str = "") -> Tolerance:
+    """Half a unit of the last printed digit."""
+    return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
+
+
+def last_digit(digits: int, unit: str = "") -> Tolerance:
+    """One unit of the last printed digit, for a value that was itself made of rounded ones."""
+    return 1.001 * 10.0**-digits, f"one in the last digit, {10.0**-digits:g}{space_before(unit)}{unit}"
+
+
+def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Difference of two shares (percent) that were each counted in so many trials, at so many standard errors.
+
+    The standard error is that of (k + 1)/(n + 2), which leaves a published 0 or 100 % an uncertainty.
+    """
+    share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
+    error = 100.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
+    return sigmas * error, f"{sigmas:g} standard errors of two shares of {trials}, {sigmas * error:.2g} %"
+
+
+def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Difference of two means over so many trials each, at so many standard errors, for a standard deviation."""
+    error = sigma * math.sqrt(2.0 / trials)
+    return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
+
+
+def agreement(
+    quantity: str,
+    *,
+    published: float,
+    tolerance: Tolerance,
+    author: float | None = None,
+    printed: float | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a check on both sides of a published number.
+
+    The value that is checked is that of the algorithm as the author ran it; without one, as printed; without that, ours.
+
+    Raises
+    ------
+    ReproduceError
+        If there is no number to check.
+    """
+    checked = author if author is not None else printed if printed is not None else ours
+    if checked is None or isinstance(checked, str):
+        raise ReproduceError(
+            f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
+        )
+    greatest, origin = tolerance
+    passed = bool(abs(checked - published) <= greatest)
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        f"± {origin}",
+        passed,
+        remark,
+        value_text(author, unit, digits),
+        value_text(printed, unit, digits),
+        "agrees",
+        int(passed),
+        1,
+    )
+
+
+def same(
+    quantity: str,
+    *,
+    published: str,
+    author: str | None = None,
+    printed: str | None = None,
+    ours: str | None = None,
+    matches: Sequence[bool],
+    target: str,
+    remark: str = "",
+) -> Row:
+    """Make one row for several published numbers, of which each agrees or not under the rule named by `target`."""
+    met, of = sum(map(bool, matches)), len(matches)
+    return Row(
+        quantity,
+        published,
+        ours or "—",
+        target,
+        met == of,
+        f"{met} of {of} agree. {remark}".strip() if of > 1 else remark,
+        author or "—",
+        printed or "—",
+        "agrees",
+        met,
+        of,
+    )
+
+
+def improvement(
+    quantity: str,
+    *,
+    published: float,
+    ours: float,
+    larger: bool,
+    author: float | None = None,
+    printed: float | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a check that ours is on the better side of a published number; the remark says by how much."""
+    space = space_before(unit)
+    gain = ours - published if larger else published - ours
+    better = f"by {gain:.{digits}f}{space}{unit}"
+    if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:
+        better = f"by a factor of {published / ours:.3g}"
+    passed = bool(ours >= published if larger else ours <= published)
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        f"{'≥' if larger else '≤'} {value_text(published, unit, digits)}",
+        passed,
+        f"Better {better}. {remark}".strip() if passed else remark,
+        value_text(author, unit, digits),
+        value_text(printed, unit, digits),
+        "better",
+        int(passed),
+        1,
+    )
+
+
+def shown(
+    quantity: str,
+    *,
+    published: float | str | None = None,
+    author: float | str | None = None,
+    printed: float | str | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a row that informs and checks nothing."""
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        remark=remark,
+        author=value_text(author, unit, digits),
+        printed=value_text(printed, unit, digits),
+    )
