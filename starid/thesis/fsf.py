@@ -81,9 +81,10 @@ def disparity_list(
 def _bin_points(
     points: NDArray[np.float64], side: float, order: NDArray[np.int64], shape: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort points into square bins of their second and third coordinate; return each point's bin and the bins' starts.
+    """Sort points into square bins of their second and third coordinate.
 
-    `order` (n,) receives the points bin by bin, in their own order within each, `shape` (2,) the number of bins.
+    `order` (n,) receives the points bin by bin, in their own order within each, and `shape` (2,) the number of bins.
+    Returned are the bin of each point in the new order and the first point of each bin.
     """
     n = points.shape[0]
     low = np.array([points[:, 1].min(), points[:, 2].min()])
@@ -102,33 +103,34 @@ def _bin_points(
     for i in range(n):
         order[fill[where[i]]] = i
         fill[where[i]] += 1
-    return where, start
+    return where[order], start
 
 
 @compiled
 def _neighbours(
     points: NDArray[np.float64],
-    bins: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+    bins: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     here: int,
     epsilon: float,
     found: NDArray[np.int64],
 ) -> int:
-    """Write all points within ε of one, itself included; return how many. The bins are not narrower than ε."""
-    order, shape, where, start = bins
+    """Write all points within ε of one, itself included; return how many.
+
+    The points are in the order of the bins (shape, bin of each point, first point of each bin), none narrower than ε.
+    """
+    shape, where, start = bins
     count = 0
     limit = epsilon * epsilon
     row = where[here] // shape[1]
     column = where[here] % shape[1]
+    a, b, c = points[here, 0], points[here, 1], points[here, 2]
     for r in range(max(row - 1, 0), min(row + 2, shape[0])):
         begin = start[r * shape[1] + max(column - 1, 0)]
         end = start[r * shape[1] + min(column + 1, shape[1] - 1) + 1]
         for k in range(begin, end):
-            there = order[k]
-            d0 = points[there, 0] - points[here, 0]
-            d1 = points[there, 1] - points[here, 1]
-            d2 = points[there, 2] - points[here, 2]
-            if d0 * d0 + d1 * d1 + d2 * d2 <= limit:
-                found[count] = there
+            square = (points[k, 0] - a) ** 2 + (points[k, 1] - b) ** 2 + (points[k, 2] - c) ** 2
+            if square <= limit:
+                found[count] = k
                 count += 1
     return count
 
@@ -153,22 +155,26 @@ def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: f
     order = np.empty(n, dtype=np.int64)
     shape = np.empty(2, dtype=np.int64)
     where, start = _bin_points(points, side, order, shape)
-    bins = (order, shape, where, start)
+    bins = (shape, where, start)
+    ordered = points[order]
+    place = np.empty(n, dtype=np.int64)
+    place[order] = np.arange(n)
     found = np.empty(n, dtype=np.int64)
     core = np.zeros(n, dtype=np.bool_)
-    for i in range(n):
-        core[i] = _neighbours(points, bins, i, epsilon, found) >= min_samples
+    for k in range(n):
+        core[k] = _neighbours(ordered, bins, k, epsilon, found) >= min_samples
     stack = np.empty(n, dtype=np.int64)
     label = 0
     for i in range(n):
-        if labels[i] != -1 or not core[i]:
+        first = place[i]
+        if labels[first] != -1 or not core[first]:
             continue
-        labels[i] = label
-        stack[0] = i
+        labels[first] = label
+        stack[0] = first
         top = 1
         while top > 0:
             top -= 1
-            count = _neighbours(points, bins, stack[top], epsilon, found)
+            count = _neighbours(ordered, bins, stack[top], epsilon, found)
             for k in range(count):
                 j = found[k]
                 if labels[j] == -1:
@@ -177,7 +183,7 @@ def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: f
                         stack[top] = j
                         top += 1
         label += 1
-    return labels
+    return labels[place]
 
 
 @compiled

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.errors import StaridError
-from starid.thesis.cme import CameraMotion, estimate_motion
+from starid.thesis.cme import CameraMotion, MotionModel, estimate_motion
 from starid.thesis.false_stars import FalseStarFilter, FilterError, ObservedFrame
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
@@ -41,6 +41,11 @@ class RsiSettings:
         Γ_min, the factor of its growth, and the side from which on the whole database is searched at once.
     motion_threshold_deg
         Distance beyond which a match does not count for the motion.
+    motion_model
+        Transformation that the camera's motion is taken for; the thesis has an affine one.
+    angle_in_search
+        Count the polar angle as a sixth feature of the search, as the thesis's worked example does. The frame must then
+        not be turned by more than a few degrees.
     memory, agreement_deg
         0: the thesis's algorithm, in which every frame's answer stands, and the last one is where the region of search
         lies. Otherwise our addition: so many last answers, carried forward with the motion, vote, two of them agreeing
@@ -53,6 +58,8 @@ class RsiSettings:
     gamma_scale: float = 1.0
     gamma_lsi_deg: float = 90.0
     motion_threshold_deg: float = 1.0
+    motion_model: MotionModel = "rigid"
+    angle_in_search: bool = False
     memory: int = 0
     agreement_deg: float = 0.5
 
@@ -195,23 +202,24 @@ class RecursiveIdentification:
             self._searches_all = True
             return _empty_step(true_stars, motion)
         observation = self._lsi.database.normalise(features)
+        angle = features.theta_rad if self.settings.angle_in_search else math.nan
         predicted = self._memory.place()
         start = time.perf_counter()
         cells = 0
         cell, distance = -1, math.inf
         if predicted is not None and side < self.settings.gamma_lsi_deg and self._trusts(predicted):
             centre = predicted.right_ascension_deg, predicted.declination_deg
-            cell, distance, cells = self._lsi.nearest_in_region(observation, *centre, side)
+            cell, distance, cells = self._lsi.nearest_in_region(observation, *centre, side, theta_rad=angle)
         use_region = cell >= 0
         if not use_region:
-            cell, distance = self._lsi.nearest(observation)
+            cell, distance = self._lsi.nearest(observation, theta_rad=angle)
         found = time.perf_counter()
         solution = self._lsi.estimate(observation, cell, distance)
         solved = time.perf_counter()
         search_s, lasso_s = found - start, solved - found
         triggered = use_region and solution.mse.error_psi > self.settings.tau
         if triggered:
-            solution, more_search, more_lasso = self._whole_database(observation, solution)
+            solution, more_search, more_lasso = self._whole_database(observation, angle, solution)
             search_s, lasso_s = search_s + more_search, lasso_s + more_lasso
         estimate, roll = self._voted(solution.mse, features)
         exceeded = estimate.error_psi > self.settings.tau
@@ -255,10 +263,10 @@ class RecursiveIdentification:
         return voted, place.roll_deg
 
     def _whole_database(
-        self, observation: NDArray[np.float64], solution: LsiSolution
+        self, observation: NDArray[np.float64], angle: float, solution: LsiSolution
     ) -> tuple[LsiSolution, float, float]:
         start = time.perf_counter()
-        cell, distance = self._lsi.nearest(observation)
+        cell, distance = self._lsi.nearest(observation, theta_rad=angle)
         found = time.perf_counter()
         other = self._lsi.estimate(observation, cell, distance)
         solved = time.perf_counter()
@@ -278,6 +286,7 @@ class RecursiveIdentification:
                 self._before.positions[result.matches[:, 0]],
                 frame.positions[result.matches[:, 1]],
                 threshold_deg=self.settings.motion_threshold_deg,
+                model=self.settings.motion_model,
             )
         except FilterError:
             return everything, None

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.thesis.experiments.comparison import shown
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -15,7 +16,6 @@ from starid.thesis.experiments.experiment import (
     Parameters,
     Part,
     Results,
-    row,
     write_csv,
 )
 from starid.thesis.experiments.fsf import EQUIVALENT, RADIUS_DEG, first_frame, noise_of
@@ -93,9 +93,9 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
         for name, value in line.items():
             columns.setdefault(name, []).append(value)
         rows.append(
-            row(
+            shown(
                 f"frames without a core among the true pairs, μ = {factor}, noise × {scale:g}: f = 0, f = {_FALSE_STARS}",
-                ours=f"{lost[0]:.1f}, {lost[_FALSE_STARS]:.1f} %",
+                printed=f"{lost[0]:.1f}, {lost[_FALSE_STARS]:.1f} %",
                 remark=f"median spread {typical[1]:.2f}° in separation, {typical[2]:.2f}° in slope; fullest neighbourhood "
                 f"{fullest.mean():.1f} of {pair_count(7)}",
             )

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.thesis.experiments.comparison import improvement, shown
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -17,7 +18,6 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
-    row,
     write_csv,
 )
 from starid.thesis.experiments.lsi_trials import OFF, ON, frames_under_test
@@ -39,15 +39,25 @@ _PUBLISHED: Final = {
 _STAGES: Final = ("extraction", "search", "dictionary", "lasso", "estimation", "total", "subcell")
 _WORDS: Final = ("feature extraction", "1NN search", "dictionary", "LASSO", "estimation", "total")
 _PASSES: Final = 3
-_SOLVE_LIMIT_MS: Final = 0.5
-_SEARCH_LIMIT_MS: Final = 0.05
+_COMPARED: Final = ("1NN search", "LASSO", "total")
+_RIVALS: Final = {
+    "PA": (130.57, 27.5),
+    "MGA": (7380.0, 394.6),
+    "LPT": (665.89, 73.8),
+    "VP": (280.72, 7.8),
+    "GA": (331.0, 185.6),
+    "SVD": (1483.0, 13.4),
+    "OSV": (145.0, 35.2),
+    "the thesis's LSI": (6300.0, 46.1),
+}
+"""Table 6.2: database, kB, and run time, ms."""
 _BEST: Final = 99.5
 _LARGEST: Final = 99.75
 
 _NOTE: Final = """Median over the test frames of the least of three passes, in milliseconds, one thread, calls from Python included. The thesis
 gives means measured in MATLAB on a Core i5 at 2.7 GHz: its search is a scan of all frames, ours walks a tree over
 the 8-bit codes and looks at the stars of the few cells that could be nearer; its LASSO solves for 100 λ one by one, ours follows the piecewise
-linear path. Times depend on the machine; the ratio says what matters. Off the grid the search has more cells to look at, as no cell is at distance zero."""
+linear path. The rivals of table 6.2 are quoted by the thesis from their papers, measured on other machines. Times depend on the machine; the ratio says what matters. Off the grid the search has more cells to look at, as no cell is at distance zero."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -117,12 +127,6 @@ def _work(context: Context, part: Part) -> Results:
     }
 
 
-def _compared(published: float, ours: float) -> str:
-    if ours > published:
-        return f"{ours / published:.1f} times slower"
-    return f"{published / ours:.{0 if published > 10.0 * ours else 1}f} times faster"
-
-
 def _rows(results: Mapping[str, Results], percents: list[float], *, checked: bool) -> list[Row]:
     rows = []
     for percent in percents:
@@ -131,39 +135,34 @@ def _rows(results: Mapping[str, Results], percents: list[float], *, checked: boo
             for i, (stage, word) in enumerate(zip(_STAGES, _WORDS, strict=False)):
                 if percent not in (_BEST, _LARGEST) and stage != "total":
                     continue
-                ours = float(np.median(times[stage]))
-                published = _PUBLISHED[percent][i]
-                limit = _SEARCH_LIMIT_MS if (percent, stage) == (_LARGEST, "search") else None
-                rows.append(
-                    row(
-                        f"p = {percent:g} %, {grid} the grid: {word}",
-                        published=published,
-                        ours=ours,
-                        unit="ms",
-                        digits=3,
-                        at_most=limit if checked else None,
-                        remark=_compared(published, ours),
+                quantity = f"p = {percent:g} %, {grid} the grid: {word}"
+                ours, published = float(np.median(times[stage])), _PUBLISHED[percent][i]
+                # the thesis's frames are on the grid, and the quick run judges no time by the clock
+                if checked and grid == ON and word in _COMPARED:
+                    rows.append(
+                        improvement(
+                            quantity, published=published, ours=ours, larger=False, unit="ms", digits=3
+                        )
                     )
-                )
+                else:
+                    rows.append(shown(quantity, published=published, ours=ours, unit="ms", digits=3))
             if percent == _BEST:
                 rows += [
-                    row(
-                        f"p = {percent:g} %, {grid} the grid: from features to estimate",
-                        published=_PUBLISHED[percent][5] - _PUBLISHED[percent][0],
-                        ours=float(np.median(times["solve"])),
+                    shown(
+                        f"p = {percent:g} %, {grid} the grid: {words}",
+                        ours=float(np.median(times[stage])),
                         unit="ms",
                         digits=3,
-                        at_most=_SOLVE_LIMIT_MS if checked else None,
-                        remark="Aim: 0.1 ms.",
-                    ),
-                    row(
-                        f"p = {percent:g} %, {grid} the grid: sub-cell search (ours)",
-                        ours=float(np.median(times["subcell"])),
-                        unit="ms",
-                        digits=3,
-                    ),
+                    )
+                    for words, stage in (
+                        ("from features to estimate", "solve"),
+                        ("sub-cell search (ours)", "subcell"),
+                    )
                 ]
-    return rows
+    return rows + [
+        shown(f"table 6.2, quoted by the thesis: {name}", published=f"{size:g} kB, {time_ms:g} ms")
+        for name, (size, time_ms) in _RIVALS.items()
+    ]
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
@@ -194,7 +193,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
 EXPERIMENTS: Final = (
     Experiment(
         "lsi-run-time",
-        "Run time of LSI by stage: table 6.1",
+        "Run time of LSI by stage: table 6.1; table 6.2",
         _parts,
         _work,
         _finish,

@@ -21,6 +21,7 @@ MODULES: Final[tuple[str, ...]] = (
     "fsf_limits",
     "fsf_studies",
     "rsi",
+    "rsi_printed",
     "spherical",
 )
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""

@@ -50,11 +50,11 @@ def _work(context: Context, part: Part) -> Results:
     numbers = np.full((len(FIELDS), count), math.nan)
     rng = context.rng("frames", v["false_stars"], v["factor"], int(100 * v["scale"]))
     for i, frame in enumerate(sky_sequence(rng, lsi.database.sky, *START, noise, count=count, wander=True)):
-        numbers[:, i] = _measured(recursion.step(frame.observed), frame)
+        numbers[:, i] = measured_step(recursion.step(frame.observed), frame)
     return {"numbers": numbers}
 
 
-def _measured(step: RsiStep, frame: SimulatedFrame) -> tuple[float, ...]:
+def measured_step(step: RsiStep, frame: SimulatedFrame) -> tuple[float, ...]:
     """The fields of one frame."""
     motion = step.motion
     distances = (
@@ -96,7 +96,7 @@ _MEMORY: Final = 15
 EXPERIMENTS: Final = (
     Experiment(
         "rsi",
-        "Recursive identification: figures 6.33–6.43, E, F, G, tables 6.6–6.9, H.1, H.2",
+        "Recursive identification with the scalable filter (ours): figures 6.33–6.43, E, F, G, tables 6.6–6.9",
         rsi_parts,
         _work,
         _finish,
@@ -120,6 +120,6 @@ EXPERIMENTS: Final = (
             "scales": [EQUIVALENT],
             "frames": 400,
         },
-        revision=2,
+        revision=3,
     ),
 )
