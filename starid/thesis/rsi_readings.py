@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 def side_as_printed(mean_distance_deg: float, sigma_distance_deg: float, gamma_min_deg: float) -> float:
     """Eq. 6.5 with the number 110 in it, degrees; it falls as the distances grow."""
-    power = 110.0 ** (-0.5 * math.log10(mean_distance_deg)) * 110.0 ** (-0.5 * math.log10(sigma_distance_deg))
+    power: float = 110.0 ** (-0.5 * math.log10(mean_distance_deg)) * 110.0 ** (
+        -0.5 * math.log10(sigma_distance_deg)
+    )
     return gamma_min_deg + power * sigma_distance_deg * mean_distance_deg
 
 

@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypedDict
 
 from starid.thesis.experiments.experiment import ReproduceError, Row, space_before, value_text
+
+
+class Readings(TypedDict, total=False):
+    """A number as the author ran the algorithm, as the thesis prints it, and ours; keywords of the functions below."""
+
+    author: float
+    printed: float
+    ours: float
+
 
 Tolerance = tuple[float, str]
 """Greatest difference from the published number, and where that comes from."""

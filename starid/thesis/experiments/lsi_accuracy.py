@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.thesis.experiments.comparison import agreement, improvement, sampled_mean, shown
+from starid.thesis.experiments.comparison import Readings, agreement, improvement, sampled_mean, shown
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -177,7 +177,7 @@ def _on_grid_rows(result: Results) -> list[Row]:
     tolerance = (_POINTS, f"{_POINTS:g} points; the standard error of 1 701 frames is 0.7 to 1.2")
     rows = []
     for limit, published in _PUBLISHED.items():
-        values = {
+        values: Readings = {
             "author": share(result["f_author_mse"], limit),
             "printed": share(result["f_mse"], limit),
             "ours": share(result["f_fine"], limit),
@@ -191,9 +191,10 @@ def _on_grid_rows(result: Results) -> list[Row]:
                 unit="%",
             )
         )
-    gross = {
-        name: 100.0 - share(result[f"f_{key}"], 1.0)
-        for name, key in (("author", "author_mse"), ("printed", "mse"), ("ours", "fine"))
+    gross: Readings = {
+        "author": 100.0 - share(result["f_author_mse"], 1.0),
+        "printed": 100.0 - share(result["f_mse"], 1.0),
+        "ours": 100.0 - share(result["f_fine"], 1.0),
     }
     rows.append(
         agreement(
@@ -232,20 +233,16 @@ def _on_grid_rows(result: Results) -> list[Row]:
 
 def _off_grid_rows(result: Results) -> list[Row]:
     where = f"p = {_BEST:g} %, off the grid"
-    rows = []
-    for limit in _PUBLISHED:
-        values = {
-            "author": share(result["f_author_mse"], limit),
-            "printed": share(result["f_mse"], limit),
-        }
-        rows.append(
-            shown(
-                f"LSI (MSE) and sub-cell (ours), {where}: share with ε_f ≤ {limit:g}°",
-                **values,
-                ours=share(result["f_fine"], limit),
-                unit="%",
-            )
+    rows = [
+        shown(
+            f"LSI (MSE) and sub-cell (ours), {where}: share with ε_f ≤ {limit:g}°",
+            author=share(result["f_author_mse"], limit),
+            printed=share(result["f_mse"], limit),
+            ours=share(result["f_fine"], limit),
+            unit="%",
         )
+        for limit in _PUBLISHED
+    ]
     rows += [
         improvement(
             f"stars compared (ours), {where}: share with ε_f ≤ {limit:g}°",
@@ -338,7 +335,7 @@ def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float
             ("ε_ψ", "psi_author", "psi_mse"),
             ("ε_f", "f_author_mse", "f_mse"),
         ):
-            values = {"author": float(changed(author)), "printed": float(changed(printed))}
+            counted: Readings = {"author": float(changed(author)), "printed": float(changed(printed))}
             quantity = f"{where} whose {what} changes when the camera is turned"
             remark = (
                 "Where several weights ω reconstruct the observation equally well, the last digit of the features decides between them."
@@ -350,12 +347,12 @@ def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float
                     quantity,
                     published=0.0,
                     tolerance=(0.0, "none: the maps are called exactly identical"),
-                    **values,
+                    **counted,
                     digits=0,
                     remark=remark,
                 )
                 if grid == ON
-                else shown(quantity, **values, digits=0)
+                else shown(quantity, **counted, digits=0)
             )
         listed = {
             kind: ", ".join(f"{share(one[f'f_{kind}'], 0.3):.2f}" for one in sets) + " %"

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.thesis.experiments.comparison import agreement, same, sampling, shown
+from starid.thesis.experiments.comparison import Readings, agreement, same, sampling, shown
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -249,21 +249,16 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
     return files
 
 
-def _readings(
-    results: Mapping[str, Results], kind: str, level: float, limit: float, grid: str
-) -> dict[str, float]:
+def _readings(results: Mapping[str, Results], kind: str, level: float, limit: float, grid: str) -> Readings:
     """Share within a limit in each reading that was computed; without noise the readings of the noise are one."""
     literal = results.get(f"{kind}-{level:g}-{grid}" if level else f"none-{grid}")
     reduced = results.get(f"root-{kind}-{level:g}-{grid}" if level else f"none-{grid}")
-    found = {}
+    found: Readings = {}
     if reduced is not None:
         found["author"] = share(reduced["f_author_mse"], limit)
     if literal is not None:
         found["printed"] = share(literal["f_mse"], limit)
         found["ours"] = share(literal["f_fine"], limit)
-    angle = results.get(f"six-{kind}-{level:g}-{grid}")
-    if angle is not None:
-        found["six"] = share(angle["f_six"], limit)
     return found
 
 
@@ -281,8 +276,8 @@ def _noise_row(
     if "author" not in values:
         return None
     frames = results[f"none-{ON}"]["f_mse"].size
-    six = values.pop("six", None)
-    remark = words if six is None else f"{words} Reading (i): {six:.2f} %.".strip()
+    angle = results.get(f"six-{kind}-{level:g}-{ON}")
+    remark = words if angle is None else f"{words} Reading (i): {share(angle['f_six'], limit):.2f} %.".strip()
     return agreement(
         f"{_NOISE_WORDS[kind]}, σ = {level:g}, on the grid: share with ε_f ≤ {limit:g}°",
         published=published,

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.thesis.experiments.comparison import agreement, shown
+from starid.thesis.experiments.comparison import Readings, agreement, shown
 from starid.thesis.experiments.experiment import Context, Results, Row, write_csv
 from starid.thesis.experiments.lsi_trials import OFF, ON
 from starid.thesis.experiments.plots import colours, figure, save
@@ -126,7 +126,7 @@ def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
     for case in ("none", "root-both-1", "false-1", "missing-1"):
         for grid in (ON, OFF):
             result = results[f"{case}-{grid}"]
-            rank = {
+            rank: Readings = {
                 "author": float(spearmanr(result["psi_author"], result["f_author_mse"]).statistic),
                 "printed": float(spearmanr(result["psi_mse"], result["f_mse"]).statistic),
             }
