@@ -7,6 +7,7 @@ that agree, and fewer are a regression.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -33,9 +34,11 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {}
 """Experiment → quantity → why it is missed."""
 
 
-def known_miss(experiment: str, row: Row) -> KnownMiss | None:
+def known_miss(
+    experiment: str, row: Row, known: Mapping[str, Mapping[str, KnownMiss]] | None = None
+) -> KnownMiss | None:
     """The entry of a missed row, None if it is met, has none, or reaches less than the entry says."""
     if row.passed is not False:
         return None
-    entry = KNOWN.get(experiment, {}).get(row.quantity)
+    entry = (KNOWN if known is None else known).get(experiment, {}).get(row.quantity)
     return entry if entry is not None and row.met >= entry.met else None
