@@ -24,6 +24,7 @@ from starid.thesis.experiments.experiment import (
 from starid.thesis.experiments.fsf import RADIUS_DEG, first_frame, noise_of
 from starid.thesis.experiments.lsi_trials import OFF, frames_under_test, share
 from starid.thesis.experiments.plots import figure, save
+from starid.thesis.frame_sky import SkyError
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.lasso import LAMBDAS, lasso_path
 from starid.thesis.lsi import LostInSpace
@@ -64,9 +65,12 @@ def _kappa(context: Context, kappa: float) -> Results:
     database = build_database(star_catalog(), DatabaseParameters(overlap=_OVERLAP, kappa=kappa))
     solvers = [LostInSpace(database, solver="matlab"), LostInSpace(database)]
     frames = _frames(context)
-    errors, counts = np.empty((2, len(frames))), np.empty(len(frames))
+    errors, counts = np.full((2, len(frames)), np.nan), np.zeros(len(frames))
     for i, (ra, dec) in enumerate(frames):
-        features = database.sky.features(ra % 360.0, dec)
+        try:
+            features = database.sky.features(ra % 360.0, dec)
+        except SkyError:
+            continue
         counts[i] = features.n
         for j, lsi in enumerate(solvers):
             estimate = lsi.solve(features).mse
