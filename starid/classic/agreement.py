@@ -1,0 +1,140 @@
+"""The largest group of proposed matches whose mutual distances agree with the catalogue.
+
+Most published algorithms end with matched stars and a last check that they belong together: all in one field, or all at
+the right distances from each other. The latter holds for every sensor and is done here once for all.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.classic.pairs import chord_between
+from starid.errors import StaridError
+from starid.geometric.jit_kernels import entry, inner
+from starid.wahba import solve_wahba
+
+LEAST_GROUP: Final = 3
+"""Matches that an attitude needs: of two, chance finds as many as one likes."""
+
+
+@inner
+def compatible(
+    directions: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    a: int,
+    b: int,
+    tolerance: float,
+) -> bool:
+    """Whether two matches name different stars, seen as far apart as the catalogue has them."""
+    if pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]:
+        return False
+    seen = chord_between(directions, pairs[a, 0], directions, pairs[b, 0])
+    return abs(seen - chord_between(vectors, pairs[a, 1], vectors, pairs[b, 1])) <= tolerance
+
+
+@inner
+def group_around(
+    directions: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    seed: int,
+    tolerance: float,
+    members: NDArray[np.int64],
+) -> int:
+    """Collect matches that agree with one of them, and with all that were collected before; return how many.
+
+    Those that agree with most others come first (`members` (m,) receives the rows).
+    """
+    n = pairs.shape[0]
+    support = np.zeros(n, dtype=np.int64)
+    with_seed = np.zeros(n, dtype=np.bool_)
+    for i in range(n):
+        with_seed[i] = compatible(directions, vectors, pairs, seed, i, tolerance)
+    for i in range(n):
+        if with_seed[i]:
+            for j in range(n):
+                if with_seed[j] and compatible(directions, vectors, pairs, i, j, tolerance):
+                    support[i] += 1
+    members[0] = seed
+    count = 1
+    for i in np.argsort(-support, kind="mergesort"):
+        if not with_seed[i]:
+            continue
+        good = True
+        for k in range(1, count):
+            if not compatible(directions, vectors, pairs, i, members[k], tolerance):
+                good = False
+                break
+        if good:
+            members[count] = i
+            count += 1
+    return count
+
+
+@entry
+def _largest_group(
+    directions: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    tolerance: float,
+) -> NDArray[np.int64]:
+    """Rows of the largest group over all seeds; the first of those equally large."""
+    members, best = np.empty(pairs.shape[0], dtype=np.int64), np.empty(0, dtype=np.int64)
+    for seed in range(pairs.shape[0]):
+        count = group_around(directions, vectors, pairs, seed, tolerance, members)
+        if count > best.shape[0]:
+            best = members[:count].copy()
+    return best
+
+
+def largest_group(
+    directions: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    tolerance: float,
+) -> NDArray[np.int64]:
+    """Matches that agree with each other in every distance, as many as can be found from each of them.
+
+    Parameters
+    ----------
+    directions : ndarray (n, 3)
+        Observed unit vectors in the sensor frame.
+    vectors : ndarray (N, 3)
+        Unit vectors of the guide stars.
+    pairs : ndarray (m, 2)
+        Proposed matches: row of an observed star, row of a guide star; a star may stand in several.
+    tolerance : float
+        Largest difference of two chords.
+
+    Returns
+    -------
+    ndarray (k, 2)
+        The group, empty where it has fewer than `LEAST_GROUP` members or is the mirror image of the sky.
+    """
+    none = np.empty((0, 2), dtype=np.int64)
+    if len(pairs) < LEAST_GROUP:
+        return none
+    unique = np.unique(pairs, axis=0)
+    group = unique[_largest_group(directions, vectors, unique, tolerance)]
+    if len(group) < LEAST_GROUP or not _same_hand(directions, vectors, group, tolerance):
+        return none
+    return group[np.argsort(group[:, 0])]
+
+
+def _same_hand(
+    directions: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    group: NDArray[np.int64],
+    tolerance: float,
+) -> bool:
+    """Whether a turn brings the stars of the group onto the observed ones; distances alone fit the mirror image too."""
+    seen, stars = directions[group[:, 0]], vectors[group[:, 1]]
+    try:
+        residual = solve_wahba(seen, stars).to_sensor(stars) - seen
+    except StaridError:  # stars on one line
+        return False
+    return bool(np.median(np.linalg.norm(residual, axis=1)) <= tolerance)

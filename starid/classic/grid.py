@@ -1,0 +1,135 @@
+"""GA, the grid algorithm.
+
+C. Padgett, K. Kreutz-Delgado, "A grid algorithm for autonomous star identification", IEEE Transactions on Aerospace and
+Electronic Systems 33(1), 202–213, 1997.
+
+A pivot star is put in the middle, its nearest neighbour beyond a buffer radius is turned onto the +x axis, and a g × g
+grid is laid over the pattern radius: the cells that hold a star are the pattern. A look-up table leads from each cell to
+the guide stars whose pattern has it; the one that collects most votes is the pivot, if it has enough and no other has as
+many. Every observed star is tried as the pivot; the largest group of matches that fits into one field stands.
+
+own choice: pattern radius 0.65 of the width of the field, buffer 0.15 of it (a nearer neighbour turns the grid by more than a cell at its
+rim), g = 40 as in the paper, and at least 4 votes. Guide stars that are equal in votes, four at most, are all left to the last step.
+own choice: "fits into one field" is tested as agreement of all distances, as for all algorithms here.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
+from starid.classic.solver import ClassicIdentifier, Database, Observed
+from starid.geometric.jit_kernels import entry, inner
+
+GRID: Final = 40
+"""Cells along each side of the grid."""
+
+RADIUS_SHARE: Final = 0.65
+"""Pattern radius over the width of the field."""
+
+BUFFER_SHARE: Final = 0.15
+"""Buffer radius over the pattern radius."""
+
+LEAST_VOTES: Final = 4
+MOST_NEIGHBOURS: Final = 400
+
+
+@inner
+def place_on_grid(
+    polar: NDArray[np.float64], i: int, reference: float, radius: float, cells: int
+) -> tuple[float, float]:
+    """Position of a neighbour in units of cells, the grid turned to a reference azimuth."""
+    angle = turned(polar[i, 1], reference)
+    half = 0.5 * cells
+    x = half + half * polar[i, 0] / radius * np.cos(angle)
+    y = half + half * polar[i, 0] / radius * np.sin(angle)
+    return min(max(x, 0.0), cells - 1e-9), min(max(y, 0.0), cells - 1e-9)
+
+
+@inner
+def occupied_cells(
+    polar: NDArray[np.float64],
+    count: int,
+    aligned: int,
+    radius: float,
+    cells: int,
+    out: NDArray[np.int64],
+) -> int:
+    """Fill in the cells that hold a star, each once, the grid turned to a neighbour; return how many."""
+    filled = 0
+    for i in range(count):
+        x, y = place_on_grid(polar, i, polar[aligned, 1], radius, cells)
+        cell = int(y) * cells + int(x)
+        known = False
+        for k in range(filled):
+            known = known or out[k] == cell
+        if not known:
+            out[filled] = cell
+            filled += 1
+    return filled
+
+
+@entry
+def _patterns(
+    vectors: NDArray[np.float64], radius: float, buffer: float
+) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
+    """Look-up table: first entry of each cell, and the stars whose pattern has it."""
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    cells, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    for star in range(vectors.shape[0]):
+        count = neighbours_of(vectors, star, radius, polar, rows)
+        aligned = nearest_beyond(polar, count, buffer)
+        if aligned < 0:
+            continue
+        for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
+            cells.append(found[k])
+            stars.append(np.int64(star))
+    keys, owners = np.array(cells), np.array(stars)
+    start, order = grouped(keys, GRID * GRID)
+    return start, owners[order].astype(np.uint16)
+
+
+@entry
+def _vote(
+    start: NDArray[np.int32],
+    owner: NDArray[np.uint16],
+    stars: int,
+    seen: NDArray[np.float64],
+    radius: float,
+    buffer: float,
+) -> NDArray[np.int64]:
+    """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    matches = np.empty((seen.shape[0] * MOST_TIED, 2), dtype=np.int64)
+    filled = 0
+    for pivot in range(seen.shape[0]):
+        count = neighbours_of(seen, pivot, radius, polar, rows)
+        aligned = nearest_beyond(polar, count, buffer)
+        if aligned < 0:
+            continue
+        votes = np.zeros(stars, dtype=np.int32)
+        for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
+            for place in range(start[found[k]], start[found[k] + 1]):
+                votes[owner[place]] += 1
+        filled = add_winners(votes, LEAST_VOTES, pivot, matches, filled)
+    return matches[:filled]
+
+
+class GridIdentifier(ClassicIdentifier):
+    """The grid algorithm behind the interface of all identifiers."""
+
+    stars_per_field: ClassVar[float] = 30.0
+
+    def _build(self) -> Database:
+        self._radius = RADIUS_SHARE * self.width_rad
+        self._buffer = BUFFER_SHARE * self._radius
+        self.start, self.owner = _patterns(self.guide.vectors, self._radius, self._buffer)
+        return self.start, self.owner
+
+    def _match(self, observed: Observed) -> NDArray[np.int64]:
+        return _vote(self.start, self.owner, len(self.guide), observed.directions, self._radius, self._buffer)

@@ -1,0 +1,138 @@
+"""IG, the improved grid algorithm.
+
+M. Aghaei, H. A. Moghaddam, "Grid star identification improvement using optimization approaches", IEEE Transactions on Aerospace
+and Electronic Systems 52(5), 2080–2090, 2016.
+
+Three changes to the grid algorithm. Neighbours are clustered by brightness and the grid is aligned with a bright one, and with
+several in turn, since a bright star is seldom missing and its place in the order of distance seldom wrong. Of every look-up the
+two best matches are kept. The threshold on the votes is that of Bayes' decision between a true and a chance match.
+
+own choice: the bright cluster is the brighter half of a pattern; guide patterns are aligned with its nearest star beyond the buffer,
+observed ones with its three nearest in turn.
+own choice: votes are binomial. An observed cell is in the true pattern with probability 0.5 (noise, rim of the field, stars that come and
+go) and in another's with the share of cells that patterns fill on the average. A match stands when its odds
+outweigh the prior, one guide star among all.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.classic.grid import BUFFER_SHARE, GRID, MOST_NEIGHBOURS, RADIUS_SHARE, occupied_cells
+from starid.classic.neighbours import grouped, neighbours_of
+from starid.classic.solver import ClassicIdentifier, Database, Observed
+from starid.geometric.jit_kernels import entry, inner
+
+ALIGNMENTS: Final = 3
+"""Neighbours that an observed pattern is aligned with in turn."""
+
+KEPT: Final = 2
+"""Best matches of each look-up that are kept."""
+
+HIT_RATE: Final = 0.5
+"""Probability that an observed cell is in the true pattern."""
+
+
+@inner
+def _bright_neighbour(
+    polar: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    count: int,
+    magnitude: NDArray[np.float64],
+    buffer: float,
+    rank: int,
+) -> int:
+    """Place of the neighbour beyond the buffer of given rank, by distance, in the brighter half; −1 if there is none."""
+    values = np.empty(count)
+    for i in range(count):
+        values[i] = magnitude[rows[i]]
+    middle = np.median(values) if count > 0 else 0.0
+    for i in range(count):
+        if polar[i, 0] > buffer and values[i] <= middle:
+            if rank == 0:
+                return i
+            rank -= 1
+    return -1
+
+
+@entry
+def _patterns(
+    vectors: NDArray[np.float64], magnitude: NDArray[np.float64], radius: float, buffer: float
+) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
+    """Look-up table: first entry of each cell, and the stars whose pattern has it."""
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    cells, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    for star in range(vectors.shape[0]):
+        count = neighbours_of(vectors, star, radius, polar, rows)
+        aligned = _bright_neighbour(polar, rows, count, magnitude, buffer, 0)
+        if aligned < 0:
+            continue
+        for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
+            cells.append(found[k])
+            stars.append(np.int64(star))
+    keys, owners = np.array(cells), np.array(stars)
+    start, order = grouped(keys, GRID * GRID)
+    return start, owners[order].astype(np.uint16)
+
+
+@entry
+def _look_up(
+    table: tuple[NDArray[np.int32], NDArray[np.uint16]],
+    stars: int,
+    seen: tuple[NDArray[np.float64], NDArray[np.float64]],
+    radius: float,
+    buffer: float,
+    fill: float,
+) -> NDArray[np.int64]:
+    """Matches (m, 2) whose votes pass the Bayesian threshold, the best two of each pivot and alignment."""
+    start, owner = table
+    directions, magnitude = seen
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    matches = np.empty((directions.shape[0] * ALIGNMENTS * KEPT, 2), dtype=np.int64)
+    filled = 0
+    hit, miss = math.log(HIT_RATE / fill), math.log((1.0 - HIT_RATE) / (1.0 - fill))
+    for pivot in range(directions.shape[0]):
+        count = neighbours_of(directions, pivot, radius, polar, rows)
+        for rank in range(ALIGNMENTS):
+            aligned = _bright_neighbour(polar, rows, count, magnitude, buffer, rank)
+            if aligned < 0:
+                break
+            votes = np.zeros(stars, dtype=np.int32)
+            cells = occupied_cells(polar, count, aligned, radius, GRID, found)
+            for k in range(cells):
+                for place in range(start[found[k]], start[found[k] + 1]):
+                    votes[owner[place]] += 1
+            for _ in range(KEPT):
+                best = np.argmax(votes)
+                odds = votes[best] * hit + (cells - votes[best]) * miss
+                if odds > math.log(stars):
+                    matches[filled, 0], matches[filled, 1] = pivot, best
+                    filled += 1
+                votes[best] = 0
+    return matches[:filled]
+
+
+class ImprovedGridIdentifier(ClassicIdentifier):
+    """The improved grid algorithm behind the interface of all identifiers."""
+
+    stars_per_field: ClassVar[float] = 30.0
+
+    def _build(self) -> Database:
+        self._radius = RADIUS_SHARE * self.width_rad
+        self._buffer = BUFFER_SHARE * self._radius
+        guide = self.guide
+        self.table = _patterns(guide.vectors, guide.magnitude, self._radius, self._buffer)
+        # a pattern's own cell for its alignment star aside, cells are filled evenly over the circle
+        inside = 0.25 * math.pi * GRID**2
+        self._fill = min(self.table[1].size / (len(guide) * inside), HIT_RATE / 2.0)
+        return self.table
+
+    def _match(self, observed: Observed) -> NDArray[np.int64]:
+        seen = (observed.directions, observed.magnitude)
+        return _look_up(self.table, len(self.guide), seen, self._radius, self._buffer, self._fill)

@@ -1,0 +1,146 @@
+"""A star's neighbours in polar coordinates about it: what every pattern of a pivot star is made of.
+
+The published patterns shift the image until the pivot is in its middle, which holds in narrow fields only.
+
+own choice: the sphere is turned instead of the image shifted, so that a pattern is the same wherever its pivot
+stands in the field, at any width of field: the radius is the chord, the azimuth is counted in the tangential plane
+of the pivot from an axis that each call is free to choose. Sensor and sky have the same sense of rotation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.geometric.jit_kernels import entry, inner
+
+MOST_TIED: Final = 4
+"""Guide stars with equally many votes that a pivot may leave to the last step; more of them say nothing."""
+
+
+@inner
+def neighbours_of(
+    vectors: NDArray[np.float64],
+    pivot: int,
+    radius: float,
+    polar: NDArray[np.float64],
+    rows: NDArray[np.int64],
+) -> int:
+    """List the neighbours of a star by rising distance.
+
+    Parameters
+    ----------
+    vectors : ndarray (n, 3)
+        Unit vectors.
+    pivot : int
+        Row of the star.
+    radius : float
+        Largest chord.
+    polar : ndarray (m, 2)
+        Receives chord and azimuth, radians in [−π, π].
+    rows : ndarray (m,)
+        Receives the neighbours' rows.
+
+    Returns
+    -------
+    int
+        How many there are; those beyond m, in the order of the rows, are left out.
+    """
+    px, py, pz = vectors[pivot, 0], vectors[pivot, 1], vectors[pivot, 2]
+    # an axis across: that of the least component, made perpendicular
+    ax, ay, az = 0.0, 0.0, 1.0
+    if abs(px) <= abs(py) and abs(px) <= abs(pz):
+        ax, az = 1.0, 0.0
+    elif abs(py) <= abs(pz):
+        ay, az = 1.0, 0.0
+    along = ax * px + ay * py + az * pz
+    ax, ay, az = ax - along * px, ay - along * py, az - along * pz
+    norm = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax * norm, ay * norm, az * norm
+    bx, by, bz = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
+    count = 0
+    for i in range(vectors.shape[0]):
+        x, y, z = vectors[i, 0] - px, vectors[i, 1] - py, vectors[i, 2] - pz
+        square = x * x + y * y + z * z
+        if i == pivot or square > radius * radius or square == 0.0 or count == rows.shape[0]:
+            continue
+        distance = math.sqrt(square)
+        place = count
+        while place > 0 and polar[place - 1, 0] > distance:
+            polar[place, 0], polar[place, 1] = polar[place - 1, 0], polar[place - 1, 1]
+            rows[place] = rows[place - 1]
+            place -= 1
+        polar[place, 0] = distance
+        polar[place, 1] = math.atan2(bx * x + by * y + bz * z, ax * x + ay * y + az * z)
+        rows[place] = i
+        count += 1
+    return count
+
+
+@inner
+def turned(azimuth: float, reference: float) -> float:
+    """Azimuth counted from a reference, in [0, 2π)."""
+    angle = azimuth - reference
+    if angle < 0.0:
+        angle += 2.0 * math.pi
+    return angle if angle < 2.0 * math.pi else 0.0
+
+
+@inner
+def nearest_beyond(polar: NDArray[np.float64], count: int, buffer: float) -> int:
+    """First of the neighbours, by rising distance, that is farther than a buffer; −1 if there is none."""
+    for i in range(count):
+        if polar[i, 0] > buffer:
+            return i
+    return -1
+
+
+@entry
+def neighbour_list(
+    vectors: NDArray[np.float64], pivot: int, radius: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Chords and azimuths (m, 2) of a star's neighbours by rising distance, and their rows (m,)."""
+    polar = np.empty((vectors.shape[0], 2))
+    rows = np.empty(vectors.shape[0], dtype=np.int64)
+    count = neighbours_of(vectors, pivot, radius, polar, rows)
+    return polar[:count].copy(), rows[:count].copy()
+
+
+@inner
+def grouped(keys: NDArray[np.int64], groups: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Sort rows by key: first row of each group (groups + 1,), and the rows (n,) in that order."""
+    start = np.zeros(groups + 1, dtype=np.int32)
+    for key in keys:
+        start[key + 1] += 1
+    for group in range(groups):
+        start[group + 1] += start[group]
+    fill = start.copy()
+    order = np.empty(keys.shape[0], dtype=np.int64)
+    for row in range(keys.shape[0]):
+        order[fill[keys[row]]] = row
+        fill[keys[row]] += 1
+    return start, order
+
+
+@inner
+def add_winners(
+    votes: NDArray[np.int32], least: int, pivot: int, matches: NDArray[np.int64], filled: int
+) -> int:
+    """Append the guide stars with most votes, if they are enough and not too many are tied; return the new number of matches.
+
+    `matches` (n·`MOST_TIED`, 2) receives the pivot and the guide star.
+    """
+    most = votes.max()
+    if most < least:
+        return filled
+    count = 0
+    for star in range(votes.shape[0]):
+        if votes[star] == most:
+            if count == MOST_TIED:
+                return filled
+            matches[filled + count, 0], matches[filled + count, 1] = pivot, star
+            count += 1
+    return filled + count

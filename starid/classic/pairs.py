@@ -1,0 +1,132 @@
+"""Pairs of catalogue stars by distance, found through a k-vector.
+
+Distances are chords, 2·sin(angle/2): they order like angles, keep all their digits at small ones, and cost no
+trigonometry. The k-vector (Mortari 1996, Search-less algorithm) counts the pairs below each of as many evenly
+spaced values as there are pairs, so that a range of distances is found by two reads instead of a search.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+from starid.geometric.jit_kernels import entry, inner
+
+MOST_STARS: Final = 65_535
+"""Stars that 16-bit numbers can name."""
+
+
+class PairTable(NamedTuple):
+    """Pairs of stars by rising distance.
+
+    Attributes
+    ----------
+    chord : ndarray (m,) float32
+        Distances.
+    first, second : ndarray (m,) uint16
+        Their stars, ``first < second``.
+    below : ndarray (m + 1,) int32
+        k-vector: pairs whose distance is at most ``lowest + j·step``.
+    line : ndarray (2,)
+        ``lowest`` and ``step``.
+    """
+
+    chord: NDArray[np.float32]
+    first: NDArray[np.uint16]
+    second: NDArray[np.uint16]
+    below: NDArray[np.int32]
+    line: NDArray[np.float64]
+
+    @property
+    def nbytes(self) -> int:
+        """Size in bytes."""
+        return sum(part.nbytes for part in self)
+
+
+@inner
+def chord_between(ones: NDArray[np.float64], i: int, others: NDArray[np.float64], j: int) -> float:
+    """Distance of two unit vectors, rows of two tables."""
+    x, y, z = ones[i, 0] - others[j, 0], ones[i, 1] - others[j, 1], ones[i, 2] - others[j, 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@entry
+def _close_pairs(
+    vectors: NDArray[np.float64], longest: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.uint16]]:
+    """All pairs at most so far apart; the stars are sorted by rising z."""
+    n = vectors.shape[0]
+    count = 0
+    chord = np.empty(0, dtype=np.float32)
+    first, second = np.empty(0, dtype=np.uint16), np.empty(0, dtype=np.uint16)
+    for fill in range(2):
+        if fill == 1:
+            chord = np.empty(count, dtype=np.float32)
+            first, second = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
+        count = 0
+        for i in range(n):
+            for j in range(i + 1, n):
+                if vectors[j, 2] - vectors[i, 2] > longest:
+                    break
+                distance = chord_between(vectors, i, vectors, j)
+                if distance <= longest:
+                    if fill == 1:
+                        chord[count], first[count], second[count] = distance, i, j
+                    count += 1
+    return chord, first, second
+
+
+def pair_table(vectors: NDArray[np.float64], longest: float) -> PairTable:
+    """All pairs of unit vectors (n, 3) that are at most a chord apart.
+
+    Raises
+    ------
+    StaridError
+        More stars than `MOST_STARS`.
+    """
+    if len(vectors) > MOST_STARS:
+        raise StaridError(
+            f"pair table: {len(vectors)} stars given, at most {MOST_STARS} can be held; take a brighter limit"
+        )
+    by_z = np.argsort(vectors[:, 2], kind="stable")
+    chord, low, high = _close_pairs(np.ascontiguousarray(vectors[by_z]), longest)
+    one, other = by_z[low].astype(np.uint16), by_z[high].astype(np.uint16)
+    order = np.lexsort((np.maximum(one, other), np.minimum(one, other), chord))
+    chord, one, other = chord[order], one[order], other[order]
+    lowest, step = 0.0, 1.0
+    if chord.size:
+        lowest = float(chord[0])
+        step = (float(chord[-1]) - lowest) / chord.size or 1.0
+    values = lowest + step * np.arange(chord.size + 1)
+    below = np.searchsorted(chord.astype(np.float64), values, side="right").astype(np.int32)
+    line = np.array([lowest, step])
+    return PairTable(chord, np.minimum(one, other), np.maximum(one, other), below, line)
+
+
+@inner
+def pair_range(table: PairTable, low: float, high: float) -> tuple[int, int]:
+    """First pair, and one past the last, whose distance lies within [low, high]."""
+    chord, below = table.chord, table.below
+    pairs = chord.shape[0]
+    if pairs == 0 or high < chord[0] or low > chord[pairs - 1]:
+        return 0, 0
+    lowest, step = table.line[0], table.line[1]
+    place = math.floor((low - lowest) / step) - 1
+    start = int(below[min(place, pairs)]) if place >= 0 else 0
+    place = math.ceil((high - lowest) / step) + 1
+    end = int(below[place]) if place <= pairs else pairs
+    while start < pairs and chord[start] < low:
+        start += 1
+    while end > start and chord[end - 1] > high:
+        end -= 1
+    return start, max(start, end)
+
+
+@entry
+def pairs_within(table: PairTable, low: float, high: float) -> tuple[int, int]:
+    """As `pair_range`, for callers in Python."""
+    return pair_range(table, low, high)

@@ -1,0 +1,71 @@
+"""The radial pattern of the pole star and the radial and cyclic algorithm: rings that hold a neighbour.
+
+The distances from a star to its neighbours, quantised into rings, make a binary vector that no rotation changes. A look-up table
+leads from each ring to the guide stars that have a neighbour in it; every ring of an observed star is a vote for them.
+
+own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.3 px of 937 each).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.classic.neighbours import grouped, neighbours_of
+from starid.geometric.jit_kernels import entry, inner
+
+RINGS: Final = 200
+INNER: Final = 0.05
+"""Inner end of the rings over the pattern radius."""
+
+RADIUS_SHARE: Final = 0.5
+"""Pattern radius over the width of the field."""
+
+MOST_NEIGHBOURS: Final = 400
+
+
+@inner
+def ring_of(chord: float, radius: float) -> int:
+    """Ring of a distance, −1 inside the innermost one."""
+    share = (chord / radius - INNER) / (1.0 - INNER)
+    return min(int(share * RINGS), RINGS - 1) if share >= 0.0 else -1
+
+
+@entry
+def ring_table(vectors: NDArray[np.float64], radius: float) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
+    """Look-up table: first entry of each ring, and the stars that have a neighbour in it, each once."""
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    rings, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    for star in range(vectors.shape[0]):
+        last = -1
+        for i in range(neighbours_of(vectors, star, radius, polar, rows)):
+            ring = ring_of(polar[i, 0], radius)
+            if ring > last:
+                rings.append(np.int64(ring))
+                stars.append(np.int64(star))
+                last = ring
+    keys, owners = np.array(rings), np.array(stars)
+    start, order = grouped(keys, RINGS)
+    return start, owners[order].astype(np.uint16)
+
+
+@inner
+def radial_votes(
+    table: tuple[NDArray[np.int32], NDArray[np.uint16]],
+    polar: NDArray[np.float64],
+    count: int,
+    radius: float,
+    votes: NDArray[np.int32],
+) -> None:
+    """Count the rings that an observed star, given its neighbours, shares with each guide star."""
+    start, owner = table
+    votes[:] = 0
+    last = -1
+    for i in range(count):
+        ring = ring_of(polar[i, 0], radius)
+        if ring > last:
+            last = ring
+            for place in range(start[ring], start[ring + 1]):
+                votes[owner[place]] += 1

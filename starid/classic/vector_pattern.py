@@ -1,0 +1,114 @@
+"""VP, the one-dimensional vector pattern.
+
+L. Luo, L. Xu, H. Zhang, "An Autonomous Star Identification Algorithm Based on One-Dimensional Vector Pattern for Star Sensors",
+Sensors 15(7), 16412–16429, 2015.
+
+The neighbours of a star are turned until its alignment star lies on the x' axis. Their positions along x', sorted into the elements
+of one vector, with the plane angle that each makes with the alignment star, are the pattern; it does not change as the image
+rotates, so no circular shift is needed. Patterns are found by an index over the elements of the vector.
+
+own choice: 200 elements over the diameter, pattern radius and buffer those of `starid.classic.grid`; an observed neighbour votes for a
+guide star that has one in the same element or the next, whose angle differs by at most 4°. (Position and angle together fix a neighbour's
+place, up to its mirror image at equal x', which the sign of the angle tells apart.)
+own choice: the angle of a near neighbour is uncertain, so the allowed difference grows inversely with its distance from the pivot.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.classic.grid import BUFFER_SHARE, MOST_NEIGHBOURS, RADIUS_SHARE
+from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
+from starid.classic.solver import ClassicIdentifier, Database, Observed
+from starid.geometric.jit_kernels import entry, inner
+
+ELEMENTS: Final = 200
+ANGLE_TOLERANCE: Final = math.radians(4.0)
+"""Largest difference of the angle of a neighbour at half the pattern radius."""
+
+LEAST_VOTES: Final = 4
+
+
+@inner
+def _element(polar: NDArray[np.float64], i: int, reference: float, radius: float) -> int:
+    """Element of the vector that a neighbour's x' falls into."""
+    x = polar[i, 0] / radius * math.cos(turned(polar[i, 1], reference))
+    return min(max(int(0.5 * (1.0 + x) * ELEMENTS), 0), ELEMENTS - 1)
+
+
+@entry
+def _patterns(
+    vectors: NDArray[np.float64], radius: float, buffer: float
+) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]]:
+    """Index: first entry of each element, the stars that have a neighbour there, and its angle."""
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    elements, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    angles = [0.0 for _ in range(0)]
+    for star in range(vectors.shape[0]):
+        count = neighbours_of(vectors, star, radius, polar, rows)
+        aligned = nearest_beyond(polar, count, buffer)
+        if aligned < 0:
+            continue
+        for i in range(count):
+            if i != aligned:
+                elements.append(np.int64(_element(polar, i, polar[aligned, 1], radius)))
+                stars.append(np.int64(star))
+                angles.append(turned(polar[i, 1], polar[aligned, 1]))
+    keys, owners, values = np.array(elements), np.array(stars), np.array(angles)
+    start, order = grouped(keys, ELEMENTS)
+    return start, owners[order].astype(np.uint16), values[order].astype(np.float32)
+
+
+@entry
+def _vote(
+    index: tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]],
+    stars: int,
+    seen: NDArray[np.float64],
+    radius: float,
+    buffer: float,
+) -> NDArray[np.int64]:
+    """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
+    start, owner, angles = index
+    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    matches = np.empty((seen.shape[0] * MOST_TIED, 2), dtype=np.int64)
+    filled = 0
+    for pivot in range(seen.shape[0]):
+        count = neighbours_of(seen, pivot, radius, polar, rows)
+        aligned = nearest_beyond(polar, count, buffer)
+        if aligned < 0:
+            continue
+        votes, voter = np.zeros(stars, dtype=np.int32), np.full(stars, -1, dtype=np.int64)
+        for i in range(count):
+            if i == aligned:
+                continue
+            angle = turned(polar[i, 1], polar[aligned, 1])
+            allowed = ANGLE_TOLERANCE * min(0.5 * radius / polar[i, 0], 4.0)
+            middle = _element(polar, i, polar[aligned, 1], radius)
+            for element in range(max(middle - 1, 0), min(middle + 2, ELEMENTS)):
+                for place in range(start[element], start[element + 1]):
+                    star = owner[place]
+                    gap = abs(angles[place] - angle)
+                    if voter[star] != i and min(gap, 2.0 * math.pi - gap) <= allowed:
+                        votes[star] += 1
+                        voter[star] = i
+        filled = add_winners(votes, LEAST_VOTES, pivot, matches, filled)
+    return matches[:filled]
+
+
+class VectorPatternIdentifier(ClassicIdentifier):
+    """The one-dimensional vector pattern behind the interface of all identifiers."""
+
+    stars_per_field: ClassVar[float] = 30.0
+
+    def _build(self) -> Database:
+        self._radius = RADIUS_SHARE * self.width_rad
+        self._buffer = BUFFER_SHARE * self._radius
+        self.index = _patterns(self.guide.vectors, self._radius, self._buffer)
+        return self.index
+
+    def _match(self, observed: Observed) -> NDArray[np.int64]:
+        return _vote(self.index, len(self.guide), observed.directions, self._radius, self._buffer)
