@@ -26,6 +26,7 @@ MODULES: Final[tuple[str, ...]] = (
     "rsi",
     "rsi_printed",
     "spherical",
+    "classics",
 )
 """Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
 

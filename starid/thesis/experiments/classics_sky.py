@@ -1,0 +1,115 @@
+"""The thesis's frames as an identifier of stars takes them: positions in pixels and fluxes, on its flat sky and on the true sphere.
+
+On the flat sky distances are those of the (α, δ) plane, which no turn of a sphere keeps. The published algorithms work
+with unit vectors; so the plane is laid, small as a stamp, on the sphere, and seen through a lens so long that its frames fill
+the same pixels: curvature is gone, distances are those of the plane, and no algorithm needs to know.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+from starid.thesis.database import THESIS_KAPPA, DatabaseParameters, sky_of
+from starid.thesis.experiments.experiment import planar_sky, star_catalog
+from starid.thesis.frame_sky import FrameSky
+from starid.thesis.simulation import PIXEL_DEG, NoiseModel, add_noise
+
+SkyName = Literal["flat", "sphere"]
+
+STAMP: Final = 2e-5
+"""Radians of the sphere that a degree of the flat plane becomes."""
+
+_SIDE_PX: Final = 937
+
+
+@dataclass(frozen=True, eq=False)
+class ThesisSky:
+    """A sky of the thesis's stars, with the camera and the catalogue that belong to it.
+
+    Attributes
+    ----------
+    frames
+        Where frames are taken from.
+    camera, catalog
+        For identifiers; magnitudes are Hp in both bands.
+    """
+
+    name: SkyName
+    frames: FrameSky
+    camera: Camera
+    catalog: StarCatalog
+
+    def limit_for(self, per_field: float) -> float:
+        """Magnitude to which a frame holds so many stars on the average; that of the faintest where there are fewer."""
+        row = math.ceil(len(self.catalog) * per_field / self.stars_per_field)
+        return float(self.catalog.v[min(row, len(self.catalog)) - 1])
+
+    @property
+    def stars_per_field(self) -> float:
+        """Stars of the catalogue in a frame on the average."""
+        share = (
+            0.5 * (1.0 - math.cos(math.radians(20.0)))
+            if self.name == "sphere"
+            else math.pi * 400.0 / 64_800.0
+        )
+        return len(self.frames.stars) * share
+
+    def observe(
+        self, rng: np.random.Generator, ra_deg: float, dec_deg: float, noise: NoiseModel
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions (n, 2), pixels, and fluxes (n,), 1 at magnitude 0, of the objects in a frame with north up."""
+        brightness, places, _ = self.frames.stars_in_frame(ra_deg % 360.0, dec_deg)
+        to_deg = PIXEL_DEG if self.name == "sphere" else 1.0
+        magnitudes, places, _ = add_noise(
+            rng, brightness, places * to_deg, noise, self.frames.half_width * to_deg
+        )
+        return places / PIXEL_DEG + np.asarray(self.camera.centre_px), 10.0 ** (-0.4 * magnitudes)
+
+    def boresight_deg(self, attitude: Attitude) -> tuple[float, float]:
+        """Right ascension and declination that an attitude of this sky means, degrees."""
+        if self.name == "sphere":
+            return attitude.ra_deg, attitude.dec_deg
+        x, y, z = attitude.boresight
+        return float(x / z) / STAMP + 180.0, float(y / z) / STAMP
+
+
+@lru_cache(maxsize=2)
+def thesis_sky(name: SkyName) -> ThesisSky:
+    """The sky of the published numbers, flat as the thesis has it, or its stars on the sphere."""
+    catalog = star_catalog()
+    faint = catalog.subset(catalog.hp >= THESIS_KAPPA)
+    faint = dataclasses.replace(faint, v=faint.hp)
+    faint = faint.subset(np.argsort(faint.v, kind="stable"))
+    if name == "sphere":
+        camera = Camera.from_fov(_SIDE_PX * PIXEL_DEG, _SIDE_PX, _SIDE_PX)
+        parameters = DatabaseParameters.for_camera(
+            camera, overlap=0.995, kappa=THESIS_KAPPA, direction="faintest", band="hp"
+        )
+        return ThesisSky(name, sky_of(catalog, parameters), camera, faint)
+    focal = 1.0 / (PIXEL_DEG * STAMP)
+    centre = 0.5 * (_SIDE_PX - 1)
+    camera = Camera(_SIDE_PX, _SIDE_PX, (focal, focal), (centre, centre))
+    return ThesisSky(name, planar_sky(None, "faintest"), camera, _stamp(faint))
+
+
+def _stamp(stars: StarCatalog) -> StarCatalog:
+    """Stars of the flat plane as a small patch of the sphere; it does not wrap, and no frame of the thesis crosses α = 0°."""
+    ra, dec = np.degrees(stars.ra_rad), np.degrees(stars.dec_rad)
+    vectors = np.column_stack([STAMP * (ra - 180.0), STAMP * dec, np.ones(len(stars))])
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    return dataclasses.replace(
+        stars,
+        vectors=vectors,
+        ra_rad=np.arctan2(vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi),
+        dec_rad=np.arcsin(vectors[:, 2]),
+    )
