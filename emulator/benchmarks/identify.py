@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -10,12 +11,21 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starhil.emulator.benchmarks.peers import OWN, PEERS, Reply, Solver, make_solver, version_of
+from starhil.emulator.benchmarks.peers import (
+    Reply,
+    Solver,
+    UnsuitedError,
+    check_name,
+    make_solver,
+    resident_bytes,
+    version_of,
+)
 from starhil.emulator.benchmarks.scenes import Scene, SceneMaker, SceneSettings
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
+from starid.errors import StaridError
 from starid.geometric.pattern_index import seen_stars
 
 Array = NDArray[np.float64]
@@ -34,20 +44,38 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "0.5, half covered": SceneSettings(5.5, 0.5, covered=0.5),
     "0.5, 100 false, V ≤ 4.75": SceneSettings(4.75, 0.5, false_stars=100),
     "0.5, 200 false in half the field": SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5),
+    "8°, V ≤ 7.5, 0.5": SceneSettings(7.5, 0.5),
+    "20°, V ≤ 6.5, 0.5": SceneSettings(6.5, 0.5),
+    "62°, V ≤ 5, 0.5": SceneSettings(5.0, 0.5),
+    "dense, V ≤ 7.8, 0.5": SceneSettings(7.8, 0.5),
+    "tracking, 3 stars": SceneSettings(5.5, 0.5, kept=3),
+    "tracking, 2 stars": SceneSettings(5.5, 0.5, kept=2),
 }
-"""Row of the table → scene: "σ px, false, missing" of stars to V 5.5 where nothing else is said."""
+"""Row of the table → scene: "σ px, false, missing" of stars to V 5.5 in 42° where nothing else is said."""
+
+FIELD_DEG: Final = {"8°, V ≤ 7.5, 0.5": 8.0, "20°, V ≤ 6.5, 0.5": 20.0, "62°, V ≤ 5, 0.5": 62.0}
+"""Fields that differ from that of the camera given."""
+
+TRACKED: Final = ("tracking, 3 stars", "tracking, 2 stars")
+"""Rows in which a solver that tracks is given an attitude a few pixels off."""
 
 STANDARD: Final = tuple(ROWS)[:9]
 """Rows of the published comparison."""
+
+LEADERBOARD: Final = (*STANDARD, *tuple(ROWS)[13:])
+"""Those, and other fields, a dense one, and a few stars in tracking."""
 
 WRONG_ARCSEC: Final = 360.0
 """A valid attitude whose boresight is off by more than this is wrong."""
 
 PEER_LIMIT_V: Final = 5.5
-"""Faintest star in the peers' databases: that of the scenes."""
+"""Least faint limit of the databases of peers and published algorithms: otherwise that of the scenes."""
+
+PREDICTION_PX: Final = 3.0
+"""Error of a predicted attitude, one sigma about each axis, in pixels at the centre."""
 
 _BLEND_PX: Final = 2.0
-_DEEPEST_V: Final = 6.0
+_DEEPER_V: Final = 0.5
 _FLOOR_STEPS: Final = 3
 
 
@@ -145,50 +173,100 @@ def run(
     Returns
     -------
     dict
-        `rows` (list of `Tally.report`), `skipped`, `versions`, `seed`.
+        `rows` (list of `Tally.report`), `solvers` (what each takes for each field: database, time to build or load it,
+        growth of resident memory), `skipped`, `versions`, `seed`.
     """
     if frames < 1:
         raise EmulatorError(f"--frames {frames}: at least 1 is needed")
     for row in rows:
         if row not in ROWS:
             raise EmulatorError(f"--row {row!r}: one of {'; '.join(ROWS)} is needed")
-    stars = seen_stars(load_catalog(), _DEEPEST_V, _BLEND_PX * camera.pixel_scale_rad)
-    solvers, skipped = _solvers([*own, *peers], camera, stars.brighter_than(PEER_LIMIT_V))
-    maker = SceneMaker(camera, stars)
+    names = list(dict.fromkeys([*own, *peers]))
+    for name in names:
+        check_name(name)
     tallies: list[Tally] = []
-    for row in rows:
-        if progress is not None:
-            progress(row)
-        tallies += _run_row(row, frames, seed, maker, solvers, budget_s)
+    made: list[dict[str, Any]] = []
+    skipped: dict[str, str] = {}
+    # rows of one field together, so that only its solvers are held at a time; the table keeps its order
+    for (width, limit), members in _by_field(rows, camera).items():
+        seen = camera if width is None else Camera.from_fov(width, camera.width, camera.height)
+        field_of = _Field(seen, limit)
+        field_of.add(names, made, skipped)
+        for row in members:
+            if progress is not None:
+                progress(row)
+            tallies += _run_row(row, frames, seed, field_of, budget_s)
+    tallies.sort(key=lambda tally: list(rows).index(tally.row))
     return {
         "seed": seed,
         "rows": [tally.report() for tally in tallies],
+        "solvers": made,
         "skipped": skipped,
-        "versions": {name: version_of(name) for name in solvers},
+        "versions": {name: version_of(name) for name in dict.fromkeys(tally.solver for tally in tallies)},
     }
 
 
-def _solvers(
-    names: Sequence[str], camera: Camera, stars: StarCatalog
-) -> tuple[dict[str, Solver], dict[str, str]]:
-    """Solvers by name, and why others are left out."""
-    solvers: dict[str, Solver] = {}
-    skipped: dict[str, str] = {}
-    for name in names:
-        if name not in OWN + PEERS:
-            raise EmulatorError(f"solver {name!r}: one of {', '.join(OWN + PEERS)} is needed")
-        try:
-            solvers[name] = make_solver(name, camera, stars)
-        except ImportError:
-            skipped[name] = f"not installed: pip install {name}"
-    return solvers, skipped
+def _by_field(rows: Sequence[str], camera: Camera) -> dict[tuple[float | None, float], list[str]]:
+    """Rows by their width of field (None: that of the camera given) and the limit of the databases for it."""
+    fields: dict[tuple[float | None, float], list[str]] = {}
+    for row in rows:
+        width, limit = FIELD_DEG.get(row), ROWS[row].limiting_magnitude
+        if width is None or math.isclose(width, camera.fov_deg):
+            width, limit = None, max(limit, PEER_LIMIT_V)
+        fields.setdefault((width, limit), []).append(row)
+    return fields
 
 
-def _run_row(
-    row: str, frames: int, seed: int, maker: SceneMaker, solvers: dict[str, Solver], budget_s: float
-) -> list[Tally]:
+class _Field:
+    """A camera with the sky that its scenes are made of, and the solvers for it.
+
+    Parameters
+    ----------
+    camera : Camera
+        Pinhole without distortion.
+    limit : float
+        Faintest V of the databases.
+    """
+
+    def __init__(self, camera: Camera, limit: float) -> None:
+        stars = seen_stars(load_catalog(), limit + _DEEPER_V, _BLEND_PX * camera.pixel_scale_rad)
+        self.maker = SceneMaker(camera, stars)
+        self.known = stars.brighter_than(limit)
+        self.solvers: dict[str, Solver] = {}
+
+    def add(self, names: Sequence[str], made: list[dict[str, Any]], skipped: dict[str, str]) -> None:
+        """Make solvers; append what they take to `made`, and why others are left out to `skipped`."""
+        camera = self.maker.camera
+        warm = self.maker.scene(SceneSettings(float(self.known.v[-1]), 0.5), np.random.default_rng(1))
+        for name in names:
+            before, begin = resident_bytes(), time.perf_counter()
+            try:
+                solver = make_solver(name, camera, self.known)
+            except ImportError:
+                skipped[name] = f"not installed: pip install {name}"
+                continue
+            except (UnsuitedError, StaridError) as error:
+                skipped[f"{name}, {camera.fov_deg:.0f}°"] = str(error)
+                continue
+            seconds = time.perf_counter() - begin
+            solver.solve(warm)
+            self.solvers[name] = solver
+            size = solver.database_bytes
+            made.append(
+                {
+                    "solver": name,
+                    "field_deg": round(camera.fov_deg, 3),
+                    "limit_v": float(self.known.v[-1]),
+                    "database_kb": None if size is None else 1e-3 * size,
+                    "build_s": seconds if solver.build_seconds is None else solver.build_seconds,
+                    "memory_mb": 1e-6 * max(resident_bytes() - before, 0),
+                }
+            )
+
+
+def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float) -> list[Tally]:
     """All solvers on the scenes of one row."""
-    settings = ROWS[row]
+    settings, maker, solvers = ROWS[row], field_of.maker, field_of.solvers
     tallies = {name: Tally(row, name) for name in solvers}
     spent = dict.fromkeys(solvers, 0.0)
     warm = maker.scene(settings, np.random.default_rng([seed, 1]))
@@ -200,10 +278,17 @@ def _run_row(
     for _ in range(frames):
         scene = maker.scene(settings, rng)
         floor = None if settings.random_points else best_attitude(maker.camera, maker.stars, scene)
+        predicted = None
+        if row in TRACKED:
+            turn = PREDICTION_PX * maker.camera.pixel_scale_rad * rng.standard_normal(3)
+            predicted = scene.attitude.rotated(turn)
         for name, solver in solvers.items():
             if spent[name] > budget_s:
                 continue
-            reply = solver.solve(scene)
+            if predicted is not None and solver.track is not None:
+                reply = solver.track(scene, predicted)
+            else:
+                reply = solver.solve(scene)
             spent[name] += reply.seconds
             tallies[name].add(scene, floor, reply)
     return list(tallies.values())

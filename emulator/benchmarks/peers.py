@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
+import resource
 import struct
 import tempfile
 import time
@@ -16,18 +18,24 @@ from numpy.typing import NDArray
 
 from starhil.emulator.benchmarks.scenes import Scene
 from starhil.emulator.errors import EmulatorError
+from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
-from starid.interface import make_identifier
+from starid.interface import CLASSICS, make_identifier
+from starid.solution import Solution
 
 Array = NDArray[np.float64]
 
 OWN: Final = ("geometric", "lsi", "rsi")
-PEERS: Final = ("tetra3rs", "ruststartracker")
+PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve")
+ALL: Final = (*OWN, *CLASSICS, *PEERS)
 PATTERN_MAX_ERROR: Final = 0.005
 RUST_TOLERANCE_RAD: Final = 0.0015
 RUST_LOOKUP_MAGNITUDE: Final = 4.0
 RUST_MATCHES: Final = 8
+CEDAR_TIMEOUT_MS: Final = 5000.0
+LEAST_FEATURE_FIELD_DEG: Final = 30.0
+"""Narrowest field for which a feature database (lsi, rsi) is built here: its cells grow with the inverse square of the field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +79,29 @@ class Solver:
         Answers a scene.
     reset : callable
         Makes it forget the scenes that it has seen.
+    track : callable or None
+        Answers a scene near a predicted attitude, where it can.
+    database_bytes : int or None
+        Size of its database, where it can be told.
+    build_seconds : float or None
+        Time that building the database took, where that was measured apart from anything else.
     """
 
     solve: Callable[[Scene], Reply]
     reset: Callable[[], object] = lambda: None
+    track: Callable[[Scene, Attitude], Reply] | None = None
+    database_bytes: int | None = None
+    build_seconds: float | None = None
+
+
+class UnsuitedError(EmulatorError):
+    """A solver that has nothing to offer for this camera, and why."""
+
+
+def resident_bytes() -> int:
+    """Memory of this process that is resident, bytes."""
+    pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
+    return int(pages) * resource.getpagesize()
 
 
 def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
@@ -83,45 +110,99 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
     Parameters
     ----------
     name : str
-        One of `OWN` or `PEERS`.
+        One of `ALL`, or MODULE:FUNCTION of anyone's own that takes camera and stars and returns a `Solver`.
     camera : Camera
         What the scenes are made with.
     stars : StarCatalog
-        Catalogue for the peers' databases: doubles merged, as the scenes have them. Ours take their default.
+        Catalogue for the peers' databases: doubles merged, as the scenes have them. Ours take their default, and the
+        published algorithms its faintest star as the limit of the sensor.
 
     Raises
     ------
     ImportError
         The peer is not installed.
+    UnsuitedError
+        It has no database for this field.
     EmulatorError
         The name is unknown.
     """
     if name in OWN:
         return _own(name, camera)
-    if name == "tetra3rs":
-        return _tetra3rs(camera, stars)
-    if name == "ruststartracker":
-        return _ruststartracker(camera, stars)
-    raise EmulatorError(f"solver {name!r}: one of {', '.join(OWN + PEERS)} is needed")
+    if name in CLASSICS:
+        return _classic(name, camera, float(stars.v[-1]))
+    if ":" in name:
+        return _custom(name, camera, stars)
+    check_name(name)
+    return _MAKERS[name](camera, stars)
 
 
 def version_of(name: str) -> str:
     """Version of an installed solver."""
-    return importlib.metadata.version("starhil" if name in OWN else name)
+    if ":" in name:
+        return "custom"
+    return importlib.metadata.version(name if name in PEERS else "starhil")
+
+
+def check_name(name: str) -> None:
+    """Reject a name that `make_solver` does not know.
+
+    Raises
+    ------
+    EmulatorError
+        It is neither one of `ALL` nor MODULE:FUNCTION.
+    """
+    if name not in ALL and ":" not in name:
+        raise EmulatorError(f"solver {name!r}: one of {', '.join(ALL)}, or MODULE:FUNCTION, is needed")
+
+
+def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
+    """Make a solver by a function of a module that can be imported."""
+    module, _, function = name.partition(":")
+    try:
+        maker = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise EmulatorError(f"solver {name!r}: {error}; PYTHONPATH must lead to the module") from error
+    solver = maker(camera, stars)
+    if not isinstance(solver, Solver):
+        raise EmulatorError(
+            f"solver {name!r}: it returned {type(solver).__name__}, emulator.bench.peers.Solver needed"
+        )
+    return solver
+
+
+def _reply(watch: Stopwatch, solution: Solution) -> Reply:
+    seconds = watch.read()
+    if not solution.valid:
+        return Reply(None, *seconds)
+    return Reply(solution.attitude.matrix, *seconds, solution.covariance)
 
 
 def _own(name: str, camera: Camera) -> Solver:
-    identifier = make_identifier(name, camera)
+    if name in ("lsi", "rsi") and camera.fov_deg < LEAST_FEATURE_FIELD_DEG:
+        raise UnsuitedError(f"its database is not built for fields below {LEAST_FEATURE_FIELD_DEG:g}°")
+    identifier: Any = make_identifier(name, camera)
 
     def solve(scene: Scene) -> Reply:
         watch = Stopwatch()
-        solution = identifier.identify(scene.xy_px, scene.flux)
-        seconds = watch.read()
-        if not solution.valid:
-            return Reply(None, *seconds)
-        return Reply(solution.attitude.matrix, *seconds, solution.covariance)
+        return _reply(watch, identifier.identify(scene.xy_px, scene.flux))
 
-    return Solver(solve, getattr(identifier, "reset", lambda: None))
+    def track(scene: Scene, predicted: Attitude) -> Reply:
+        watch = Stopwatch()
+        return _reply(watch, identifier.track(scene.xy_px, scene.flux, predicted))
+
+    size = getattr(identifier, "database_bytes", None)
+    return Solver(solve, getattr(identifier, "reset", lambda: None), track, size)
+
+
+def _classic(name: str, camera: Camera, limiting_magnitude: float) -> Solver:
+    """Make a published algorithm, its answers verified; it is given the sensor's limit and the magnitude of one unit of flux."""
+    identifier: Any = make_identifier(name, camera, limiting_magnitude=limiting_magnitude, zero_point=0.0)
+
+    def solve(scene: Scene) -> Reply:
+        watch = Stopwatch()
+        return _reply(watch, identifier.identify(scene.xy_px, scene.flux))
+
+    return Solver(solve, database_bytes=identifier.database_bytes, build_seconds=identifier.build_seconds)
 
 
 def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
@@ -136,6 +217,9 @@ def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
             pattern_max_error=PATTERN_MAX_ERROR,
             star_max_magnitude=float(stars.v.max()) + 0.01,
         )
+        stored = Path(folder) / "database.bin"
+        database.save_to_file(str(stored))
+        size = stored.stat().st_size
     model = tetra3rs.CameraModel(camera.focal_px[0], camera.width, camera.height)
     centre = np.asarray(camera.centre_px)
 
@@ -148,7 +232,7 @@ def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
         seconds = watch.read()
         return Reply(np.array(result.rotation_matrix_icrs_to_camera) if result else None, *seconds)
 
-    return Solver(solve)
+    return Solver(solve, database_bytes=size)
 
 
 def _gaia_format(stars: StarCatalog) -> bytes:
@@ -191,3 +275,45 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
         return Reply(Rotation.from_quat(result.quat).inv().as_matrix(), *seconds)
 
     return Solver(solve)
+
+
+def _cedar_solve(camera: Camera, _: StarCatalog) -> Solver:
+    """Make cedar-solve with the database that it ships; its positions count from the corner of the first pixel, (row, column)."""
+    import tetra3
+
+    if int(np.__version__.partition(".")[0]) > 1:
+        raise UnsuitedError(
+            "it needs NumPy 1: pip install 'numpy<2' (and --no-deps with cedar-solve, which asks for an old Pillow)"
+        )
+    program: Any = tetra3.Tetra3()
+    properties = program.database_properties
+    least, most = float(properties["min_fov"]), float(properties["max_fov"])
+    if not least <= camera.fov_deg <= most:
+        raise UnsuitedError(f"the database that it ships is for fields of {least:g}° to {most:g}°")
+
+    def solve(scene: Scene) -> Reply:
+        places = scene.xy_px[np.argsort(-scene.flux)][:, ::-1] + 0.5
+        watch = Stopwatch()
+        answer: Any = program.solve_from_centroids(
+            places,
+            (camera.height, camera.width),
+            fov_estimate=camera.fov_deg,
+            distortion=0.0,
+            solve_timeout=CEDAR_TIMEOUT_MS,
+        )
+        seconds = watch.read()
+        if answer["RA"] is None:
+            return Reply(None, *seconds)
+        angles = (float(answer[key]) for key in ("RA", "Dec", "Roll"))
+        return Reply(Attitude.from_radec_roll(*angles).matrix, *seconds)
+
+    held = (value for value in vars(program).values() if isinstance(value, np.ndarray))
+    return Solver(solve, database_bytes=sum(value.nbytes for value in held))
+
+
+_MAKERS: Final[dict[str, Callable[[Camera, StarCatalog], Solver]]] = {
+    "tetra3rs": _tetra3rs,
+    "ruststartracker": _ruststartracker,
+    "cedar-solve": _cedar_solve,
+}
+"""Name of a peer, as the package is called, → what makes it."""

@@ -41,6 +41,8 @@ class SceneSettings:
         Share of the field behind a straight edge of random direction, in which no star is seen.
     cluttered : float
         Share of the field behind such an edge to which the false stars keep.
+    kept : int or None
+        Only so many of the brightest stars are seen.
     """
 
     limiting_magnitude: float = 5.5
@@ -52,6 +54,7 @@ class SceneSettings:
     random_points: tuple[int, int] | None = None
     covered: float = 0.0
     cluttered: float = 1.0
+    kept: int | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class SceneMaker:
             self.stars.vectors[visible] @ attitude.boresight > math.cos(self.camera.field_radius_rad)
         ]
         xy, inside = self.camera.project(attitude.to_sensor(self.stars.vectors[near]))
-        rows, xy = near[inside], xy[inside]
+        rows, xy = near[inside][: settings.kept], xy[inside][: settings.kept]
         magnitudes = self.stars.v[rows]
         if settings.random_points is not None:
             count = int(rng.integers(settings.random_points[0], settings.random_points[1] + 1))

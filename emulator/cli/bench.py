@@ -200,20 +200,29 @@ def bus(
 @group.command("identify")
 def identify(
     peers: Annotated[
-        str, typer.Option(help="Programs of others to compare with: tetra3rs,ruststartracker.")
+        str, typer.Option(help="Programs of others to compare with: tetra3rs,ruststartracker,cedar-solve.")
     ] = "",
-    solvers: Annotated[str, typer.Option(help="Algorithms of our own: geometric,lsi,rsi.")] = "geometric",
+    solvers: Annotated[
+        str,
+        typer.Option(
+            help="Algorithms: geometric,lsi,rsi, published ones such as pyramid,grid, MODULE:FUNCTION of your own; 'all' with the others' programs too."
+        ),
+    ] = "geometric",
     frames: Annotated[int, typer.Option(min=1, help="Scenes a row.")] = 300,
     seed: Annotated[int, typer.Option(help="Seed of the scenes.")] = 1,
     row: Annotated[
         list[str] | None,
         typer.Option(
-            help="Row of the table; may be repeated. 'all' adds the hard ones to the standard ones."
+            help="Row of the table; may be repeated. 'all' means every one; by default the standard ones, with --solvers all also other fields."
         ),
     ] = None,
     budget: Annotated[
         float, typer.Option(help="Seconds after which a solver is left out of the rest of a row.")
     ] = 120.0,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Folder for leaderboard.md, leaderboard.json and pictures."),
+    ] = None,
     json_out: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Compare identification programs on the same scenes, and with the bound (least squares of the true matches)."""
@@ -222,19 +231,29 @@ def identify(
     from rich.console import Console
     from rich.table import Table
 
-    from starhil.emulator.benchmarks.identify import ROWS, STANDARD, run
+    from starhil.emulator.benchmarks.identify import LEADERBOARD, ROWS, STANDARD, run
+    from starhil.emulator.benchmarks.leaderboard import write_leaderboard
+    from starhil.emulator.benchmarks.peers import ALL
 
-    rows = list(STANDARD if not row else ROWS if "all" in row else row)
+    everyone = solvers.strip() == "all"
+    usual = LEADERBOARD if everyone else STANDARD
+    rows = list(usual if not row else ROWS if "all" in row else row)
     progress = Console(stderr=True)
     answer = run(
         frames,
         seed,
         peers=_names(peers),
-        own=_names(solvers),
+        own=ALL if everyone else _names(solvers),
         rows=rows,
         budget_s=budget,
         progress=lambda name: progress.print(f"row {name}"),
     )
+    if output is not None:
+        command = (
+            f"starhil bench identify --solvers {solvers} --frames {frames} --seed {seed} --budget {budget:g}"
+        )
+        for path in write_leaderboard(answer, output, command):
+            progress.print(f"wrote {path}")
     if json_out:
         print(json.dumps(answer))
         return

@@ -207,6 +207,11 @@ class Identifier:
         """The stars of the index as the camera sees them: doubles merged, brightest first."""
         return self._stars
 
+    @property
+    def database_bytes(self) -> int:
+        """Size of the index, bytes."""
+        return sum(part.nbytes for part in self._index)
+
     def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
         """Lost in space: attitude without any knowledge of it.
 

@@ -201,6 +201,11 @@ class LsiIdentifier:
         """Magnitude V of one unit of flux, as given or as the last answer showed it; None before either."""
         return self._zero_point
 
+    @property
+    def database_bytes(self) -> int:
+        """Size of the feature database, five bytes a cell, and of the index for verification, bytes."""
+        return 5 * self.database.cells + self.verifier.database_bytes
+
     def reset(self) -> None:
         """Forget what frames have shown: the zero point is again the one given, or none."""
         self._zero_point = self._given_zero_point

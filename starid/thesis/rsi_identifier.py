@@ -129,6 +129,11 @@ class RsiIdentifier:
         """The catalogue that `Solution.catalog_index` counts in."""
         return self.lsi.catalog
 
+    @property
+    def database_bytes(self) -> int:
+        """Size of the feature database and of the index for verification, bytes."""
+        return self.lsi.database_bytes
+
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""
         self.lsi.warm_up()

@@ -1,0 +1,182 @@
+"""The leaderboard: every solver in every kind of row, what they take, and solvers that anyone adds."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from starhil.emulator.benchmarks import identify as bench
+from starhil.emulator.benchmarks.leaderboard import markdown, ranked, right, write_leaderboard
+from starhil.emulator.benchmarks.peers import ALL, make_solver
+from starhil.emulator.benchmarks.scenes import SceneMaker, SceneSettings
+from starhil.emulator.cli.bench import group
+from starhil.emulator.errors import EmulatorError
+from starid.camera import Camera
+from starid.catalog import load_catalog
+from starid.interface import CLASSICS
+
+PIXEL = 1.0
+
+ORACLE = """
+from starhil.emulator.benchmarks.peers import Reply, Solver, Stopwatch
+
+def make(camera, stars):
+    def solve(scene):
+        watch = Stopwatch()
+        return Reply(scene.attitude.matrix, *watch.read())
+    return Solver(solve, database_bytes=12_000)
+
+def liar(camera, stars):
+    def solve(scene):
+        watch = Stopwatch()
+        return Reply(scene.attitude.rotated([0.1, 0.0, 0.0]).matrix, *watch.read())
+    return Solver(solve)
+
+def nothing(camera, stars):
+    return None
+"""
+
+
+@pytest.fixture
+def oracle(tmp_path, monkeypatch):
+    (tmp_path / "oracle.py").write_text(ORACLE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return "oracle:make"
+
+
+def entry(solver: str, *, valid: float, wrong: int, cpu: float, row: str = "0.5") -> dict:
+    return {
+        "row": row, "solver": solver, "frames": 10, "valid_pct": valid, "wrong": wrong, "boresight_median_arcsec": 9.0,
+        "floor_ratio": 1.0, "median_ms": cpu, "p99_ms": 2.0 * cpu, "cpu_median_ms": cpu,
+    }  # fmt: skip
+
+
+def test_wrong_answers_rank_below_missing_ones_and_slow_below_fast() -> None:
+    entries = [
+        entry("wrong", valid=100.0, wrong=1, cpu=0.1),
+        entry("slow", valid=100.0, wrong=0, cpu=5.0),
+        entry("silent", valid=10.0, wrong=0, cpu=0.1),
+        entry("fast", valid=100.0, wrong=0, cpu=1.0),
+    ]
+    order = [item["solver"] for item in ranked({"rows": entries}, "0.5")]
+    assert order == ["fast", "slow", "silent", "wrong"]
+    assert right(entries[0]) == pytest.approx(90.0)
+
+
+def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
+    answer = {
+        "seed": 3,
+        "rows": [entry("one", valid=100.0, wrong=0, cpu=1.0), entry("two", valid=50.0, wrong=2, cpu=1.0, row="8°")],
+        "solvers": [
+            {"solver": "one", "field_deg": 42.0, "limit_v": 5.5, "database_kb": 120.0, "build_s": 0.1, "memory_mb": 3.0},
+            {"solver": "two", "field_deg": 8.0, "limit_v": 7.5, "database_kb": None, "build_s": 2.0, "memory_mb": 0.0},
+        ],
+        "skipped": {"three": "not installed: pip install three"},
+        "versions": {"one": "1.0", "two": "custom"},
+    }  # fmt: skip
+    text = markdown(answer, "a command")
+    for words in (
+        "`a command`",
+        "## 0.5",
+        "## 8°",
+        "| one | 10 | 100.0 | 0 |",
+        "| two | 10 | 30.0 | 2 |",
+        "| one | 42° | 5.5 | 120 |",
+        "three: left out",
+    ):
+        assert words in text
+    paths = write_leaderboard(answer, tmp_path / "out", "a command")
+    assert json.loads((tmp_path / "out" / "leaderboard.json").read_text()) == answer
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths if path.suffix == ".png")
+
+
+def test_a_solver_of_ones_own_is_measured_like_the_others(oracle) -> None:
+    answer = bench.run(4, 5, own=[oracle, "oracle:liar"], rows=["0.5", "8°, V ≤ 7.5, 0.5"])
+    for row in answer["rows"]:
+        assert (row["valid_pct"], row["wrong"]) == (100.0, 0 if row["solver"] == oracle else 4)
+    assert [(item["solver"], item["field_deg"]) for item in answer["solvers"]] == [
+        (name, width) for width in (42.0, 8.0) for name in (oracle, "oracle:liar")
+    ]
+    assert answer["solvers"][0]["database_kb"] == pytest.approx(12.0)
+    assert answer["versions"][oracle] == "custom"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("astrology", "MODULE:FUNCTION"), ("no_such_module:make", "PYTHONPATH"), ("oracle:nothing", "NoneType")],
+)
+def test_a_solver_that_is_none_is_named(oracle, name: str, words: str) -> None:
+    with pytest.raises(EmulatorError, match=words):
+        bench.run(1, 1, own=[name], rows=["0.5"])
+
+
+def test_every_row_of_the_leaderboard_has_its_field_and_limit() -> None:
+    fields = bench._by_field(bench.LEADERBOARD, Camera.from_fov())
+    assert {width for width, _ in fields} == {None, 8.0, 20.0, 62.0}
+    assert sorted(row for rows in fields.values() for row in rows) == sorted(bench.LEADERBOARD)
+    assert set(bench.STANDARD) <= set(fields[None, bench.PEER_LIMIT_V])
+    assert set(CLASSICS) < set(ALL)
+
+
+def test_scenes_keep_only_the_brightest_and_dense_ones_hold_a_thousand() -> None:
+    camera, stars = Camera.from_fov(), load_catalog().brighter_than(8.0)
+    maker = SceneMaker(camera, stars)
+    few = maker.scene(SceneSettings(5.5, 0.0, magnitude_noise=0.0, kept=3), np.random.default_rng(1))
+    many = maker.scene(SceneSettings(5.5, 0.0, magnitude_noise=0.0), np.random.default_rng(1))
+    brightest = np.sort(many.flux)[-3:]
+    assert sorted(few.flux) == pytest.approx(brightest)
+    dense = bench.ROWS["dense, V ≤ 7.8, 0.5"]
+    counts = [len(maker.scene(dense, np.random.default_rng(seed)).flux) for seed in range(5)]
+    assert np.median(counts) >= 1000
+
+
+def test_a_tracking_row_gives_a_prediction_some_pixels_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    offsets = []
+
+    def made(name, camera, stars):
+        solver = make_solver("geometric", camera, stars)
+
+        def track(scene, predicted):
+            offsets.append(predicted.error_to(scene.attitude).total_arcsec)
+            return solver.track(scene, predicted)
+
+        return type(solver)(solver.solve, track=track)
+
+    monkeypatch.setattr(bench, "make_solver", made)
+    answer = bench.run(12, 3, rows=["tracking, 3 stars"])
+    scale = math.degrees(Camera.from_fov().pixel_scale_rad) * 3600.0
+    assert len(offsets) == 12
+    assert 1.0 * scale < np.median(offsets) < 9.0 * scale
+    assert answer["rows"][0]["wrong"] == 0
+
+
+def test_published_algorithms_take_part_and_are_never_wrong_when_verified() -> None:
+    answer = bench.run(2, 4, own=["pyramid", "oriented-svd"], rows=["0.5", "20°, V ≤ 6.5, 0.5"])
+    assert all(row["wrong"] == 0 for row in answer["rows"])
+    assert sum(row["valid_pct"] for row in answer["rows"]) >= 300.0
+    assert all(item["database_kb"] > 0 and item["build_s"] > 0 for item in answer["solvers"])
+
+
+def test_the_command_writes_report_data_and_pictures(tmp_path, oracle) -> None:
+    words = [
+        "identify",
+        "--frames",
+        "2",
+        "--solvers",
+        oracle,
+        "--row",
+        "0.5",
+        "-o",
+        str(tmp_path / "board"),
+        "--json",
+    ]
+    result = CliRunner().invoke(group, words)
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["rows"][0]["valid_pct"] == 100.0
+    assert {path.name for path in (tmp_path / "board").iterdir()} == {
+        "leaderboard.md", "leaderboard.json", "rates.png", "times.png",
+    }  # fmt: skip
