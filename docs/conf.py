@@ -71,13 +71,15 @@ def shorten_array_types(_app: Sphinx, *signature: Any) -> tuple[str | None, str 
 def keep_whole_sentences(
     _app: Sphinx, what: str, _name: str, _item: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Put an empty line before a property's text: napoleon takes what is before a colon in the first one for a type."""
-    if what in ("property", "attribute"):
-        lines.insert(0, "")
+    """Put the text of a property together again: napoleon takes what is before its first colon for a type."""
+    if what == "property":
+        for line in [line for line in lines if line.startswith(":type: ")]:
+            lines.remove(line)
+            lines[0] = f"{line.removeprefix(':type: ')}: {lines[0]}"
 
 
 def setup(app: Sphinx) -> None:
     """Connect what this file adds."""
     app.connect("autodoc-process-signature", shorten_array_types)
-    app.connect("autodoc-process-docstring", keep_whole_sentences, priority=400)
+    app.connect("autodoc-process-docstring", keep_whole_sentences, priority=600)
     app.connect("source-read", put_readme_first)

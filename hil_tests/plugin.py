@@ -1,4 +1,6 @@
-"""Pytest plugin: fixtures that put a star sensor on a serial line or a CAN bus, emulated or real::
+"""Pytest plugin: fixtures that put a star sensor on a serial line or a CAN bus, emulated or real.
+
+In a test::
 
     def test_it_tracks(starhil_serial):
         starhil_serial.command("set_mode", mode="lost_in_space")

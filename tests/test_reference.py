@@ -62,6 +62,19 @@ def test_every_table_that_can_be_written_stands_on_a_page(reference):
     assert set(re.findall(r"<!-- begin: (\w+) -->", text)) == set(reference.TABLES)
 
 
+@pytest.mark.parametrize(
+    "page",
+    [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"],
+    ids=lambda page: page.name,
+)
+def test_every_file_that_a_page_names_exists(page):
+    text = page.read_text(encoding="utf-8")
+    folders = "starid|emulator|protocol|hil_tests|configs|tools|tests|docs"
+    named = set(re.findall(rf"`((?:{folders})/[\w./*-]+)`", text))
+    missing = {name for name in named if not any(ROOT.glob(name.rstrip("/")))}
+    assert not missing
+
+
 # --- session scripts ---
 
 
