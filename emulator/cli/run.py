@@ -34,7 +34,10 @@ def command(
     seed: Annotated[int | None, typer.Option(help="Seed of all noise.")] = None,
     clock: Annotated[str | None, typer.Option(help="real, scaled:FACTOR or stepped.")] = None,
     state_dir: Annotated[
-        Path | None, typer.Option(help="Folder of what survives a restart; without it nothing does.")
+        Path | None,
+        typer.Option(
+            help="Folder that keeps saved parameters and the boot count over a restart; without it they are lost."
+        ),
     ] = None,
     symlink: Annotated[Path | None, typer.Option(help="Link to the pty, removed at the end.")] = None,
     control: Annotated[
@@ -56,10 +59,13 @@ def command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a truth log that exists.")] = False,
     scenario: Annotated[
         str,
-        typer.Option(help="Scenario file, or a name of configs/scenarios: faults and truths by run time."),
+        typer.Option(
+            help="Scenario: a TOML file, or the name of one in configs/scenarios; faults and truths at given times."
+        ),
     ] = "",
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value over the profile; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", help="section.key=value that overrides the profile; may be repeated."),
     ] = None,
     log: Annotated[str, typer.Option(help="debug, info, warning or error; to stderr.")] = "warning",
 ) -> None:
