@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import math
 import os
@@ -19,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.files import is_stream, open_stream
+from starid.files import write_atomically
 
 _log = logging.getLogger(__name__)
 
@@ -28,8 +27,11 @@ Tables = dict[str, NDArray[np.generic]]
 LIMIT_VARIABLE: Final = "STARHIL_CACHE_LIMIT_MB"
 DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
-_OWN_NAME: Final = re.compile(r"(?:hipparcos|index|features)-[0-9a-f]{16}\.(?:npz|bin)")
-"""Names of cached files: whatever else is in the folder is not ours to remove."""
+_KERNELS: Final = "kernels"
+_OWN_NAME: Final = re.compile(
+    rf"(?:hipparcos|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
+)
+"""Paths of cached files and of folders of machine code, in the cache folder: nothing else in it is removed."""
 
 
 def cache_dir() -> Path:
@@ -54,28 +56,51 @@ def cache_dir() -> Path:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "starhil"
 
 
+def kernel_folder(key: str) -> Path | None:
+    """Return the folder for machine code with a key of 16 hexadecimal digits; None where it cannot be made.
+
+    It need not exist yet.
+    """
+    folder = cache_dir() / _KERNELS / key
+    if folder.is_dir():
+        return folder
+    nearest = next(parent for parent in folder.parents if os.access(parent, os.F_OK))
+    return folder if nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) else None
+
+
 @dataclass(frozen=True)
 class CachedFile:
-    """A file in the cache folder."""
+    """A file in the cache folder, or a folder of machine code, which is kept or removed as a whole."""
 
     path: Path
     size: int
     """Bytes."""
     used_s: float
-    """When it was last used, seconds since 1970."""
+    """Time of the last use, seconds since 1970."""
+
+    @property
+    def name(self) -> str:
+        """Path in the cache folder."""
+        return _name(self.path)
+
+
+def _name(path: Path) -> str:
+    """Name of a file, with the folder before it that of machine code has."""
+    return f"{_KERNELS}/{path.name}" if path.parent.name == _KERNELS else path.name
 
 
 def cached_files() -> list[CachedFile]:
     """Return the cached files, the least recently used first."""
     found = []
     folder = cache_dir()
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if _OWN_NAME.fullmatch(path.name):
+    for path in (*folder.glob("*"), *folder.glob(f"{_KERNELS}/*")):
+        if _OWN_NAME.fullmatch(_name(path)):
             try:
                 state = path.stat()
+                size = sum(each.stat().st_size for each in path.iterdir()) if path.is_dir() else state.st_size
             except FileNotFoundError:  # another process has removed it
                 continue
-            found.append(CachedFile(path, state.st_size, state.st_mtime))
+            found.append(CachedFile(path, size, state.st_mtime))
     return sorted(found, key=lambda each: each.used_s)
 
 
@@ -107,9 +132,9 @@ def mark_used(path: Path) -> None:
 
 def evict(keep: Path) -> None:
     """Remove the least recently used cached files until the limit holds; `keep`, just written, stays."""
-    if keep.parent != cache_dir():
-        return
     files = cached_files()
+    if all(each.path != keep for each in files):  # kept in a folder outside the cache
+        return
     excess = sum(each.size for each in files) - size_limit()
     for each in files:
         if excess <= 0:
@@ -121,51 +146,16 @@ def evict(keep: Path) -> None:
 def remove(file: CachedFile) -> bool:
     """Remove a cached file; False, with a warning in the log, where that is not allowed."""
     try:
-        file.path.unlink(missing_ok=True)
+        if file.path.is_dir():
+            shutil.rmtree(file.path)
+        else:
+            file.path.unlink()
+    except FileNotFoundError:  # another process has removed it
+        return True
     except OSError as error:
         _log.warning("cache file %s cannot be removed: %s", file.path, error)
         return False
     return True
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file, then move it onto `path` in one step.
-
-    Where `path` is a link, the file that it leads to is replaced. What is no regular file (a device, a pipe, the
-    standard output) gets the content written into it when all of it is there.
-
-    Parameters
-    ----------
-    path : Path
-        Final name; missing folders are made.
-    write : callable
-        Gets the temporary path. If it raises, nothing is left behind and `path` is untouched.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written, or `path` is a folder itself.
-    """
-    if is_stream(path):
-        with tempfile.TemporaryDirectory() as folder:
-            whole = Path(folder, path.name)
-            write(whole)
-            with whole.open("rb") as content, open_stream(path) as stream:
-                shutil.copyfileobj(content, stream)
-        return
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    target = Path(os.path.realpath(path))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-    os.close(descriptor)
-    part = Path(name)
-    try:
-        write(part)
-        part.chmod(0o644)
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:

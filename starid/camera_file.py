@@ -12,11 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from starid.cache import write_atomically
 from starid.calibration import NAMES, Calibration
 from starid.camera import Camera
 from starid.errors import StaridError
-from starid.files import read_text
+from starid.files import read_text, write_atomically
 
 
 def save_camera(path: str | Path, camera: Camera, calibration: Calibration | None = None) -> None:

@@ -10,8 +10,11 @@ import errno
 import math
 import os
 import re
+import shutil
 import stat
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -127,3 +130,43 @@ def open_stream(path: str | Path) -> BinaryIO:
     if sys.stdout is not None:
         sys.stdout.flush()
     return os.fdopen(os.dup(STDOUT), "wb")
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file, then move it onto `path` in one step.
+
+    Where `path` is a link, the file that it leads to is replaced. What is no regular file (a device, a pipe, the
+    standard output) gets the content written into it when all of it is there.
+
+    Parameters
+    ----------
+    path : Path
+        Final name; missing folders are made.
+    write : callable
+        Gets the temporary path. If it raises, nothing is left behind and `path` is untouched.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written, or `path` is a folder itself.
+    """
+    if is_stream(path):
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder, path.name)
+            write(whole)
+            with whole.open("rb") as content, open_stream(path) as stream:
+                shutil.copyfileobj(content, stream)
+        return
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    target = Path(os.path.realpath(path))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    os.close(descriptor)
+    part = Path(name)
+    try:
+        write(part)
+        part.chmod(0o644)
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)

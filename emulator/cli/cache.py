@@ -31,13 +31,13 @@ def info(as_json: AS_JSON = False) -> None:
     files = cached_files()
     total = sum(each.size for each in files)
     if as_json:
-        rows = [{"name": each.path.name, "bytes": each.size, "used_unix_s": each.used_s} for each in files]
+        rows = [{"name": each.name, "bytes": each.size, "used_unix_s": each.used_s} for each in files]
         content = {"folder": str(cache_dir()), "bytes": total, "limit_bytes": size_limit(), "files": rows}
         print(json.dumps(content))
         return
     for each in reversed(files):
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(each.used_s))
-        print(f"{each.size / BYTES_PER_MB:8.1f} MB  {used}  {each.path.name}")
+        print(f"{each.size / BYTES_PER_MB:8.1f} MB  {used}  {each.name}")
     limit = size_limit() / BYTES_PER_MB
     print(f"{total / BYTES_PER_MB:8.1f} MB of {limit:g} MB in {len(files)} files in {cache_dir()}")
 

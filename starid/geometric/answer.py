@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
 from starid.geometric.pattern_index import IndexArrays
 from starid.geometric.refinement import (
@@ -29,6 +28,7 @@ from starid.geometric.settings import (
     SIGMAS_KNOWN,
 )
 from starid.geometric.verification import log_false_probability, worth_refining
+from starid.jit import inner
 
 LEAST_MATCHED: Final = 4
 """Matches that an answer needs."""

@@ -49,9 +49,9 @@ from starid.geometric.settings import (
     WINDOW,
 )
 from starid.geometric.tracking import track_kernel
-from starid.geometric.validation import checked_detections
 from starid.geometric.verification import ROTATIONS
 from starid.solution import Mode, Reason, Solution
+from starid.solver_input import checked_detections
 
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0

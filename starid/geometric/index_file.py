@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.cache import write_atomically
+from starid.files import write_atomically
 from starid.geometric.pattern_index import IndexArrays
 
 _log = logging.getLogger(__name__)

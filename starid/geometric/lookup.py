@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.pattern_index import SIDE_BINS, SIDE_STEP, SIDE_STEPS, IndexArrays, pattern_row
+from starid.jit import inner
 
 
 @inner

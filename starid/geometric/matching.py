@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.observation import (
     MAGNITUDE,
     SIGMA_U,
@@ -26,6 +25,7 @@ from starid.geometric.observation import (
 )
 from starid.geometric.pattern_index import GRID_CELLS, GRID_MARGIN, STAR_MAGNITUDE, IndexArrays
 from starid.geometric.sky_grid import cell_of
+from starid.jit import inner
 
 WINDOW_SIGMAS: Final = 4.0
 """Half-width of a matching window in units of the centroid noise."""

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
+from starid.jit import inner
 from starid.projection import (
     CX,
     CY,

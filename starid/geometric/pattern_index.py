@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from starid.camera import Camera
 from starid.catalog import StarCatalog, blend, companions
 from starid.errors import StaridError
-from starid.geometric.jit_kernels import entry, inner
 from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.geometric.sky_grid import FACES, build_sky_grid, cell_of
+from starid.jit import compiled_ieee, inner
 
 INDEX_VERSION: Final = 5
 """Raised whenever the same catalogue and settings would give another index."""
@@ -202,7 +202,7 @@ def pattern_row(hand: int, longest: int, middle: int, bins: int) -> int:
     return (hand * bins * (bins + 1) + longest * (longest + 1)) // 2 + middle
 
 
-@entry
+@compiled_ieee
 def _triangles(
     vectors: NDArray[np.float64],
     start: NDArray[np.int64],
@@ -255,7 +255,7 @@ def _triangles(
     return patterns, binned
 
 
-@entry
+@compiled_ieee
 def _count_field_stars(
     vectors: NDArray[np.float64], magnitudes: NDArray[np.float64], cap_cosine: float, bins: int
 ) -> NDArray[np.int32]:

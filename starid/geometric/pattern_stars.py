@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 _FINEST_CELL: Final = 0.01
 """Least edge of a cell of the look-up grid, on the unit sphere: bounds its memory."""
 
 
-@entry
+@compiled_ieee
 def _pick(vectors: NDArray[np.float64], chord: float, quota: int, finest_cell: float) -> NDArray[np.bool_]:
     """Take stars in order while fewer than `quota` taken ones lie within the chord of them.
 

@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.matching import (
     BY_NOISE,
     match_detections,
@@ -46,6 +45,7 @@ from starid.geometric.settings import (
     SIGMAS_KNOWN,
     WINDOW,
 )
+from starid.jit import inner
 
 MAX_ROUNDS: Final = 12
 """Rounds of matching and solving."""

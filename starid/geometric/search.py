@@ -22,7 +22,6 @@ from starid.geometric.answer import (
     judged,
     new_candidate,
 )
-from starid.geometric.jit_kernels import entry, inner
 from starid.geometric.lookup import look_up
 from starid.geometric.observation import MAGNITUDE, OFFSET_U, OFFSET_V, Raw, Table, X, Y, Z, observe, scaled
 from starid.geometric.pattern_index import (
@@ -51,6 +50,7 @@ from starid.geometric.settings import (
     TOO_FEW,
 )
 from starid.geometric.verification import ROTATIONS, hit_odds, test_order
+from starid.jit import compiled_ieee, inner
 from starid.projection import HEIGHT, MODEL, WIDTH
 
 SYSTEMATIC: Final = 14
@@ -246,7 +246,7 @@ def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
     return 0, 1, k + 1
 
 
-@entry
+@compiled_ieee
 def identify_kernel(
     index: IndexArrays,
     params: NDArray[np.float64],

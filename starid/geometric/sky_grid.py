@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 FACES: Final = 6
 _SLOPE_MARGIN: Final = 1.25
@@ -60,7 +60,7 @@ def _reach(vector: NDArray[np.float64], face: int, n: int, margin: float) -> tup
     return first_i, last_i, first_j, last_j
 
 
-@entry
+@compiled_ieee
 def _fill(vectors: NDArray[np.float64], n: int, margin: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Count, then list; see `build_sky_grid`."""
     start = np.zeros(FACES * n * n + 1, dtype=np.int32)

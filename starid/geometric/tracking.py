@@ -21,7 +21,6 @@ from starid.geometric.answer import (
     judged,
     new_candidate,
 )
-from starid.geometric.jit_kernels import entry, inner
 from starid.geometric.matching import to_sky
 from starid.geometric.observation import MAGNITUDE, Raw, Table, observe
 from starid.geometric.pattern_index import (
@@ -45,6 +44,7 @@ from starid.geometric.settings import (
 )
 from starid.geometric.sky_grid import cell_of
 from starid.geometric.verification import hit_odds, test_order
+from starid.jit import compiled_ieee, inner
 from starid.projection import MODEL
 
 PAIRED: Final = 16
@@ -141,7 +141,7 @@ def _try_detections(
     return 0.0
 
 
-@entry
+@compiled_ieee
 def track_kernel(
     index: IndexArrays,
     params: NDArray[np.float64],

@@ -26,7 +26,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.matching import residual
 from starid.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.geometric.pattern_index import (
@@ -40,6 +39,7 @@ from starid.geometric.pattern_index import (
 from starid.geometric.refinement import SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
 from starid.geometric.settings import FIELD_PX, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
 from starid.geometric.sky_grid import cell_of
+from starid.jit import inner
 from starid.projection import MODEL
 
 TRUE_SHARE: Final = 0.5

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops, compiled_sums
+from starid.jit import compiled_ieee, compiled_sums
 
 BLOCK_PX: Final = 32
 """Side of a block; stars fill a percent of it, glare hardly bends within it."""
@@ -103,7 +103,7 @@ def _refine(
     plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
 
 
-@compiled_loops
+@compiled_ieee
 def _sample_places(
     columns: int, count: int, dx: npt.NDArray[np.float32], dy: npt.NDArray[np.float32]
 ) -> None:
@@ -114,7 +114,7 @@ def _sample_places(
         dy[k] = np.float32((k // columns - middle_y) * _ROW_STEP)
 
 
-@compiled_loops
+@compiled_ieee
 def _block_statistics(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     block: int,
@@ -181,7 +181,7 @@ def estimate_background(
     return Background(level, noise, block_px)
 
 
-@compiled_loops
+@compiled_ieee
 def grid_place(position: float, block: float, count: int) -> tuple[int, int, float]:
     """The two of `count` block centres that a pixel lies between, and how far towards the second.
 
@@ -192,7 +192,7 @@ def grid_place(position: float, block: float, count: int) -> tuple[int, int, flo
     return i, min(i + 1, count - 1), u - i
 
 
-@compiled_loops
+@compiled_ieee
 def interpolate_at(grid: npt.NDArray[np.float32], block: float, x: float, y: float) -> float:
     """Value of a grid of blocks at a pixel position, linear between block centres and on to the edges."""
     i, i2, q = grid_place(y, block, grid.shape[0])

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops, compiled_sums
 from starid.imaging.normal_table import normal
+from starid.jit import compiled_ieee, compiled_sums
 
 FIT_COLUMNS: Final = 9
 X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
@@ -41,7 +41,7 @@ SHORT_TRAIL_PX: Final = 0.5
 """A shorter trail is fitted as a round spot."""
 
 
-@compiled_loops
+@compiled_ieee
 def spot_profile(
     centre: float,
     sigma: float,
@@ -63,7 +63,7 @@ def spot_profile(
         bell = next_bell
 
 
-@compiled_loops
+@compiled_ieee
 def spot_model(
     x: float,
     y: float,
@@ -98,7 +98,7 @@ def spot_model(
             k += 1
 
 
-@compiled_loops
+@compiled_ieee
 def trail_model(
     x: float,
     y: float,
@@ -143,7 +143,7 @@ def trail_model(
             model[2, k] = by_u * along_y + by_v * along_x
 
 
-@compiled_loops
+@compiled_ieee
 def star_model(
     x: float,
     y: float,
@@ -200,7 +200,7 @@ def _normal_equations(
     sums[6], sums[7], sums[8], sums[9], sums[10] = b_x, b_y, b_f, chi2, used
 
 
-@compiled_loops
+@compiled_ieee
 def fit_star(
     pixels: npt.NDArray[np.float32],
     window: tuple[int, int, int, int],

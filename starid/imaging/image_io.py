@@ -9,9 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.cache import write_atomically
 from starid.errors import StaridError
-from starid.files import MEGABYTE, is_stream, read_bytes
+from starid.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
 IMAGE_LIMIT: Final = 1000 * MEGABYTE
 """Largest image file that is read, bytes: a colour TIFF of 16 bits of the largest cameras has some 900 MB."""

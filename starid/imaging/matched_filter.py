@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.imaging.background import grid_place
-from starid.imaging.jit_loops import compiled_loops, compiled_sums
+from starid.jit import compiled_ieee, compiled_sums
 
 INTEGER_TAPS_SUM: Final = 16
 """Sum of the integer filter's taps along one axis; a byte smoothed along both axes fills 16 bits then."""
@@ -52,7 +52,7 @@ def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
     return _SHARP_TAPS if sigma_px < _SHARP_BELOW_PX else _SOFT_TAPS
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_down(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     y: int,
@@ -82,7 +82,7 @@ def _smooth_down(
             out[x] += tap * np.float32(np.int32(up[x]) + np.int32(down[x]))
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_along(
     padded: npt.NDArray[np.float32], taps: npt.NDArray[np.float32], out: npt.NDArray[np.float32]
 ) -> None:
@@ -109,7 +109,7 @@ def _smooth_along(
             out[x] += tap * (left[x] + right[x])
 
 
-@compiled_loops
+@compiled_ieee
 def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
     """Values of row i of a grid of blocks at every image column."""
     columns = grid.shape[1]
@@ -126,7 +126,7 @@ def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDA
         start = max(end, start)
 
 
-@compiled_loops
+@compiled_ieee
 def _between(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[np.float32]) -> None:
     """Threshold of a row between two lines of it."""
     upper, lower = lines[0], lines[1]
@@ -134,7 +134,7 @@ def _between(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[n
         limit[x] = upper[x] + q * (lower[x] - upper[x])
 
 
-@compiled_loops
+@compiled_ieee
 def _flag_groups(
     row: npt.NDArray[np.float32],
     limit: npt.NDArray[np.float32],
@@ -168,7 +168,7 @@ def _flag_groups_integer(
         flags[whole] = 1
 
 
-@compiled_loops
+@compiled_ieee
 def _peaks_of_row(
     y: int,
     row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
@@ -216,7 +216,7 @@ def _peaks_of_row(
     return count
 
 
-@compiled_loops
+@compiled_ieee
 def _set_lines(
     grid: npt.NDArray[np.float32], block: float, y: int, current: int, lines: npt.NDArray[np.float32]
 ) -> tuple[int, np.float32]:
@@ -228,7 +228,7 @@ def _set_lines(
     return i, np.float32(q)
 
 
-@compiled_loops
+@compiled_ieee
 def find_peaks(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     threshold: npt.NDArray[np.float32],
@@ -285,7 +285,7 @@ def find_peaks(
     return count
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_down_integer(
     image: npt.NDArray[np.uint8], y: int, taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
 ) -> None:
@@ -301,7 +301,7 @@ def _smooth_down_integer(
         out[x] = np.uint16(np.uint16(np.uint16(centre[x]) * t0) + np.uint16(near * t1) + np.uint16(far * t2))
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_along_integer(
     padded: npt.NDArray[np.uint16], taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
 ) -> None:
@@ -316,7 +316,7 @@ def _smooth_along_integer(
         out[x] = np.uint16(np.uint16(padded[x + 2] * t0) + np.uint16(near * t1) + np.uint16(far * t2))
 
 
-@compiled_loops
+@compiled_ieee
 def find_peaks_in_bytes(
     image: npt.NDArray[np.uint8],
     threshold: npt.NDArray[np.float32],

@@ -24,7 +24,6 @@ from starid.imaging.centroid import (
     fit_star,
     star_model,
 )
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.windows import (
     COLUMNS,
     LEFT,
@@ -40,6 +39,7 @@ from starid.imaging.windows import (
     TRAIL_X,
     TRAIL_Y,
 )
+from starid.jit import compiled_ieee
 
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
@@ -65,7 +65,7 @@ FIT_PARAMETERS: Final = 3
 _LEAST_SIDE: Final = 11
 
 
-@compiled_loops
+@compiled_ieee
 def find_neighbours(
     windows: npt.NDArray[np.float64],
     order: npt.NDArray[np.int64],
@@ -123,7 +123,7 @@ def find_neighbours(
     return count
 
 
-@compiled_loops
+@compiled_ieee
 def _mask_stray_pixel(
     pixels: npt.NDArray[np.float32],
     model: npt.NDArray[np.float64],
@@ -154,7 +154,7 @@ def _mask_stray_pixel(
     return stray >= 0
 
 
-@compiled_loops
+@compiled_ieee
 def _judge(
     pixels: npt.NDArray[np.float32],
     model: npt.NDArray[np.float64],
@@ -202,7 +202,7 @@ def _judge(
     return float(GOOD)
 
 
-@compiled_loops
+@compiled_ieee
 def _flags(
     star: npt.NDArray[np.float64],
     window: npt.NDArray[np.float64],
@@ -229,7 +229,7 @@ def _flags(
     return flags
 
 
-@compiled_loops
+@compiled_ieee
 def _take_away(
     star: npt.NDArray[np.float64],
     shape: tuple[float, float, float],
@@ -246,7 +246,7 @@ def _take_away(
         target[i] -= np.float32(star[FLUX] * lights[0, i])
 
 
-@compiled_loops
+@compiled_ieee
 def measure(
     windows: npt.NDArray[np.float64],
     pixels: npt.NDArray[np.float32],
@@ -341,7 +341,7 @@ def measure(
         _drop_doubles(stars, first, neighbours, sigma)
 
 
-@compiled_loops
+@compiled_ieee
 def _drop_doubles(
     stars: npt.NDArray[np.float64],
     first: npt.NDArray[np.int32],

@@ -22,8 +22,8 @@ from starid.imaging.centroid import (
     Y,
     star_model,
 )
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y
+from starid.jit import compiled_ieee
 from starid.photometry import EVEN_PAIR
 
 Array = npt.NDArray[np.float64]
@@ -47,7 +47,7 @@ _DOUBTFUL: Final = 1.4
 the same angle covers more pixels."""
 
 
-@compiled_loops
+@compiled_ieee
 def _invert(matrix: Array, inverse: Array) -> bool:
     """Invert a small positive matrix by Gauss–Jordan elimination, destroying it; False if it is singular."""
     size = matrix.shape[0]
@@ -70,7 +70,7 @@ def _invert(matrix: Array, inverse: Array) -> bool:
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def fit_pair(
     pixels: npt.NDArray[np.float32],
     window: tuple[int, int, int, int],
@@ -159,7 +159,7 @@ def fit_pair(
     return False
 
 
-@compiled_loops
+@compiled_ieee
 def _start(
     left_over: Array, window: tuple[int, int, int, int], star: Array, sigma: float, pair: Array
 ) -> bool:
@@ -198,7 +198,7 @@ def _start(
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def _is_better(
     pair: Array, chi2: float, sigma: float, models: Array, pixels: npt.NDArray[np.float32]
 ) -> bool:
@@ -222,7 +222,7 @@ def _is_better(
     return highest < _ONE_PIXEL * everything
 
 
-@compiled_loops
+@compiled_ieee
 def _shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
     """How far from a star towards its companion, as a share of their distance, one spot would be fitted."""
     gaussian = math.exp(-(off_x * off_x + off_y * off_y) / (blend_px * blend_px))
@@ -230,7 +230,7 @@ def _shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
     return share * ratio / (1.0 + ratio)
 
 
-@compiled_loops
+@compiled_ieee
 def doubt_close_pairs(stars: Array, order: npt.NDArray[np.int64], blend_px: float) -> None:
     """Widen the errors of the brighter star of a pair that is told apart, but hardly.
 
@@ -263,7 +263,7 @@ def doubt_close_pairs(stars: Array, order: npt.NDArray[np.int64], blend_px: floa
             brighter[VAR_Y] += (shift * off_y) ** 2
 
 
-@compiled_loops
+@compiled_ieee
 def _merge(pair: Array, blend_px: float, star: Array) -> None:
     """Put one star in place of two: all their light where one spot would be fitted, with the errors of the fit of one.
 
@@ -280,7 +280,7 @@ def _merge(pair: Array, blend_px: float, star: Array) -> None:
     star[CHI2], star[PIXELS] = pair[0, CHI2], pair[0, PIXELS]
 
 
-@compiled_loops
+@compiled_ieee
 def split_pairs(
     windows: Array,
     pixels: npt.NDArray[np.float32],

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.imaging.background import interpolate_at, median
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, mismatch, typical_trail
+from starid.jit import compiled_ieee
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class SpotShape:
     stars: int
 
 
-@compiled_loops
+@compiled_ieee
 def adaptive_moments(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x0: float,
@@ -136,7 +136,7 @@ def adaptive_moments(
     return False
 
 
-@compiled_loops
+@compiled_ieee
 def moments_of(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from starid.imaging.background import interpolate_at
 from starid.imaging.centroid import FIT_COLUMNS, FLUX, GOOD, STATE, X, Y, fit_star, spot_model
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _SETTLED: Final = 0.01
 _MODEL_ERROR: Final = 0.02
 
 
-@compiled_loops
+@compiled_ieee
 def _one_width(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     column: int,
@@ -91,7 +91,7 @@ def _one_width(
     return math.nan
 
 
-@compiled_loops
+@compiled_ieee
 def spot_widths(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],

@@ -12,16 +12,16 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
+from starid.jit import compiled_ieee
 
 _TILE_COLUMNS: Final = 128
 _TILE_ROWS: Final = 32
 _MOST_STEPS: Final = 96
 
 
-@compiled_loops
+@compiled_ieee
 def _sum_along(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     flow: npt.NDArray[np.float64],

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 Array = npt.NDArray[np.float64]
 
@@ -32,14 +32,14 @@ _ROUNDS: Final = 4
 _SINGULAR: Final = 1e-12
 
 
-@compiled_loops
+@compiled_ieee
 def _drawn(flow: Array, u: float, v: float) -> tuple[float, float]:
     """Trail of a flow at a place."""
     inward = flow[3] * u + flow[4] * v
     return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
 
 
-@compiled_loops
+@compiled_ieee
 def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
     """Trail (dx, dy) in pixels at an image position, up to its sense.
 
@@ -56,14 +56,14 @@ def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[
     return _drawn(flow, (x - 0.5 * (width - 1)) / half, (y - 0.5 * (height - 1)) / half)
 
 
-@compiled_loops
+@compiled_ieee
 def _rows(u: float, v: float, rows: Array) -> None:
     """Factors (2, 5) of a flow in dx and in dy at a place."""
     rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3], rows[0, 4] = 1.0, 0.0, -v, u * u, u * v
     rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3], rows[1, 4] = 0.0, 1.0, u, u * v, v * v
 
 
-@compiled_loops
+@compiled_ieee
 def mismatch(flow: Array, places: Array, trails: Array, k: int) -> tuple[float, float]:
     """Distance between the seen trail k and the flow's, and the sense (±1) in which it is the smaller."""
     dx, dy = _drawn(flow, places[k, 0], places[k, 1])
@@ -72,7 +72,7 @@ def mismatch(flow: Array, places: Array, trails: Array, k: int) -> tuple[float, 
     return (forth, 1.0) if forth <= back else (back, -1.0)
 
 
-@compiled_loops
+@compiled_ieee
 def _solve(matrix: Array, right: Array, used: int, out: Array) -> bool:
     """Solve the first `used` equations of a positive system by elimination; False if it is singular."""
     for column in range(used):
@@ -99,7 +99,7 @@ def _solve(matrix: Array, right: Array, used: int, out: Array) -> bool:
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def _least_squares(
     places: Array,
     trails: Array,
@@ -126,7 +126,7 @@ def _least_squares(
     return _solve(matrix, right, used, out)
 
 
-@compiled_loops
+@compiled_ieee
 def _left_over(flow: Array, places: Array, trails: Array) -> float:
     """Mean distance between seen and drawn trails, each counted as at most half its length."""
     total = 0.0
@@ -136,7 +136,7 @@ def _left_over(flow: Array, places: Array, trails: Array) -> float:
     return float(total / places.shape[0])
 
 
-@compiled_loops
+@compiled_ieee
 def fit_flow(places: Array, trails: Array, flow: Array) -> None:
     """Fit a flow (5,) to trails (n, 2) at places (n, 2), whatever their senses.
 
@@ -184,7 +184,7 @@ def fit_flow(places: Array, trails: Array, flow: Array) -> None:
         flow[:] = start
 
 
-@compiled_loops
+@compiled_ieee
 def typical_trail(flow: Array, places: Array, trails: Array) -> tuple[float, float]:
     """Median length of a flow's trails at places (n, 2), and median distance from the seen ones (n, 2), pixels."""
     lengths = np.empty(places.shape[0])

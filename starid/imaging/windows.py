@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.imaging.background import LEAST_NOISE_DN, interpolate_at
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.trail_flow import trail_at
+from starid.jit import compiled_ieee
 
 WINDOW_COLUMNS: Final = 14
 (
@@ -61,7 +61,7 @@ _ALONE_SIGMA: Final = 8.0
 _ALONE_SHARE: Final = 0.125
 
 
-@compiled_loops
+@compiled_ieee
 def light_radius(sigma: float, flux: float, noise: float) -> int:
     """Half-width of the square in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
     peak = flux / (2.0 * math.pi * sigma * sigma)
@@ -70,7 +70,7 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
     return min(max(math.ceil(reach * sigma + 0.5), 2), LARGEST_HALF_WIDTH)
 
 
-@compiled_loops
+@compiled_ieee
 def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) -> tuple[float, float]:
     """Slopes of the background along x and y, counts a pixel."""
     return (
@@ -79,7 +79,7 @@ def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) ->
     )
 
 
-@compiled_loops
+@compiled_ieee
 def _ring(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x: int,
@@ -117,7 +117,7 @@ def _ring(
     return total / (high - low), (values[high] - values[low]) / _QUARTILE_SIGMA
 
 
-@compiled_loops
+@compiled_ieee
 def _saturated_patch(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x: int,
@@ -162,7 +162,7 @@ def _saturated_patch(
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: int) -> bool:
     """Whether a pixel lies in the box around a patch that was followed before."""
     for k in range(count):
@@ -171,7 +171,7 @@ def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: 
     return False
 
 
-@compiled_loops
+@compiled_ieee
 def _sky(
     around: float, spread: float, base: float, noise: float, typical_noise: float
 ) -> tuple[float, float]:
@@ -190,7 +190,7 @@ def _sky(
     return base, noise
 
 
-@compiled_loops
+@compiled_ieee
 def _middle(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float
 ) -> tuple[float, float]:
@@ -209,7 +209,7 @@ def _middle(
     return column + min(max(1.5 * x / total, -0.7), 0.7), row + min(max(1.5 * y / total, -0.7), 0.7)
 
 
-@compiled_loops
+@compiled_ieee
 def _stands_alone(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float, noise: float
 ) -> bool:
@@ -225,7 +225,7 @@ def _stands_alone(
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def lay_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -323,7 +323,7 @@ def lay_windows(
     return total
 
 
-@compiled_loops
+@compiled_ieee
 def cut_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     windows: npt.NDArray[np.float64],

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from starid import cache, catalog, hipparcos
+from starid import cache, catalog, files, hipparcos
 from starid.catalog import StarCatalog, blend, companions, load_catalog
 from starid.errors import StaridError
 from starid.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
@@ -418,6 +418,6 @@ def test_a_failing_write_leaves_the_old_file(tmp_path: Path) -> None:
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        cache.write_atomically(target, fail)
+        files.write_atomically(target, fail)
     assert target.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["kept"]

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from starid.attitude import Attitude, turn_text
-from starid.cache import write_atomically
 from starid.camera_file import load_camera
 from starid.errors import StaridError
-from starid.files import read_bytes, read_number, read_text
+from starid.files import read_bytes, read_number, read_text, write_atomically
 from starid.hipparcos import read_hip2
 from starid.imaging.image_io import read_image, write_image
 from starid.thesis.database import DatabaseError
@@ -75,7 +74,7 @@ def test_a_folder_is_not_written_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize("into_file", [False, True])
 def test_the_standard_output_is_a_file_too(tmp_path: Path, *, into_file: bool) -> None:
     program = (
-        "import sys; from pathlib import Path; from starid.cache import write_atomically;"
+        "import sys; from pathlib import Path; from starid.files import write_atomically;"
         "print('before'); write_atomically(Path(sys.argv[1]), lambda part: part.write_text('whole\\n')); print('after')"
     )
     link, file = tmp_path / "stdout", tmp_path / "file"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from starid.cache import write_atomically
+from starid.files import write_atomically
 from starid.thesis.experiments.experiment import Row
 from starid.thesis.experiments.runner import Finished
 

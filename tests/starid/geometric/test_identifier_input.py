@@ -12,8 +12,8 @@ from starid.camera import Camera, Model
 from starid.catalog import load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Effort, Identifier
-from starid.geometric.validation import FARTHEST_PX
 from starid.solution import Reason, Solution
+from starid.solver_input import FARTHEST_PX
 from tests.starid.geometric.sky_points import identifier, sky
 
 AT = Attitude.from_radec_roll(80.0, 10.0, 30.0)

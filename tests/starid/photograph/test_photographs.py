@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from starid import field_sweep, image_solver
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_stars import pick_pattern_stars
+from starid.photograph import field_sweep, solver
 from starid.photograph.field_sweep import solve_any_field
 from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_choice
 from starid.photograph.solver import ImageSolution, solve_image
 from starid.photograph.typical_camera import typical_camera
 from starid.photograph.views import Look, has_dark_tail, looks
-from tests.starid.photograph import FOV_DEG, HEIGHT, WIDTH, photograph
+from tests.starid.photograph.night_sky import FOV_DEG, HEIGHT, WIDTH, photograph
 
 CENTRE_ARCSEC = 10.0
 TOLD = Camera.from_fov(FOV_DEG * 0.92, WIDTH, HEIGHT)
@@ -71,7 +71,7 @@ def test_a_lens_that_cannot_be_calibrated_leaves_the_answer(sky, monkeypatch) ->
         raise StaridError("calibration: folds the image")
 
     image, truth, camera = photograph(sky, 1)
-    monkeypatch.setattr(image_solver, "calibrate_identified", refuse)
+    monkeypatch.setattr(solver, "calibrate_identified", refuse)
     found = solve_image(image, TOLD, sky, fov_tolerance=0.1)
     assert found.solution.valid
     assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
