@@ -1,4 +1,4 @@
-"""Things that are computed once and kept: the folder for them, its size limit, and tables written whole or not at all."""
+"""Results that are computed once and kept on disk: their folder, its size limit, and cached tables of arrays."""
 
 from __future__ import annotations
 
@@ -105,9 +105,9 @@ def cached_files() -> list[CachedFile]:
 
 
 def size_limit() -> int:
-    """Return how many bytes the cached files may have together: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
+    """Return the limit of the total size of the cached files, bytes: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
 
-    A value that is no number of at least 0 is reported in the log, and the default holds.
+    An invalid value is logged, and the default applies.
     """
     text = os.environ.get(LIMIT_VARIABLE) or f"{DEFAULT_LIMIT_MB:g}"
     try:
@@ -116,14 +116,14 @@ def size_limit() -> int:
         limit = math.nan
     if not 0 <= limit < math.inf:
         _log.warning(
-            "%s is %r: must be a number of megabytes; %g holds", LIMIT_VARIABLE, text, DEFAULT_LIMIT_MB
+            "%s is %r: must be a number of megabytes; %g applies", LIMIT_VARIABLE, text, DEFAULT_LIMIT_MB
         )
         limit = DEFAULT_LIMIT_MB
     return round(limit * BYTES_PER_MB)
 
 
 def mark_used(path: Path) -> None:
-    """Note that a cached file was used now, so that others are evicted before it."""
+    """Set the time of the last use of a cached file or folder to now."""
     try:
         os.utime(path)
     except OSError as error:  # a read-only cache, or the file of another user
@@ -164,8 +164,8 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
     Parameters
     ----------
     name : str
-        File name without suffix. It must change with whatever the arrays are made from: a stale file is
-        one with another name.
+        File name without suffix. It must depend on everything that the arrays depend on: a stale file has
+        another name.
     build : callable
         Makes the arrays by name.
 
@@ -173,7 +173,7 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
     -------
     dict of ndarray
         As built. The file is an uncompressed ``.npz``, whose checksums are verified on loading; a damaged
-        one, or one that cannot be read, is built anew. Where the folder cannot be written the arrays are
+        one, or one that cannot be read, is built again. Where the folder cannot be written the arrays are
         only returned.
     """
     path = cache_dir() / f"{name}.npz"
@@ -184,7 +184,7 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
             mark_used(path)
             return tables
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        _log.warning("cache file %s is not usable (%s): built anew", path, error)
+        _log.warning("cache file %s is not usable (%s): built again", path, error)
     tables = build()
 
     def write(part: Path) -> None:

@@ -20,7 +20,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
-import llvmlite
 import numba
 import numpy as np
 from numba import njit
@@ -103,7 +102,7 @@ class KernelLocator:
     def __init__(self, function: Any, source: str) -> None:
         self._line = function.__code__.co_firstlineno
         self._stamp = source_stamp(function.__module__)
-        versions = (numba.__version__, llvmlite.__version__, np.__version__)
+        versions = (numba.__version__, np.__version__)
         key = hashlib.sha256(repr((function.__module__, self._stamp, versions)).encode()).hexdigest()[:16]
         self._folder = kernel_folder(key) or Path(source).parent / "__pycache__"
 

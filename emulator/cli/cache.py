@@ -1,4 +1,4 @@
-"""`starhil cache`: what is kept of earlier computations, and removing it."""
+"""`starhil cache`: show and clear the results of earlier computations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-group = typer.Typer(help="Star catalogue, indices and databases that were computed before and are kept.")
+group = typer.Typer(help="Cached star catalogues, indices, databases and machine code of kernels.")
 
 AS_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -22,9 +22,9 @@ def command(context: typer.Context) -> None:
 
 @group.command("info")
 def info(as_json: AS_JSON = False) -> None:
-    """Show folder, size, limit and files; beyond the limit the least recently used file goes first.
+    """Show folder, size, limit and files; beyond the limit the least recently used is removed first.
 
-    STARHIL_CACHE_DIR names another folder, STARHIL_CACHE_LIMIT_MB another limit.
+    STARHIL_CACHE_DIR sets the folder, STARHIL_CACHE_LIMIT_MB the limit.
     """
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
 
@@ -44,7 +44,7 @@ def info(as_json: AS_JSON = False) -> None:
 
 @group.command("clear")
 def clear() -> None:
-    """Remove all cached files; they are computed again when they are needed."""
+    """Remove all cached files; they are computed again when needed."""
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, remove
 
     files = cached_files()

@@ -1,4 +1,4 @@
-"""Width of the spot, fitted to bright stars together with place and flux."""
+"""Width of the spot, fitted to bright stars together with position and flux."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _one_width(
     saturation: float,
     result: Array,
 ) -> float:
-    """Width of the star at a peak; NaN if there is none to be had."""
+    """Width of the star at a peak; NaN where it cannot be fitted."""
     height, width = image.shape
     sigma = start
     for _ in range(_ROUNDS):
@@ -65,7 +65,7 @@ def _one_width(
         spot_model(x, y, sigma, window, model, work)
         spot_model(x, y, sigma * (1.0 + _STEP), window, wider, work)
         spot_model(x, y, sigma * (1.0 - _STEP), window, narrower, work)
-        # least squares for changes of flux and width; place does not mix with either
+        # least squares for changes of flux and width; position is uncorrelated with both
         ff = fs = ss = bf = bs = 0.0
         for k in range(pixels.size):
             share = model[0, k]
@@ -102,7 +102,7 @@ def spot_widths(
     saturation: float,
     widths: Array,
 ) -> int:
-    """Fill `widths` (m,) with the spot widths of the first peaks that have one; return how many.
+    """Fill `widths` (m,) with the spot widths of the first peaks that have one; return their number.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def spot_widths(
     start : float
         First guess, pixels.
     saturation : float
-        Counts from which a star is saturated and given up.
+        Least count of a saturated pixel; saturated stars are rejected.
     """
     count = 0
     result = np.empty(FIT_COLUMNS)

@@ -1,4 +1,4 @@
-"""Windows around candidates: how large each must be, what the sky is under it, and its pixels."""
+"""Windows around candidates: their size, the sky under them and their pixels."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ WINDOW_COLUMNS: Final = 14
     RADIUS_X,
     RADIUS_Y,
 ) = range(WINDOW_COLUMNS)
-"""Columns of a table of windows: place and size; where the pixels begin in the packed array; first guess of the star;
+"""Columns of a table of windows: position and size; start of the pixels in the packed array; first guess of the star;
 sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
 
 LARGEST_HALF_WIDTH: Final = 40
 """Half-width of a window at most, pixels."""
 
 MOST_SATURATED: Final = 400
-"""Connected saturated pixels from which on an object is no star."""
+"""Least number of connected saturated pixels of an object that is not a star."""
 
 PATCH_REACH: Final = 40
-"""So far from its peak the saturated patch of a star reaches at most, pixels."""
+"""Largest distance of the saturated patch of a star from its peak, pixels."""
 
 EXTENDED: Final = -1.0
 SEEN_BEFORE: Final = -2.0
 NO_ROOM: Final = -3.0
 ONE_PIXEL: Final = -4.0
-"""Values of COLUMNS that say why a candidate has no window."""
+"""Values of COLUMNS for candidates without a window."""
 
 _MOST_PATCHES: Final = 1000
 _RING_PIXELS: Final = 48
@@ -72,7 +72,7 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
 
 @compiled_ieee
 def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) -> tuple[float, float]:
-    """Slopes of the background along x and y, counts a pixel."""
+    """Slopes of the background along x and y, counts per pixel."""
     return (
         0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y)),
         0.5 * (interpolate_at(level, block, x, y + 1.0) - interpolate_at(level, block, x, y - 1.0)),
@@ -80,7 +80,7 @@ def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) ->
 
 
 @compiled_ieee
-def _ring(
+def _ring_statistics(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x: int,
     y: int,
@@ -92,7 +92,7 @@ def _ring(
 ) -> tuple[float, float]:
     """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
 
-    The sky's slopes along x and y are taken off first.
+    The sky's slopes along x and y are subtracted first.
     """
     height, width = image.shape
     count = 0
@@ -130,7 +130,7 @@ def _saturated_patch(
     """Follow the connected saturated pixels from (x, y); False if there are too many, or too far, for a star.
 
     Fills `patch` (7,) with their mean column and row, half their larger extent, and their first and last column and
-    row. `seen` is scratch of (2·PATCH_REACH + 1)².
+    row. `seen` is workspace of (2·PATCH_REACH + 1)².
     """
     height, width = image.shape
     seen[:] = 0
@@ -164,7 +164,7 @@ def _saturated_patch(
 
 @compiled_ieee
 def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: int) -> bool:
-    """Whether a pixel lies in the box around a patch that was followed before."""
+    """Whether a pixel lies in the bounding box of an earlier patch."""
     for k in range(count):
         if patches[k, 3] <= column <= patches[k, 4] and patches[k, 5] <= row <= patches[k, 6]:
             return True
@@ -172,12 +172,12 @@ def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: 
 
 
 @compiled_ieee
-def _sky(
+def _sky_under(
     around: float, spread: float, base: float, noise: float, typical_noise: float
 ) -> tuple[float, float]:
     """Sky and noise under a star, from its ring (NaN if there is none) and from the grid of blocks.
 
-    The grid has the smaller error; the ring wins where it contradicts the grid, as in glare or by a bright limb.
+    The grid has the smaller error; the ring is used where they disagree, as in glare or near a bright limb.
     """
     if spread != spread:
         return base, noise
@@ -191,10 +191,10 @@ def _sky(
 
 
 @compiled_ieee
-def _middle(
+def _first_position(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float
 ) -> tuple[float, float]:
-    """First guess of a star's place: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
+    """First guess of a star's position: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
     height, width = image.shape
     if not (0 < column < width - 1 and 0 < row < height - 1):
         return float(column), float(row)
@@ -246,7 +246,7 @@ def lay_windows(
     peaks : ndarray (n, 2)
         Column and row of each candidate, the brightest first.
     flux : ndarray (n,)
-        First guess of their light, counts.
+        First guess of their flux, counts.
     level, noise, block
         Grid of the background, and the side of its blocks.
     spot : (float, float, float)
@@ -254,7 +254,7 @@ def lay_windows(
     flow : ndarray (5,)
         Flow of the trails (`starid.imaging.trail_flow`).
     windows : ndarray (n, WINDOW_COLUMNS)
-        Filled; COLUMNS tells where there is none, and why.
+        Filled; COLUMNS marks candidates without a window and why.
 
     Returns
     -------
@@ -293,8 +293,8 @@ def lay_windows(
         radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
         centre_x, centre_y = round(x), round(y)
         slopes = _slopes(level, block, x, y)
-        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
-        sky_level, window[NOISE] = _sky(
+        around, spread = _ring_statistics(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
+        sky_level, window[NOISE] = _sky_under(
             around,
             spread,
             interpolate_at(level, block, x, y),
@@ -310,7 +310,7 @@ def lay_windows(
         rows = min(centre_y + radius_y, height - 1) - top + 1
         window[LEFT], window[TOP] = left, top
         if extra == 0.0:
-            x, y = _middle(image, column, row, sky_level)
+            x, y = _first_position(image, column, row, sky_level)
         window[START_X], window[START_Y], window[PATCH] = x, y, extra
         window[TRAIL_X], window[TRAIL_Y] = trail_x, trail_y
         window[RADIUS_X], window[RADIUS_Y] = radius_x, radius_y
@@ -332,7 +332,7 @@ def cut_windows(
     saturation: float,
     pixels: npt.NDArray[np.float32],
 ) -> None:
-    """Copy the windows' pixels, one window after the other, less the sky; saturated ones become infinite.
+    """Copy the windows' pixels minus the sky, one window after another; saturated ones become infinite.
 
     The sky is a plane: `BASE` at the first guess of the star, sloped as the grid of blocks.
     """

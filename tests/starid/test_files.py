@@ -101,10 +101,10 @@ def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
     assert seen[0].startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(("reader", "refusal"), READERS)
+@pytest.mark.parametrize(("reader", "error_type"), READERS)
 @pytest.mark.parametrize("kind", ["zero", "pipe", "folder"])
 def test_only_regular_files_are_read(
-    tmp_path: Path, reader: object, refusal: type[Exception], kind: str
+    tmp_path: Path, reader: object, error_type: type[Exception], kind: str
 ) -> None:
     path = tmp_path / kind
     if kind == "zero":
@@ -121,7 +121,7 @@ def test_only_regular_files_are_read(
         "try: getattr(module, sys.argv[2])(Path(sys.argv[5]))\n"
         "except error as caught: print(caught)"
     )
-    names = [reader.__module__, reader.__name__, refusal.__module__, refusal.__name__]  # type: ignore[attr-defined]
+    names = [reader.__module__, reader.__name__, error_type.__module__, error_type.__name__]  # type: ignore[attr-defined]
     done = subprocess.run(
         [sys.executable, "-c", program, *names, str(path)], capture_output=True, text=True, timeout=120
     )
