@@ -1,6 +1,6 @@
-"""Attitude: one rotation from ICRS into the sensor frame, and every way in and out of it.
+"""Attitude: the rotation from ICRS into the sensor frame, and its conversions.
 
-Conventions, binding everywhere in the project:
+Conventions of the whole project:
 
 - The sensor frame is +x right (columns of the image), +y down (rows), +z boresight.
 - A quaternion is scalar-last ``(x, y, z, w)`` and *rotates vectors*: ``v_sensor = q ⊗ v_icrs ⊗ q*``, the
@@ -40,7 +40,7 @@ _SMALL_ANGLE: Final = 1e-8
 
 @dataclass(frozen=True)
 class AttitudeError:
-    """How far one attitude is from another.
+    """Difference between two attitudes.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ class Attitude:
         return Attitude(_multiply(turn, self.quaternion_xyzw.tolist()))
 
     def error_to(self, truth: Attitude) -> AttitudeError:
-        """How far this attitude is from the truth, split into cross-boresight and roll."""
+        """Error of this attitude against the truth, split into cross-boresight and roll."""
         tx, ty, tz, tw = truth.quaternion_xyzw.tolist()
         x, y, z, w = _multiply(self.quaternion_xyzw.tolist(), (-tx, -ty, -tz, tw)).tolist()
         if w < 0.0:
@@ -247,7 +247,7 @@ class Attitude:
 
 
 def turn_text(degrees: float, digits: int) -> str:
-    """Right ascension or roll as text with so many decimals, below 360 after rounding too."""
+    """Format right ascension or roll with a number of decimals; below 360 after rounding too."""
     return f"{round(degrees % 360.0, digits) % 360.0:.{digits}f}"
 
 
@@ -303,7 +303,7 @@ def _multiply(
 
 
 def quaternion_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scalar-last unit quaternion (4,) of a (nearly) rotation matrix, by its largest part (Shepperd 1978)."""
+    """Scalar-last unit quaternion (4,) of a (nearly) rotation matrix, by its largest component (Shepperd 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
     rows = (

@@ -1,8 +1,7 @@
-"""Things that are computed once and kept: the folder for them, its size limit, and tables written whole or not at all."""
+"""Results that are computed once and kept on disk: their folder, its size limit, and cached tables of arrays."""
 
 from __future__ import annotations
 
-import errno
 import logging
 import math
 import os
@@ -19,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.files import is_stream, open_stream
+from starid.files import write_atomically
 
 _log = logging.getLogger(__name__)
 
@@ -28,8 +27,11 @@ Tables = dict[str, NDArray[np.generic]]
 LIMIT_VARIABLE: Final = "STARHIL_CACHE_LIMIT_MB"
 DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
-_OWN_NAME: Final = re.compile(r"(?:hipparcos|index|features)-[0-9a-f]{16}\.(?:npz|bin)")
-"""Names of cached files: whatever else is in the folder is not ours to remove."""
+_KERNELS: Final = "kernels"
+_OWN_NAME: Final = re.compile(
+    rf"(?:hipparcos|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
+)
+"""Paths of cached files and of folders of machine code, in the cache folder: nothing else in it is removed."""
 
 
 def cache_dir() -> Path:
@@ -54,35 +56,58 @@ def cache_dir() -> Path:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "starhil"
 
 
+def kernel_folder(key: str) -> Path | None:
+    """Return the folder for machine code with a key of 16 hexadecimal digits; None where it cannot be made.
+
+    It need not exist yet.
+    """
+    folder = cache_dir() / _KERNELS / key
+    if folder.is_dir():
+        return folder
+    nearest = next(parent for parent in folder.parents if os.access(parent, os.F_OK))
+    return folder if nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) else None
+
+
 @dataclass(frozen=True)
 class CachedFile:
-    """A file in the cache folder."""
+    """A file in the cache folder, or a folder of machine code, which is kept or removed as a whole."""
 
     path: Path
     size: int
     """Bytes."""
     used_s: float
-    """When it was last used, seconds since 1970."""
+    """Time of the last use, seconds since 1970."""
+
+    @property
+    def name(self) -> str:
+        """Path in the cache folder."""
+        return _name(self.path)
+
+
+def _name(path: Path) -> str:
+    """Name of a file, with the folder before it that of machine code has."""
+    return f"{_KERNELS}/{path.name}" if path.parent.name == _KERNELS else path.name
 
 
 def cached_files() -> list[CachedFile]:
     """Return the cached files, the least recently used first."""
     found = []
     folder = cache_dir()
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if _OWN_NAME.fullmatch(path.name):
+    for path in (*folder.glob("*"), *folder.glob(f"{_KERNELS}/*")):
+        if _OWN_NAME.fullmatch(_name(path)):
             try:
                 state = path.stat()
+                size = sum(each.stat().st_size for each in path.iterdir()) if path.is_dir() else state.st_size
             except FileNotFoundError:  # another process has removed it
                 continue
-            found.append(CachedFile(path, state.st_size, state.st_mtime))
+            found.append(CachedFile(path, size, state.st_mtime))
     return sorted(found, key=lambda each: each.used_s)
 
 
 def size_limit() -> int:
-    """Return how many bytes the cached files may have together: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
+    """Return the limit of the total size of the cached files, bytes: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
 
-    A value that is no number of at least 0 is reported in the log, and the default holds.
+    An invalid value is logged, and the default applies.
     """
     text = os.environ.get(LIMIT_VARIABLE) or f"{DEFAULT_LIMIT_MB:g}"
     try:
@@ -91,14 +116,14 @@ def size_limit() -> int:
         limit = math.nan
     if not 0 <= limit < math.inf:
         _log.warning(
-            "%s is %r: must be a number of megabytes; %g holds", LIMIT_VARIABLE, text, DEFAULT_LIMIT_MB
+            "%s is %r: must be a number of megabytes; %g applies", LIMIT_VARIABLE, text, DEFAULT_LIMIT_MB
         )
         limit = DEFAULT_LIMIT_MB
     return round(limit * BYTES_PER_MB)
 
 
 def mark_used(path: Path) -> None:
-    """Note that a cached file was used now, so that others are evicted before it."""
+    """Set the time of the last use of a cached file or folder to now."""
     try:
         os.utime(path)
     except OSError as error:  # a read-only cache, or the file of another user
@@ -107,9 +132,9 @@ def mark_used(path: Path) -> None:
 
 def evict(keep: Path) -> None:
     """Remove the least recently used cached files until the limit holds; `keep`, just written, stays."""
-    if keep.parent != cache_dir():
-        return
     files = cached_files()
+    if all(each.path != keep for each in files):  # kept in a folder outside the cache
+        return
     excess = sum(each.size for each in files) - size_limit()
     for each in files:
         if excess <= 0:
@@ -121,51 +146,16 @@ def evict(keep: Path) -> None:
 def remove(file: CachedFile) -> bool:
     """Remove a cached file; False, with a warning in the log, where that is not allowed."""
     try:
-        file.path.unlink(missing_ok=True)
+        if file.path.is_dir():
+            shutil.rmtree(file.path)
+        else:
+            file.path.unlink()
+    except FileNotFoundError:  # another process has removed it
+        return True
     except OSError as error:
         _log.warning("cache file %s cannot be removed: %s", file.path, error)
         return False
     return True
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file, then move it onto `path` in one step.
-
-    Where `path` is a link, the file that it leads to is replaced. What is no regular file (a device, a pipe, the
-    standard output) gets the content written into it when all of it is there.
-
-    Parameters
-    ----------
-    path : Path
-        Final name; missing folders are made.
-    write : callable
-        Gets the temporary path. If it raises, nothing is left behind and `path` is untouched.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written, or `path` is a folder itself.
-    """
-    if is_stream(path):
-        with tempfile.TemporaryDirectory() as folder:
-            whole = Path(folder, path.name)
-            write(whole)
-            with whole.open("rb") as content, open_stream(path) as stream:
-                shutil.copyfileobj(content, stream)
-        return
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    target = Path(os.path.realpath(path))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-    os.close(descriptor)
-    part = Path(name)
-    try:
-        write(part)
-        part.chmod(0o644)
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
@@ -174,8 +164,8 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
     Parameters
     ----------
     name : str
-        File name without suffix. It must change with whatever the arrays are made from: a stale file is
-        one with another name.
+        File name without suffix. It must depend on everything that the arrays depend on: a stale file has
+        another name.
     build : callable
         Makes the arrays by name.
 
@@ -183,7 +173,7 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
     -------
     dict of ndarray
         As built. The file is an uncompressed ``.npz``, whose checksums are verified on loading; a damaged
-        one, or one that cannot be read, is built anew. Where the folder cannot be written the arrays are
+        one, or one that cannot be read, is built again. Where the folder cannot be written the arrays are
         only returned.
     """
     path = cache_dir() / f"{name}.npz"
@@ -194,7 +184,7 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
             mark_used(path)
             return tables
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        _log.warning("cache file %s is not usable (%s): built anew", path, error)
+        _log.warning("cache file %s is not usable (%s): built again", path, error)
     tables = build()
 
     def write(part: Path) -> None:

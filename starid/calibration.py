@@ -1,10 +1,15 @@
 """Self-calibration: focal length, centre and distortion from stars matched over several frames.
 
-All frames are adjusted together (a bundle): one camera, one attitude a frame. The residual of a star is its
+All frames are adjusted together (a bundle): one camera, one attitude per frame. The residual of a star is its
 measured position minus the projection of its catalogue direction, over its standard deviation. Levenberg–
-Marquardt steps solve for the camera by the Schur complement of the attitudes' 3 × 3 blocks; Huber weights and
-a final rejection keep false matches out. Weak priors at the start values hold what the frames cannot tell
-(in a narrow field, where a shift of the centre looks like a rotation) instead of letting it run away.
+Marquardt steps solve for the camera by the Schur complement of the attitudes' 3 × 3 blocks; Huber weights and a
+final rejection exclude false matches. Weak priors at the start values bound parameters that the frames do not determine,
+such as the centre in a narrow field, where its shift is degenerate with a rotation.
+
+`scipy.optimize.least_squares` (trust region, Huber loss, analytic Jacobian) is as accurate but slower, because it does
+not exploit the block structure. Over 8 seeded sets per case, median error of the image in pixels and CPU time, here and
+with scipy: 10 frames of 42°, 0.0115 and 0.0114, 87 ms and 373 ms; 8 fisheye frames with false matches, 0.0050 and
+0.0050, 319 ms and 1165 ms; 3 frames, 0.0226 and 0.0224, 35 ms and 68 ms.
 """
 
 from __future__ import annotations
@@ -68,7 +73,7 @@ class CalibrationFrame:
         Standard deviation of each position, the same on both axes or along x and y; without it all are
         equal and the noise is estimated from the residuals.
     attitude : Attitude, optional
-        Start value; without it Wahba's problem is solved with the start camera.
+        Start value; by default the solution of Wahba's problem with the start camera.
     """
 
     xy_px: Array
@@ -95,7 +100,7 @@ class CalibrationFrame:
 
     @property
     def axis_sigmas(self) -> Array:
-        """Standard deviations (n, 2) along x and y, pixels; ones where none were given."""
+        """Standard deviations (n, 2) along x and y, pixels; ones by default."""
         n = len(self.xy_px)
         if self.sigma_px is None:
             return np.ones((n, 2))
@@ -104,26 +109,26 @@ class CalibrationFrame:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Outcome of a calibration.
+    """The result of a calibration.
 
     Attributes
     ----------
     camera : Camera
         The estimated camera.
     attitudes : tuple of Attitude
-        One a frame.
+        One per frame.
     estimated : tuple of str
-        What was free (keys of `GROUPS`).
+        Free parameters (keys of `GROUPS`).
     covariance : ndarray (9, 9)
-        Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; zero rows for what was held. Scaled by the
-        residuals where no standard deviations were given, or where they were too small.
+        Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; zero rows for fixed parameters. Scaled by
+        the residuals where standard deviations are missing or too small.
     rms_px : float
         Root mean square distance of the used stars from their projection, pixels.
     sigma_px : float
         Noise of a position on one axis, pixels, from the residuals and the degrees of freedom (of a star
-        with mean weight, where stars have standard deviations of their own).
+        with mean weight, where the frames have standard deviations).
     used : tuple of ndarray (n,) of bool
-        Stars of each frame that took part to the end.
+        Stars of each frame that were not rejected.
     residual_px : tuple of ndarray (n, 2)
         Measured minus projected position of every star, pixels.
     """
@@ -139,7 +144,7 @@ class Calibration:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Standard deviation of each camera parameter by name; 0 for what was held."""
+        """Standard deviation of each camera parameter by name; 0 for a fixed parameter."""
         return dict(zip(NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
@@ -156,7 +161,7 @@ def calibrate(
     Parameters
     ----------
     frames : sequence of CalibrationFrame
-        The more, and the better spread over the image, the better.
+        Accuracy grows with their number and with the spread of the stars over the image.
     camera : Camera
         Start value; parameters that are not estimated keep its values.
     estimate : sequence of str
@@ -169,8 +174,8 @@ def calibrate(
     Raises
     ------
     StaridError
-        Unknown parameter, too few stars for what is asked, matches that do not fit the start camera or, of
-        one frame, the others, or a result that folds the image.
+        Unknown parameter, too few stars for the free parameters, matches inconsistent with the start camera
+        or with the other frames, or a distortion that folds the image.
     """
     check_estimate(estimate)
     if not frames:
@@ -193,7 +198,7 @@ def calibrate(
 
 
 def check_estimate(estimate: Sequence[str]) -> None:
-    """Refuse names that are not keys of `GROUPS`, and none at all."""
+    """Reject an empty choice, and names that are not keys of `GROUPS`."""
     unknown = sorted(set(estimate) - set(GROUPS))
     if unknown or not estimate:
         what = f"{unknown[0]!r}" if unknown else "nothing"
@@ -202,7 +207,7 @@ def check_estimate(estimate: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Where the adjustment stands: values of the nine camera parameters, and the attitudes."""
+    """A state of the adjustment: values of the nine camera parameters, and the attitudes."""
 
     values: Array
     attitudes: tuple[Attitude, ...]
@@ -231,7 +236,7 @@ class _Bundle:
         self.prior = (self.freedom.T * prior**-2.0) @ self.freedom
 
     def start(self) -> _State:
-        """State of the start values."""
+        """The start values."""
         attitudes = tuple(
             solve_wahba(self.camera.back_project(f.xy_px), f.reference) if f.attitude is None else f.attitude
             for f in self.frames
@@ -265,7 +270,7 @@ class _Bundle:
         return max(spread, 1.0) if self.has_sigmas else spread
 
     def reject(self, state: _State) -> None:
-        """Keep the stars within five times the spread."""
+        """Reject stars beyond five times the spread."""
         distances = self.distances(self.residuals(state))
         limit = _REJECT * self.scale(distances)
         self.used = tuple(d <= limit for d in distances)
@@ -286,7 +291,7 @@ class _Bundle:
         return total if math.isfinite(total) else math.inf
 
     def adjusted(self, state: _State) -> _State:
-        """State after Levenberg–Marquardt steps until none helps."""
+        """Minimise the cost by Levenberg–Marquardt steps."""
         damping = 1e-3
         scale = self.scale(self.distances(self.residuals(state)))
         cost = self.cost(state, scale)
@@ -313,7 +318,7 @@ class _Bundle:
         return state
 
     def outcome(self, state: _State, estimated: tuple[str, ...]) -> Calibration:
-        """Package the final state."""
+        """Make the result of the final state."""
         residuals = self.residuals(state)
         distances = [d[u] for d, u in zip(self.distances(residuals), self.used, strict=True)]
         squares = np.concatenate(distances) ** 2
@@ -344,7 +349,7 @@ class _Bundle:
 
 
 class _System:
-    """Normal equations of a bundle at a state, the attitudes' blocks apart."""
+    """Normal equations of a bundle at a state, with the blocks of the attitudes separate."""
 
     def __init__(self, bundle: _Bundle, state: _State, scale: float, *, robust: bool = True) -> None:
         self.bundle = bundle
@@ -410,7 +415,7 @@ def _freedom(estimate: Sequence[str], values: Array) -> Array:
 
 
 def _turn_slopes(params: Array, vectors: Array) -> Array:
-    """Derivative (n, 2, 3) of the positions by a turn of the sensor, pixels per radian: J (v × e)."""
+    """Derivative (n, 2, 3) of the positions by a rotation of the sensor, pixels per radian: J (v × e)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

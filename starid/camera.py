@@ -58,13 +58,13 @@ class Camera:
     focal_px : (float, float)
         Focal lengths fx, fy in pixels (pixels per radian at the centre for every model).
     centre_px : (float, float)
-        Where the boresight falls, (cx, cy) in pixels; pixel centres are integers.
+        Position (cx, cy) of the boresight, pixels; pixel centres are integers.
     model : {"pinhole", "equidistant", "flat"}
-        Mapping from direction to plane. "flat" is longitude and latitude about the boresight; how the
-        thesis's flat RA–Dec plane comes out of it is told in `flat_view`.
+        Mapping from direction to plane. "flat" is longitude and latitude about the boresight; `flat_view`
+        maps the thesis's flat RA–Dec plane to it.
     distortion : tuple of 5 floats
-        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, acting on the plane; fewer are
-        filled up with zeros.
+        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, acting on the plane; missing
+        terms are zero.
 
     Raises
     ------
@@ -149,7 +149,7 @@ class Camera:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Camera from the keys that `to_dict` writes; `fov_deg` may stand for focal_px and centre_px."""
+        """Camera from the keys of `to_dict`; `fov_deg` may replace focal_px and centre_px."""
         known = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known - {"fov_deg"})
         if unknown:
@@ -170,7 +170,7 @@ class Camera:
         return cls(**given)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values under the field names, fit for TOML and JSON."""
+        """Plain values by field name, for TOML and JSON."""
         values = dataclasses.asdict(self)
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
@@ -196,7 +196,7 @@ class Camera:
 
     @cached_property
     def identity(self) -> str:
-        """Short checksum of every value, for the names of things cached for this camera."""
+        """Short checksum of every value, for names in the cache."""
         text = repr((self.width, self.height, self.focal_px, self.centre_px, self.model, self.distortion))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -258,8 +258,8 @@ class Camera:
     def jacobian(self, vectors: ArrayLike) -> NDArray[np.float64]:
         """Return the derivative (n, 2, 3) of the pixel position by the direction, in pixels per unit.
 
-        It is taken at unit vectors (n, 3) and is zero along the direction itself. For a rotation of the sensor by a small vector e (radians,
-        sensor frame) the directions move by ``v × e``, so the positions move by ``J (v × e)``.
+        It is taken at unit vectors (n, 3) and is zero along the direction itself. When the sensor rotates by a small
+        vector e (radians, sensor frame), the directions move by ``v × e``, so the positions move by ``J (v × e)``.
         """
         return jacobian_kernel(self.params, _table("directions", vectors, 3))
 
@@ -301,13 +301,13 @@ def _side(name: str, side: Any) -> int:
 
 
 def _check_model(model: Any) -> None:
-    """Refuse what is not the name of a model."""
+    """Reject an unknown name of a model."""
     if not isinstance(model, str) or model not in _MODEL_CODES:
         raise StaridError(f"camera model: {model!r} given, one of {', '.join(_MODEL_CODES)} needed")
 
 
 def _floats(values: Any) -> tuple[float, ...] | None:
-    """Values as floats; None where they are no sequence of finite numbers."""
+    """Values as floats; None unless they are a sequence of finite numbers."""
     if not isinstance(values, Iterable):
         return None
     items = tuple(values)

@@ -1,8 +1,8 @@
-"""Camera profiles: a camera, and how it was calibrated, in a small TOML file.
+"""Camera profiles: a camera and its calibration in a small TOML file.
 
-The table ``[camera]`` holds the keys of `starid.camera.Camera.to_dict` and is all that is read back, so a
-device profile with such a table is a camera profile too. The table ``[calibration]`` tells for people and
-scripts where the numbers come from.
+The table ``[camera]`` holds the keys of `starid.camera.Camera.to_dict` and is the only one that is read, so a
+device profile with such a table is a camera profile too. The table ``[calibration]`` documents the origin of the
+values.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from starid.cache import write_atomically
 from starid.calibration import NAMES, Calibration
 from starid.camera import Camera
 from starid.errors import StaridError
-from starid.files import read_text
+from starid.files import read_text, write_atomically
 
 
 def save_camera(path: str | Path, camera: Camera, calibration: Calibration | None = None) -> None:
@@ -25,11 +24,11 @@ def save_camera(path: str | Path, camera: Camera, calibration: Calibration | Non
     Parameters
     ----------
     path : path
-        File to write; an old one is replaced.
+        File to write or replace.
     camera : Camera
-        What `load_camera` gives back.
+        The camera.
     calibration : Calibration, optional
-        Its figures and covariance are written beside.
+        Its figures and covariance are written too.
 
     Raises
     ------
@@ -67,7 +66,7 @@ def load_camera(path: str | Path) -> Camera:
     Raises
     ------
     StaridError
-        The file is missing, no TOML, without a table [camera], or holds a wrong key or value.
+        The file is missing or not TOML, has no table [camera], or holds an unknown key or invalid value.
     """
     source = Path(path)
     try:

@@ -22,7 +22,7 @@ from starid.photometry import absolute_magnitude, fitted_share, flux_ratio, v_fr
 Band = Literal["v", "hp"]
 
 DEFAULT_EPOCH: Final = 2026.0
-"""Julian year to which positions are moved when nothing else is asked for."""
+"""Default Julian year of the positions."""
 
 _RAD_PER_MAS: Final = math.pi / (180.0 * 3600.0 * 1000.0)
 _EPOCH_RANGE: Final = (1800.0, 2200.0)
@@ -56,7 +56,7 @@ class StarCatalog:
     parallax_mas : ndarray (n,)
         Parallax, mas.
     pm_ra_mas_yr, pm_dec_mas_yr : ndarray (n,)
-        Proper motion at J1991.25, mas a year; the first includes cos δ.
+        Proper motion at J1991.25, mas per year; the first includes cos δ.
     epoch : float
         Julian year of `vectors`.
     """
@@ -92,7 +92,7 @@ class StarCatalog:
 
     @cached_property
     def identity(self) -> str:
-        """Short checksum of stars, positions and magnitudes, for the names of things cached for them."""
+        """Short checksum of stars, positions and magnitudes, for names in the cache."""
         digest = hashlib.sha256()
         for values in (self.hip, self.vectors, self.hp, self.v):
             digest.update(values.tobytes())
@@ -175,12 +175,12 @@ class StarCatalog:
         """
         wanted = np.asarray(hip)
         ordered = self.hip[self._by_hip]
-        place = np.minimum(np.searchsorted(ordered, wanted), max(len(self) - 1, 0))
-        found = ordered[place] == wanted if len(self) else np.zeros(wanted.shape, dtype=np.bool_)
+        row = np.minimum(np.searchsorted(ordered, wanted), max(len(self) - 1, 0))
+        found = ordered[row] == wanted if len(self) else np.zeros(wanted.shape, dtype=np.bool_)
         if not np.all(found):
             missing = np.atleast_1d(wanted)[~np.atleast_1d(found)][0]
             raise StaridError(f"star catalogue: HIP {missing} is not in it ({len(self)} stars)")
-        return self._by_hip[place]
+        return self._by_hip[row]
 
 
 def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -> StarCatalog:
@@ -253,7 +253,7 @@ def moved(
     pm_dec_mas_yr: NDArray[np.float64],
     epoch: float,
 ) -> NDArray[np.float64]:
-    """Unit vectors (n, 3) at a Julian year of stars given at J1991.25 (as `load_catalog` tells)."""
+    """Unit vectors (n, 3) at a Julian year of stars given at J1991.25 (see `load_catalog`)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
     years = (epoch - EPOCH) * _RAD_PER_MAS
     east, north = years * pm_ra_mas_yr, years * pm_dec_mas_yr
@@ -266,7 +266,7 @@ def moved(
 
 
 def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: float) -> NDArray[np.intp]:
-    """Rows, ascending, of the stars fainter than a V magnitude that stand near one that is not.
+    """Rows, ascending, of the stars fainter than a V magnitude that lie near a brighter one.
 
     Parameters
     ----------
@@ -283,25 +283,26 @@ def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: 
     return faint[np.unique(pairs[:, 1])]
 
 
-def blend(
+def merge_close_stars(
     catalog: StarCatalog, separation_rad: float, band: Band = "v", *, as_fitted: bool = False
 ) -> StarCatalog:
-    """Merge stars that a sensor cannot tell apart.
+    """Merge stars that a sensor cannot resolve.
 
-    From the brightest down, each star takes in all fainter ones within the separation that no brighter
-    one has taken: the merged star stands at the flux-weighted position with the summed flux (in V and in
-    Hp), and keeps HIP number, colours, parallax and proper motion of its brightest member.
+    From the brightest down, each star absorbs all fainter ones within the separation that no brighter one has
+    absorbed. The merged star has the flux-weighted position, the summed flux (in V and in Hp), and the HIP number,
+    colours, parallax and proper motion of its brightest member.
 
     Parameters
     ----------
     catalog : StarCatalog
-        The stars. Cut it first to what matters: faint companions add little light.
+        The stars. Limit its magnitude first: faint companions add little light.
     separation_rad : float
         Angle within which two stars are one, radians.
     band : {"v", "hp"}
         The band whose flux weights the position and ranks the members.
     as_fitted : bool
-        Put the merged star where the fit of one spot finds it (`starid.photometry.fitted_share`), short of the centre of light.
+        Place the merged star where the fit of a single spot finds it (`starid.photometry.fitted_share`), short of the
+        centre of light.
 
     Returns
     -------
@@ -323,13 +324,13 @@ def blend(
         if leader[bright] == bright and leader[faint] == faint:
             leader[faint] = bright
     flux = flux_ratio(catalog.magnitude(band))
-    places = catalog.vectors
+    positions = catalog.vectors
     if as_fitted:
-        gap = places - places[leader]
+        gap = positions - positions[leader]
         distance = np.linalg.norm(gap, axis=1) / max(_chord(separation_rad), 1e-12)
-        places = places[leader] + fitted_share(distance, flux / flux[leader])[:, None] * gap
+        positions = positions[leader] + fitted_share(distance, flux / flux[leader])[:, None] * gap
     sums = np.zeros((len(catalog), 3))
-    np.add.at(sums, leader, places * flux[:, None])
+    np.add.at(sums, leader, positions * flux[:, None])
     kept = np.flatnonzero(leader == np.arange(len(catalog)))
     grown = np.bincount(leader, minlength=len(catalog))[kept] > 1
     vectors = catalog.vectors[kept].copy()
@@ -357,7 +358,7 @@ def _close_pairs(
 ) -> NDArray[np.intp]:
     """Pairs (m, 2) of rows of `ones` and rows of `others`, unit vectors, that are not farther apart than an angle.
 
-    The others are ordered by z, in which partners stand within the chord. (A tree would do, but importing one costs half
+    The others are ordered by z, in which partners stand within the chord. (Importing a k-d tree would take half
     a second.)
     """
     chord = _chord(separation_rad)

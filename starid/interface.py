@@ -1,4 +1,4 @@
-"""One interface for every identification algorithm, and the one place that makes them by name."""
+"""The interface of every star identifier, and the factory that makes one by name."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ALGORITHMS: Final[dict[str, tuple[str, str]]] = {
     "pole-star": ("starid.classic.pole_star", "PoleStarIdentifier"),
     "radial-cyclic": ("starid.classic.radial_cyclic", "RadialCyclicIdentifier"),
 }
-"""Name of an algorithm → module and class; modules are imported when they are asked for."""
+"""Name of an algorithm → module and class; a module is imported on first use."""
 
 CLASSICS: Final = tuple(
     name for name, (module, _) in ALGORITHMS.items() if module.startswith("starid.classic.")
@@ -43,7 +43,7 @@ CLASSICS: Final = tuple(
 
 @runtime_checkable
 class StarIdentifier(Protocol):
-    """What identifies stars: detections in, verified attitude out."""
+    """A star identifier: detections in, verified attitude out."""
 
     @property
     def camera(self) -> Camera:
@@ -52,7 +52,7 @@ class StarIdentifier(Protocol):
 
     @property
     def catalog(self) -> StarCatalog:
-        """The catalogue that `Solution.catalog_index` counts in."""
+        """The catalogue whose rows `Solution.catalog_index` refers to."""
         ...
 
     def identify(
@@ -61,7 +61,7 @@ class StarIdentifier(Protocol):
         flux: NDArray[np.float64],
         xy_sigma_px: NDArray[np.float64] | None = None,
     ) -> Solution:
-        """Lost in space: attitude without any knowledge of it.
+        """Find the attitude without any prior knowledge (lost in space).
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class StarIdentifier(Protocol):
             Brightness in any linear unit.
         xy_sigma_px : array (n,) or (n, 2), optional
             One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
-            the residuals when not given.
+            the residuals by default.
         """
         ...
 
@@ -84,16 +84,16 @@ class StarIdentifier(Protocol):
         *,
         window_px: float | None = None,
     ) -> Solution:
-        """Attitude near a predicted one; invalid, with the reason, where it does not hold.
+        """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
 
         Parameters
         ----------
         xy_px, flux, xy_sigma_px
             As in `identify`.
         predicted : Attitude or array (4,)
-            Attitude expected, or its scalar-last quaternion.
+            Predicted attitude at the time of the exposure, or its scalar-last quaternion.
         window_px : float, optional
-            Largest distance of a star from where the prediction puts it, pixels.
+            Largest distance of a star from its predicted position, pixels.
         """
         ...
 
@@ -104,16 +104,16 @@ def make_identifier(
     catalog: StarCatalog | None = None,
     **options: Any,
 ) -> StarIdentifier:
-    """Identifier by name: "geometric", "lsi", "rsi" or one of `CLASSICS`.
+    """Make a star identifier by name: "geometric", "lsi", "rsi" or one of `CLASSICS`.
 
     Parameters
     ----------
     algorithm : str
         One of `ALGORITHMS`.
     camera : Camera
-        What the detections were taken with.
+        The camera that took the images.
     catalog : StarCatalog, optional
-        Default: the one that `load_catalog()` gives.
+        By default `load_catalog()`.
     **options
         Keywords of the algorithm's own class.
 

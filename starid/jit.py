@@ -1,9 +1,9 @@
-"""The numba decorator of the package, typed, with a disk cache that notices changed callees.
+"""Decorators that compile kernels with numba and keep their machine code on disk.
 
-Numba's own cache compares only the file of the function itself: after a change to a kernel that it calls in
-another module, it would go on running the old machine code. So every cache index is stamped with the
-contents of all modules of the project that the function's module imports, directly or not. And Numba runs
-whatever it finds in its files: here each begins with a checksum of the rest, and a damaged one is removed.
+The machine code is kept in the cache folder (`starid.cache`), in one folder per state of the sources: that of the
+function's module and of every module of the project that it imports, directly or not. Installations with equal sources
+share it, and a changed source, in a called module too, is compiled again. Each file begins with a checksum of the rest,
+because numba runs whatever it reads; a damaged file is removed.
 """
 
 from __future__ import annotations
@@ -20,74 +20,158 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
+import numba
+import numpy as np
 from numba import njit
 from numba.core import caching
+
+from starid.cache import evict, kernel_folder, mark_used
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 _log = logging.getLogger(__name__)
 
 _NumbaCacheFile: Any = caching.IndexDataCacheFile
+_NumbaCache: Any = caching.FunctionCache
+_NumbaCacheImpl: Any = caching.CompileResultCacheImpl
 
 _IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
 
 
 def _import_numba_arrays() -> None:
-    """Import what numba needs for arrays, without the whole of ``scipy.linalg``.
+    """Import numba's array support without the whole of ``scipy.linalg``.
 
-    numba imports that only to see that it is there, which takes a fifth of the time until a first kernel runs, and 12 MB.
-    scipy is a requirement of this package; a kernel that multiplies matrices imports what it needs when it is called.
+    numba imports ``scipy.linalg`` only to check that it exists, which takes a fifth of the time until the first kernel
+    runs, and 12 MB. scipy is a requirement of this package; a kernel that multiplies matrices imports what it needs when
+    it is called.
     """
     linalg: Any = importlib.import_module("numba.np.linalg")
-    looks_for_scipy = linalg.ensure_blas
+    ensure_blas = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
     try:
         importlib.import_module("numba.np.arraymath")
     finally:
-        linalg.ensure_blas = looks_for_scipy
+        linalg.ensure_blas = ensure_blas
 
 
 _import_numba_arrays()
 
 
 def compiled(function: Kernel) -> Kernel:
-    """Compile a function of numbers and plain arrays: cached on disk, and free of the interpreter's lock."""
-    return cast("Kernel", stamped(njit(cache=True, nogil=True)(function)))
+    """Compile a function of numbers and plain arrays: cached on disk, and run without the interpreter's lock."""
+    return cast("Kernel", cached_on_disk(njit(nogil=True)(function)))
 
 
-def stamped(dispatcher: Any) -> Any:
-    """Let numba's disk cache of a dispatcher depend on all project modules that its function can call.
+def compiled_ieee(function: Kernel) -> Kernel:
+    """Compile as `compiled`, with divisions that follow IEEE 754 (x/0 is infinite or NaN, as in numpy arrays).
 
-    Parameters
-    ----------
-    dispatcher : numba dispatcher
-        From ``njit(cache=True, …)``; returned as it is where numba keeps no cache for it.
+    Without numba's test of every divisor a loop over pixels has no branch and becomes vector instructions.
     """
-    cache: Any = getattr(dispatcher, "_cache", None)
-    if isinstance(getattr(cache, "_cache_file", None), caching.IndexDataCacheFile):
-        stamp = source_stamp(dispatcher.py_func.__module__)
-        base = cache._impl.filename_base  # noqa: SLF001
-        cache._cache_file = VerifiedCacheFile(cache.cache_path, base, stamp)  # noqa: SLF001
+    return cast("Kernel", cached_on_disk(njit(nogil=True, error_model="numpy")(function)))
+
+
+def compiled_sums(function: Kernel) -> Kernel:
+    """Compile as `compiled_ieee`, with sums in any order, so that they become vector instructions too."""
+    reordered = {"reassoc", "nsz", "contract"}
+    return cast("Kernel", cached_on_disk(njit(nogil=True, error_model="numpy", fastmath=reordered)(function)))
+
+
+def inner(function: Kernel) -> Kernel:
+    """Compile a function that only other kernels call, with divisions that follow IEEE 754.
+
+    It is cached only as part of the kernels that call it, and has none of the wrappers for callers in Python and C,
+    which would take longer to compile than the function itself.
+    """
+    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+    return cast("Kernel", njit(nogil=True, **options)(function))
+
+
+def cached_on_disk(dispatcher: Any) -> Any:
+    """Let a numba dispatcher keep its machine code on disk; returned unchanged where numba does not compile."""
+    if hasattr(dispatcher, "enable_caching"):
+        dispatcher._cache = KernelCache(dispatcher.py_func)  # noqa: SLF001
     return dispatcher
 
 
-class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
-    """Numba's cache files of one function, each with a checksum: what is damaged is removed and compiled again.
+class KernelLocator:
+    """Where numba keeps the machine code of one function.
 
-    A file that cannot be written is reported in the log, and the function is compiled in each process.
+    In the cache folder, or in ``__pycache__`` beside the source where no cache folder can be made.
+    """
+
+    def __init__(self, function: Any, source: str) -> None:
+        self._line = function.__code__.co_firstlineno
+        self._stamp = source_stamp(function.__module__)
+        versions = (numba.__version__, np.__version__)
+        key = hashlib.sha256(repr((function.__module__, self._stamp, versions)).encode()).hexdigest()[:16]
+        self._folder = kernel_folder(key) or Path(source).parent / "__pycache__"
+
+    @classmethod
+    def from_function(cls, function: Any, source: str) -> KernelLocator:
+        """Return the locator of a function; numba's own way to make one."""
+        return cls(function, source)
+
+    def get_cache_path(self) -> str:
+        """Folder of the cache files."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        """Checksum that the index of the cache must carry."""
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        """Part of the file names that distinguishes functions of one name."""
+        return str(self._line)
+
+    def ensure_cache_path(self) -> None:
+        """Do nothing: the folder is made when a file is written."""
+
+
+class KernelCacheImpl(_NumbaCacheImpl):  # type: ignore[misc]
+    """numba's way to store machine code, with `KernelLocator` as the only place for it."""
+
+    _locator_classes = (KernelLocator,)
+
+
+class KernelCache(_NumbaCache):  # type: ignore[misc]
+    """numba's disk cache of one function, in files that are verified."""
+
+    _impl_class = KernelCacheImpl
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = VerifiedCacheFile(self._cache_path, self._impl.filename_base, stamp)
+
+
+class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
+    """numba's cache files of one function, each with a checksum: a damaged one is removed and compiled again.
+
+    Where a file cannot be written, a warning is logged and each process compiles the function.
     """
 
     def save(self, key: Any, data: Any) -> None:
         """Keep the machine code of a signature."""
+        folder = Path(self._cache_path)
         try:
+            folder.mkdir(parents=True, exist_ok=True)
             super().save(key, data)
         except OSError as error:
-            _log.warning("%s: machine code cannot be kept (%s): compiled each time", self._index_path, error)
+            _warn_not_kept(folder.parent, error.strerror)
+        else:
+            evict(keep=folder)
+
+    def load(self, key: Any) -> Any:
+        """Return the machine code of a signature; None where there is none."""
+        data = super().load(key)
+        if data is not None:
+            mark_used(Path(self._cache_path))
+        return data
 
     def _load_index(self) -> dict[Any, str]:
         try:
             stream = io.BytesIO(self._read(Path(self._index_path)))
-        except FileNotFoundError:
+        except OSError:
             return {}
         if pickle.load(stream) != self._version:  # noqa: S301 (of this package's own cache, as all below)
             return {}  # the rest may not even be readable
@@ -122,8 +206,14 @@ class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
 
 
 @cache
+def _warn_not_kept(folder: Path, reason: str) -> None:
+    """Log, once per folder and reason, that machine code cannot be kept."""
+    _log.warning("%s: machine code cannot be kept (%s): each process compiles it", folder, reason)
+
+
+@cache
 def source_stamp(module: str) -> str:
-    """Checksum of a module's source and of all modules of its own top-level packages that it imports.
+    """Checksum of the sources of a module and of all modules of the same top-level package or `starid` that it imports.
 
     Parameters
     ----------
@@ -143,7 +233,7 @@ def source_stamp(module: str) -> str:
 
 
 def _closure(module: str, roots: set[str]) -> set[str]:
-    """Names of a module and of all that it imports within the root packages."""
+    """Names of a module and of all modules that it imports within the root packages."""
     found: set[str] = set()
     waiting = [module]
     while waiting:
@@ -157,7 +247,7 @@ def _closure(module: str, roots: set[str]) -> set[str]:
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """Names that a module's top-level import statements may mean as modules."""
+    """Names in a module's top-level import statements that may be those of modules."""
     names = []
     for package, members in _IMPORT.findall(_source(module)):
         names.append(package.decode())
@@ -172,8 +262,8 @@ def _source(module: str) -> bytes:
     home = getattr(sys.modules.get(root), "__file__", None)
     if home is None:
         return b""
-    place = Path(home).parent.joinpath(*parts)
-    for path in (place.with_suffix(".py") if parts else Path(home), place / "__init__.py"):
+    stem = Path(home).parent.joinpath(*parts)
+    for path in (stem.with_suffix(".py") if parts else Path(home), stem / "__init__.py"):
         if path.is_file():
             return path.read_bytes()
     return b""

@@ -1,4 +1,4 @@
-"""Missing stars: which catalogue stars should be on a frame and are not."""
+"""Catalogue stars that should be visible on an image and have no detection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from starid.errors import StaridError
 from starid.solution import Solution
 
 COMPLETE_TO: Final = 0.8
-"""Share of the predicted stars found in a magnitude bin down to which a frame counts as complete."""
+"""Least share of the predicted stars detected in a magnitude bin for the bin to count as complete."""
 
 _BIN: Final = 0.5
 _EDGE_PX: Final = 3.0
@@ -28,13 +28,13 @@ class MissingStars:
     Attributes
     ----------
     hip : ndarray (k,) int32
-        Their numbers, brightest first.
+        Hipparcos numbers, brightest first.
     xy_px : ndarray (k, 2)
-        Where they should be.
+        Predicted positions, pixels.
     magnitude : ndarray (k,)
-        Their V.
+        V magnitudes.
     complete_to : float
-        V down to which the frame shows nearly all predicted stars: only brighter ones can be missing.
+        Faintest V to which nearly all predicted stars are detected: only brighter ones can be missing.
     """
 
     hip: NDArray[np.int32]
@@ -46,20 +46,20 @@ class MissingStars:
 def missing_stars(
     solution: Solution, camera: Camera, stars: StarCatalog, xy_px: ArrayLike, *, radius_px: float = 4.0
 ) -> MissingStars:
-    """Stars brighter than what the frame is complete to, inside the field, without a detection near them.
+    """Find the stars in the field, above the completeness limit, without a detection near them.
 
     Parameters
     ----------
     solution : Solution
-        A valid one for the detections.
+        A valid solution of the detections.
     camera : Camera
-        The camera (the solution's refined one takes its place).
+        The camera; a refined one in the solution takes precedence.
     stars : StarCatalog
-        Stars as the camera sees them (`Identifier.stars`).
+        Stars as the camera resolves them (`Identifier.stars`).
     xy_px : array (n, 2)
         All detections, pixels.
     radius_px : float
-        A detection this near, matched or not, speaks for a star.
+        A star with a detection this near, matched or not, is not missing.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def missing_stars(
 
 
 def _complete_to(magnitude: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
-    """Faint end of the last half-magnitude bin of which `COMPLETE_TO` is seen; −inf where there is none."""
+    """Faint end of the last half-magnitude bin that is complete; −inf where none is."""
     limit = -math.inf
     if magnitude.size == 0:
         return limit

@@ -92,16 +92,16 @@ def flux_ratio(magnitude: ArrayLike) -> NDArray[np.float64]:
 
 
 def fitted_share(distance: NDArray[np.float64], brightness_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far towards the common centre of light an unseen companion draws the place fitted to a star.
+    """Share of the way to the common centre of light by which an unresolved companion shifts a star's fitted position.
 
-    The fit of a single spot gives less weight to light at its rim: a faint companion draws it by a Gaussian of the
-    distance; one of about half the star's light
-    or more draws it all the way. Found on rendered pairs, where it holds within 0.1.
+    The fit of a single spot gives less weight to light at its rim: the shift by a faint companion falls as a Gaussian of
+    the distance; a companion with about half the star's light or more shifts it all the way. Fitted to rendered pairs,
+    to within 0.1.
 
     Parameters
     ----------
     distance : ndarray
-        Distance in units of the least at which two stars are told apart (some 2.4 sigma of the spot).
+        Distance over the least distance at which two stars are resolved (some 2.4 sigma of the spot).
     brightness_ratio : ndarray
         Light of the companion over the star's, at most 1.
     """

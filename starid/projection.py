@@ -1,4 +1,4 @@
-"""Projection kernels: direction ↔ pixel for every camera model, on plain arrays, compiled.
+"""Compiled projection between directions and pixels for every camera model, on plain arrays.
 
 A camera is one array of `PARAMETER_COUNT` numbers (made by `starid.camera.Camera.params`), so that other
 compiled kernels can call these without a Python object. Each model maps a direction (x, y, z) of the
@@ -52,7 +52,7 @@ _TINY: Final = 1e-150
 
 @compiled
 def to_plane(model: float, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Plane coordinates of a direction before distortion, and whether the model maps it at all."""
+    """Plane coordinates of a direction before distortion, and whether the model maps it."""
     if model == PINHOLE:
         if z <= 0.0:
             return math.nan, math.nan, False
@@ -159,8 +159,8 @@ def undistort(params: NDArray[np.float64], a: float, b: float) -> tuple[float, f
 def project_one(params: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, bool]:
     """Pixel (u, v) of a direction of the sensor frame, and whether it falls on the pixel array.
 
-    Directions beyond the field, on the one-to-one part of the lens, still get their true position (a
-    renderer needs it for light that spills in); all others get NaN.
+    Directions beyond the field, on the one-to-one part of the lens, still get their true position, which a
+    renderer needs for light that spills in; all others get NaN.
     """
     a, b, mapped = to_plane(params[MODEL], x, y, z)
     if not mapped or a * a + b * b > params[LIMIT2]:

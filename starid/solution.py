@@ -1,4 +1,4 @@
-"""The answer of an identification: attitude, matched stars, uncertainty, and why it is valid or not."""
+"""The result of an identification: attitude, matched stars, uncertainty and validity."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NO_HIP: Final = np.empty(0, dtype=np.int32)
 
 
 class Reason(StrEnum):
-    """Why a solution is what it is; `OK` exactly when it is valid."""
+    """Why a solution is invalid; `OK` if and only if it is valid."""
 
     OK = "ok"
     TOO_FEW_STARS = "too_few_stars"
@@ -39,19 +39,19 @@ def _nan(*shape: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What an identifier found in one set of detections.
+    """The result of identifying one set of detections.
 
     Attributes
     ----------
     valid : bool
-        The attitude passed its verification. Nothing else in here may be flown on when it is False.
+        The attitude passed its verification. When False, no other field may be used for control.
     reason : Reason
         `ok`, or why there is no attitude.
     quaternion_xyzw : ndarray (4,)
         Scalar-last, rotates ICRS into the sensor frame; NaN when invalid.
     detection_index, catalog_index : ndarray (m,) int64
-        Matched pairs: row of the detections given, row of the identifier's `StarCatalog` (the brightest
-        member where several catalogue stars are seen as one).
+        Matched pairs: row of the detections, row of the identifier's `StarCatalog` (the brightest
+        member of a group of unresolved catalogue stars).
     hip : ndarray (m,) int32
         Hipparcos numbers of the matched catalogue stars.
     covariance : ndarray (3, 3)
@@ -59,19 +59,18 @@ class Solution:
     rms_px : float
         Root mean square distance between matched detections and their predicted positions, pixels.
     sigma_px : float
-        Centroid noise per axis that the covariance rests on (estimated, or the scaled mean of what was
-        given), pixels.
+        Centroid noise per axis that the covariance is based on, pixels: estimated, or the scaled mean of
+        the caller's.
     probability_false : float
-        Upper bound on the probability that as good an agreement would have come about by chance anywhere
-        in the search that led to it.
+        Upper bound on the probability that chance produced an agreement as good anywhere in the search.
     elapsed : float
         Seconds spent.
     mode : {"lost_in_space", "tracking"}
-        How it was found.
+        The search that found it.
     rate_rad_s : ndarray (3,) or None
-        Body rate in the sensor frame where a tracker knows it.
+        Body rate in the sensor frame, where a tracker has estimated it.
     camera : Camera or None
-        The camera as refined on the stars, where the field of view was not known exactly.
+        The camera refined on the matched stars, where the field of view was uncertain.
     """
 
     valid: bool
@@ -95,7 +94,7 @@ class Solution:
 
     @classmethod
     def invalid(cls, reason: Reason, *, mode: Mode = "lost_in_space", elapsed: float = 0.0) -> Self:
-        """Answer without an attitude, and why."""
+        """Return an invalid solution with its reason."""
         return cls(valid=False, reason=reason, mode=mode, elapsed=elapsed)
 
     @cached_property

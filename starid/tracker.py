@@ -1,4 +1,4 @@
-"""The tracker: an identifier with a memory of attitude and rate."""
+"""Tracking from frame to frame with any star identifier."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from starid.interface import StarIdentifier
 from starid.solution import Solution
 
 LONGEST_GAP_S: Final = 10.0
-"""After this long without a valid attitude, seconds, a prediction is worth nothing."""
+"""Longest time without a valid attitude over which a prediction is made, seconds."""
 
 
 class Tracker:
@@ -23,11 +23,11 @@ class Tracker:
     Parameters
     ----------
     identifier : StarIdentifier
-        Does the work.
+        The star identifier.
     longest_gap_s : float
         Age of the last valid attitude beyond which the next frame is identified lost in space, seconds.
     window_px : float, optional
-        Passed on to `StarIdentifier.track`.
+        As in `StarIdentifier.track`.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Tracker:
         self.rate_rad_s = None
 
     def predict(self, time_s: float) -> Attitude | None:
-        """Attitude expected at a time; None where there is nothing to go by."""
+        """Predicted attitude at a time; None without a recent valid attitude."""
         gap = time_s - self._time_s
         if self.attitude is None or not 0.0 <= gap <= self._longest_gap_s:
             return None
@@ -76,22 +76,22 @@ class Tracker:
         *,
         rate_hint_rad_s: ArrayLike | None = None,
     ) -> Solution:
-        """Attitude of the detections of one frame.
+        """Identify the detections of one image.
 
         Parameters
         ----------
         xy_px, flux, xy_sigma_px
             As in `StarIdentifier.identify`.
         time_s : float
-            Time of the exposure, seconds on any steady clock.
+            Time of the exposure, seconds on any monotonic clock.
         rate_hint_rad_s : array (3,), optional
-            Body rate from elsewhere (a gyro), sensor frame; it replaces the tracker's own.
+            Body rate from another source such as a gyro, sensor frame; it replaces the tracker's estimate.
 
         Returns
         -------
         Solution
-            With `rate_rad_s` where two valid frames are known. `mode` says how it was found. After an
-            invalid one the last valid attitude is kept for predictions until the gap is too long.
+            With `rate_rad_s` after two valid solutions. After an invalid solution the last valid attitude
+            serves predictions until `longest_gap_s` has passed.
         """
         if rate_hint_rad_s is not None:
             self.rate_rad_s = np.asarray(rate_hint_rad_s, dtype=np.float64)

@@ -69,7 +69,7 @@ def solve_wahba(
     ------
     StaridError
         Fewer than two stars, arrays that do not fit each other, bad weights, an unknown method, or
-        directions that leave the attitude undetermined (all on one line).
+        directions that leave the attitude undetermined (all collinear).
     """
     if method not in _SOLVERS:
         raise StaridError(f"wahba: method {method!r} given, one of {', '.join(METHODS)} needed")
@@ -94,7 +94,7 @@ def solve_wahba(
 def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Matrix:
     """Covariance (3, 3), rad², of the attitude's error as a rotation vector in the sensor frame.
 
-    For directions whose error is isotropic about the line of sight with σᵢ an axis, and weights 1/σᵢ²:
+    For directions whose error is isotropic about the line of sight with σᵢ per axis, and weights 1/σᵢ²:
     ``P = [Σ σᵢ⁻² (I − bᵢ bᵢᵀ)]⁻¹`` (Shuster & Oh 1981).
 
     Parameters

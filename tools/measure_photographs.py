@@ -76,7 +76,7 @@ def _solve(seed: int, defects: dict[str, Any]) -> tuple[float | None, float]:
     from starid.camera import Camera
     from starid.catalog import load_catalog
     from starid.photograph.solver import solve_image
-    from tests.starid.photograph import photograph
+    from tests.starid.photograph.night_sky import photograph
 
     sky = load_catalog()
     mirrored, negative = defects.pop("mirrored", False), defects.pop("negative", False)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude, random_attitude
-from starid.cache import write_atomically
+from starid.files import write_atomically
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.renderer import Renderer

@@ -21,9 +21,9 @@ import numpy.typing as npt
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Frame, Renderer, SensorModel
 from starid.attitude import random_attitude
-from starid.cache import write_atomically
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from starid.files import write_atomically
 from starid.imaging.centroid import star_model
 from starid.imaging.detection import Detections, detect
 

@@ -1,4 +1,4 @@
-"""`starhil cache`: what is kept of earlier computations, and removing it."""
+"""`starhil cache`: show and clear the results of earlier computations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-group = typer.Typer(help="Star catalogue, indices and databases that were computed before and are kept.")
+group = typer.Typer(help="Cached star catalogues, indices, databases and machine code of kernels.")
 
 AS_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -22,29 +22,29 @@ def command(context: typer.Context) -> None:
 
 @group.command("info")
 def info(as_json: AS_JSON = False) -> None:
-    """Show folder, size, limit and files; beyond the limit the least recently used file goes first.
+    """Show folder, size, limit and files; beyond the limit the least recently used is removed first.
 
-    STARHIL_CACHE_DIR names another folder, STARHIL_CACHE_LIMIT_MB another limit.
+    STARHIL_CACHE_DIR sets the folder, STARHIL_CACHE_LIMIT_MB the limit.
     """
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
 
     files = cached_files()
     total = sum(each.size for each in files)
     if as_json:
-        rows = [{"name": each.path.name, "bytes": each.size, "used_unix_s": each.used_s} for each in files]
+        rows = [{"name": each.name, "bytes": each.size, "used_unix_s": each.used_s} for each in files]
         content = {"folder": str(cache_dir()), "bytes": total, "limit_bytes": size_limit(), "files": rows}
         print(json.dumps(content))
         return
     for each in reversed(files):
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(each.used_s))
-        print(f"{each.size / BYTES_PER_MB:8.1f} MB  {used}  {each.path.name}")
+        print(f"{each.size / BYTES_PER_MB:8.1f} MB  {used}  {each.name}")
     limit = size_limit() / BYTES_PER_MB
     print(f"{total / BYTES_PER_MB:8.1f} MB of {limit:g} MB in {len(files)} files in {cache_dir()}")
 
 
 @group.command("clear")
 def clear() -> None:
-    """Remove all cached files; they are computed again when they are needed."""
+    """Remove all cached files; they are computed again when needed."""
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, remove
 
     files = cached_files()

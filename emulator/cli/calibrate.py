@@ -61,7 +61,7 @@ def command(
         print(json.dumps(_report(images, result)), file=report_stream(output))
     else:
         _show(images, output, result)
-    if result.refused:
+    if result.unidentified:
         raise typer.Exit(1)
 
 
@@ -112,7 +112,7 @@ def _report(images: list[Path], result: SelfCalibration) -> dict[str, Any]:
             }
             for index, attitude, used, residual in frames
         ],
-        "refused": {str(images[index]): reason for index, reason in result.refused.items()},
+        "refused": {str(images[index]): reason for index, reason in result.unidentified.items()},
     }
 
 

@@ -52,7 +52,7 @@ def export(
 def _write(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     from starhil.emulator.errors import EmulatorError
-    from starid.cache import write_atomically
+    from starid.files import write_atomically
 
     prepare_output(path, "-o")
     try:

@@ -222,7 +222,7 @@ class Picture:
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
             detected=len(found.flux),
-            refused=found.refused,
+            refused=found.rejected,
             matched=solution.star_count,
             stars=tuple(stars[:STARS_SENT]),
             probability_false=solution.probability_false if valid else 1.0,

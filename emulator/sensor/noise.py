@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 LANES: Final = 512
 """Random generators that run side by side; pixels are made in blocks of twice as many."""
@@ -74,7 +74,7 @@ def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
     return np.frombuffer(bits.tobytes(), dtype=np.uint32).reshape(4, LANES).copy()
 
 
-@compiled_loops
+@compiled_ieee
 def _next_bits(state: npt.NDArray[np.uint32], out: npt.NDArray[np.uint32]) -> None:
     """One xoshiro128++ step of every lane."""
     for lane in range(LANES):
@@ -97,7 +97,7 @@ def _next_bits(state: npt.NDArray[np.uint32], out: npt.NDArray[np.uint32]) -> No
         state[3, lane] = s3
 
 
-@compiled_loops
+@compiled_ieee
 def fill_normal(
     state: npt.NDArray[np.uint32],
     bits_a: npt.NDArray[np.uint32],
@@ -166,7 +166,7 @@ def fill_normal(
         normal[LANES + lane] = uniform[lane]
 
 
-@compiled_loops
+@compiled_ieee
 def _digitize_kernel(
     expected: npt.NDArray[np.float32],
     state: npt.NDArray[np.uint32],

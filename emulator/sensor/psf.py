@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 MOST_GAUSS_NODES: Final = 200
 MOST_NODES: Final = 20_000
@@ -56,7 +56,7 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
     )
 
 
-@compiled_loops
+@compiled_ieee
 def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -> None:
     """Shares of a Gaussian at 0 that fall in `count` unit cells, the first of which begins at `edge`."""
     scale = _SQRT_HALF / sigma
@@ -67,7 +67,7 @@ def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -
         before = after
 
 
-@compiled_loops
+@compiled_ieee
 def add_spots(
     image: npt.NDArray[np.float32],
     sensitivity: npt.NDArray[np.float32],

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 Image = npt.NDArray[np.float32]
 
@@ -52,7 +52,7 @@ def icrs_vector(ra_deg: float, dec_deg: float) -> npt.NDArray[np.float64]:
     return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
 
 
-@compiled_loops
+@compiled_ieee
 def _add_glare(
     image: Image,
     directions: Image,

@@ -1,4 +1,4 @@
-"""The end of an identification in the kernels: test, refine, judge; covariance, quaternion and pairs."""
+"""Test, refinement and verification of a candidate attitude, and the kernels' answer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
 from starid.geometric.pattern_index import IndexArrays
 from starid.geometric.refinement import (
@@ -29,13 +28,14 @@ from starid.geometric.settings import (
     SIGMAS_KNOWN,
 )
 from starid.geometric.verification import log_false_probability, worth_refining
+from starid.jit import inner
 
 LEAST_MATCHED: Final = 4
-"""Matches that an answer needs."""
+"""Least number of matches of an answer."""
 
 
 class Answer(NamedTuple):
-    """What a kernel hands back to Python.
+    """Result of a kernel.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Answer(NamedTuple):
     pairs : ndarray (2, m) int64
         Matched rows of the detections, and of the index's stars.
     numbers : ndarray (6,)
-        rms (px), noise (px), logarithm of the bound on a false answer, scale, triangles, candidates.
+        rms (px), noise (px), logarithm of the bound on the probability of a false answer, scale, triangles, candidates.
     """
 
     status: int
@@ -78,39 +78,39 @@ class Candidate(NamedTuple):
 
 @inner
 def new_candidate(count: int) -> Candidate:
-    """Workspace for so many detections."""
+    """Workspace for a number of detections."""
     stars = np.empty(count, dtype=np.int64)
     return Candidate(np.empty((3, 3, 3)), stars, np.empty((4, 4)), np.empty(NUMBERS))
 
 
 @inner
-def judged(
+def test_and_refine(
     index: IndexArrays,
     raw: Raw,
-    given: Table,
+    observed: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
     tests: tuple[NDArray[np.float64], NDArray[np.int64]],
     used: tuple[int, int, int],
     prior_volume: float,
 ) -> tuple[int, float]:
-    """Test, refine and judge the attitude in ``candidate.frames[2]``.
+    """Test, refine and verify the attitude in ``candidate.frames[2]``.
 
     Parameters
     ----------
     candidate : Candidate
-        Rotation, scale and zero point are set.
+        Rotation, scale and zero point must be set.
     tests : (odds, order)
         From `starid.geometric.verification.hit_odds` and `test_order`.
     used : (int, int, int)
-        Detections that the attitude was made from.
+        Detections that the attitude was derived from.
     prior_volume : float
         As in `log_false_probability`.
 
     Returns
     -------
     matched : int
-        Stars matched; 0 for a candidate that fell through.
+        Stars matched; 0 for a rejected candidate.
     bound : float
         Logarithm of the bound on the probability of a false answer.
     """
@@ -118,12 +118,21 @@ def judged(
     faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
     odds, order = tests
     if not worth_refining(
-        index, raw.params, given, rotation, numbers[SCALE], faintest, settings, odds, order, used
+        index, raw.params, observed, rotation, numbers[SCALE], faintest, settings, odds, order, used
     ):
         return 0, 0.0
-    seen = np.empty_like(given) if settings[SCALE_TOLERANCE] > 0.0 else given
+    seen = np.empty_like(observed) if settings[SCALE_TOLERANCE] > 0.0 else observed
     matched = refine(
-        index, raw, given, settings, LEAST_MATCHED, seen, rotation, candidate.stars, candidate.normal, numbers
+        index,
+        raw,
+        observed,
+        settings,
+        LEAST_MATCHED,
+        seen,
+        rotation,
+        candidate.stars,
+        candidate.normal,
+        numbers,
     )
     if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
         return 0, 0.0
@@ -161,20 +170,20 @@ def quaternion_of(m: NDArray[np.float64], q: NDArray[np.float64]) -> None:
 
 
 @inner
-def finish(
+def make_answer(
     status: int,
-    given: Table,
+    observed: Table,
     candidate: Candidate,
     settings: NDArray[np.float64],
     bound: float,
     triangles: int,
     candidates: int,
 ) -> Answer:
-    """Turn a candidate that stands (or, with a status other than `ACCEPTED`, nothing) into an answer.
+    """Make the answer of an accepted candidate, or an empty one for any other status than `ACCEPTED`.
 
     The covariance is the inverse normal matrix times the variance of unit weight. That is estimated from the
     residuals with ν degrees of freedom and multiplied by ν/(ν − 2), which makes it the covariance of the
-    (Student) posterior; errors given by the caller count as further degrees of freedom.
+    (Student) posterior; the caller's errors count as additional degrees of freedom.
     """
     numbers = candidate.numbers
     quaternion, covariance = np.full(4, math.nan), np.full((3, 3), math.nan)
@@ -190,9 +199,9 @@ def finish(
     filled = 0
     for i in range(candidate.stars.shape[0]):
         if candidate.stars[i] >= 0:
-            pairs[0, filled] = np.int64(given[i, SOURCE])
+            pairs[0, filled] = np.int64(observed[i, SOURCE])
             pairs[1, filled] = candidate.stars[i]
-            mean_sigma2 += 0.5 * (given[i, SIGMA_U] ** 2 + given[i, SIGMA_V] ** 2) / m
+            mean_sigma2 += 0.5 * (observed[i, SIGMA_U] ** 2 + observed[i, SIGMA_V] ** 2) / m
             filled += 1
     freedom = float(max(2 * m - (4 if settings[SCALE_TOLERANCE] > 0.0 else 3), 1))
     variance = numbers[VARIANCE]

@@ -1,8 +1,7 @@
-"""The geometric identifier: verified triangles of bright stars, over the whole sky, for any camera.
+"""The geometric star identifier: verified triangles of bright stars, over the whole sky, for any camera.
 
-How it finds an attitude that it knows nothing of (`starid.geometric.search`), follows one (`starid.geometric.tracking`), what it
-believes (`starid.geometric.verification`) and how it polishes (`starid.geometric.refinement`) stand in those modules; here they
-are put together for a camera and a catalogue.
+It combines the lost-in-space search (`starid.geometric.search`), tracking (`starid.geometric.tracking`), refinement
+(`starid.geometric.refinement`) and verification (`starid.geometric.verification`) for one camera and one catalogue.
 """
 
 from __future__ import annotations
@@ -49,43 +48,43 @@ from starid.geometric.settings import (
     WINDOW,
 )
 from starid.geometric.tracking import track_kernel
-from starid.geometric.validation import checked_detections
 from starid.geometric.verification import ROTATIONS
 from starid.solution import Mode, Reason, Solution
+from starid.solver_input import checked_detections
 
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
 WIDEST_TOLERANCE: Final = 0.3
 MOST_PART_STARS: Final = 30
 _QUICK_TRIANGLES: Final = 60
-"""Triangles tried at each of several focal lengths before any gets the whole effort."""
+"""Triangles tried at each focal length before any is searched in full."""
 
 _SCALE_ERROR: Final = 0.012
-"""Difference of scale across the field that the look-up of triangles bears."""
+"""Largest difference of scale across the field at which triangles are still found."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How the search is bounded.
+    """Bounds of the search.
 
     Attributes
     ----------
     tolerance_px : float
         Largest error of a triangle's side, pixels.
     window_px : float
-        First matching window, pixels; a third of it is the largest centroid noise believed.
+        First matching window, pixels; a third of it is the largest centroid noise accepted.
     test_window_px : float
         Window in which a candidate attitude is tested, pixels.
     magnitude_gate : float
-        Largest deviation of a star's magnitude from what its flux says.
+        Largest deviation of a star's catalogue magnitude from the one of its flux.
     max_triangles : int
-        Triangles of detections looked up before giving up on the field as a whole.
+        Most triangles of detections looked up over the whole field.
     part_stars : int
-        Brightest detections of each part of the field, quadrants and middle, of which every triangle is
-        tried after that; 0 for none.
+        Brightest detections in each quadrant and the middle of the field of which every triangle is tried
+        after that; 0 skips this stage.
     max_false_probability, max_false_probability_tracking : float
-        Largest bound on the probability of a false answer that is accepted, lost in space and near a
-        predicted attitude.
+        Largest accepted bound on the probability of a false solution, lost in space and near a predicted
+        attitude.
     """
 
     tolerance_px: float = 4.0
@@ -107,7 +106,7 @@ class Effort:
                 raise StaridError(f"identifier {field.name}: {value} given, a positive number needed")
 
     def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
-        """Settings for the kernels (`starid.geometric.settings`) with this camera, its focal length known."""
+        """Settings of the kernels (`starid.geometric.settings`) for a camera of known focal length."""
         numbers = np.zeros(SETTING_COUNT)
         numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
         numbers[MAGNITUDE_GATE] = self.magnitude_gate
@@ -124,33 +123,32 @@ class Effort:
 
 
 class Identifier:
-    """Star identification for one camera against one catalogue.
+    """Star identification for one camera and one catalogue.
 
     Parameters
     ----------
     camera : Camera
-        What the detections were taken with.
+        The camera that took the images.
     catalog : StarCatalog, optional
-        Default: the whole of Hipparcos at its default epoch.
+        By default the whole of Hipparcos at its default epoch.
     limiting_magnitude : float, optional
-        Faintest V in the index; by default what gives some 200 stars a field, at least 6.
+        Faintest V in the index; by default some 200 stars per field, at least V 6.
     fov_tolerance : float
-        Relative uncertainty of the focal length, 0 where it is calibrated. Solutions then carry the refined
-        camera.
+        Relative uncertainty of the focal length, 0 for a calibrated camera. Otherwise solutions carry the
+        refined camera.
     blend_px : float
-        Stars closer than this are seen as one.
+        Stars closer than this are merged, pixels.
     effort : Effort
         Bounds of the search.
     index_camera : Camera, optional
-        Camera whose index is taken, one of a rounded field say, so that similar cameras share one; by default
-        the camera itself.
+        Camera whose index is used, so that similar cameras share one; by default the camera itself.
     cache : bool or path
-        Keep the index on disk: in the cache folder, in a folder given, or not at all.
+        Whether the index is kept in the cache folder, or the folder to keep it in.
 
     Raises
     ------
     StaridError
-        A value is out of its range, or the catalogue has too few stars for the field.
+        A value is out of range, or the catalogue has too few stars for the field.
     """
 
     def __init__(
@@ -180,10 +178,10 @@ class Identifier:
         self._stars = seen_stars(self._catalog, limiting_magnitude, settings.blend_rad)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
         self._index = obtain_index(self._stars, settings, cache)
-        self._set_camera(camera, fov_tolerance, effort)
+        self._configure(camera, fov_tolerance, effort)
 
-    def _set_camera(self, camera: Camera, fov_tolerance: float, effort: Effort) -> None:
-        """Set what depends on the camera and on the bounds of the search."""
+    def _configure(self, camera: Camera, fov_tolerance: float, effort: Effort) -> None:
+        """Set everything that depends on the camera or the bounds of the search."""
         self._camera = camera
         self._fov_tolerance = fov_tolerance
         self._effort = effort
@@ -199,12 +197,12 @@ class Identifier:
 
     @property
     def catalog(self) -> StarCatalog:
-        """The catalogue that `Solution.catalog_index` counts in."""
+        """The catalogue whose rows `Solution.catalog_index` refers to."""
         return self._catalog
 
     @property
     def stars(self) -> StarCatalog:
-        """The stars of the index as the camera sees them: doubles merged, brightest first."""
+        """The stars of the index as the camera resolves them: doubles merged, brightest first."""
         return self._stars
 
     @property
@@ -213,22 +211,17 @@ class Identifier:
         return sum(part.nbytes for part in self._index)
 
     def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
-        """Lost in space: attitude without any knowledge of it.
+        """Find the attitude without any prior knowledge (lost in space).
 
         Parameters
         ----------
-        xy_px : array (n, 2)
-            Positions, pixels.
-        flux : array (n,)
-            Brightness in any linear unit.
-        xy_sigma_px : array (n,) or (n, 2), optional
-            One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
-            the residuals when not given.
+        xy_px, flux, xy_sigma_px
+            As in `starid.interface.StarIdentifier.identify`.
 
         Raises
         ------
         StaridError
-            The arrays do not fit each other, or hold values that are not finite.
+            The shapes of the arrays disagree, or a value is not finite.
         """
         begin = time.perf_counter()
         xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
@@ -248,8 +241,8 @@ class Identifier:
     ) -> Solution:
         """Try focal lengths from the nominal one outward, each with its share of the tolerance.
 
-        All of them get a little effort before any gets the whole. Each bounds the probability of a false answer
-        of its own: the bound on that of any of them is as many times as high.
+        A short search at every focal length comes before the full one. Each search bounds its own probability of a
+        false solution; the bound of the whole is the sum over the focal lengths.
         """
         steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
         share = self._fov_tolerance / (2 * steps - 1)
@@ -284,49 +277,45 @@ class Identifier:
         *,
         window_px: float | None = None,
     ) -> Solution:
-        """Attitude near a predicted one; invalid, with the reason, where it does not hold.
+        """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
-            As in `identify`.
-        predicted : Attitude or array (4,)
-            Attitude expected at the time of the exposure, or its scalar-last quaternion.
-        window_px : float, optional
-            Largest distance of a star from where the prediction puts it, pixels (`TRACKING_WINDOW_PX`).
+        xy_px, flux, predicted, xy_sigma_px, window_px
+            As in `starid.interface.StarIdentifier.track`; the window is `TRACKING_WINDOW_PX` by default.
 
         Raises
         ------
         StaridError
-            The arrays do not fit each other, or hold values that are not finite.
+            As in `identify`, or the window is not positive.
         """
         window = TRACKING_WINDOW_PX if window_px is None else window_px
-        return self._near(xy_px, flux, predicted, xy_sigma_px, window, anywhere=False)
+        return self._identify_near(xy_px, flux, predicted, xy_sigma_px, window, anywhere=False)
 
     def verify(
         self,
         xy_px: ArrayLike,
         flux: ArrayLike,
-        suspected: Attitude | ArrayLike,
+        candidate: Attitude | ArrayLike,
         xy_sigma_px: ArrayLike | None = None,
         *,
         window_px: float,
     ) -> Solution:
-        """Attitude near one that somebody picked from the whole sky: held to what `identify` demands.
+        """Verify an attitude that was selected from the whole sky, as strictly as `identify` does.
 
         Parameters
         ----------
-        xy_px, flux, suspected, xy_sigma_px, window_px
-            As in `track`. That the attitude is near the suspected one is no evidence for it.
+        xy_px, flux, candidate, xy_sigma_px, window_px
+            As in `track`. That the attitude is near the candidate one is no evidence for it.
 
         Raises
         ------
         StaridError
             As in `track`.
         """
-        return self._near(xy_px, flux, suspected, xy_sigma_px, window_px, anywhere=True)
+        return self._identify_near(xy_px, flux, candidate, xy_sigma_px, window_px, anywhere=True)
 
-    def _near(
+    def _identify_near(
         self,
         xy_px: ArrayLike,
         flux: ArrayLike,
@@ -336,7 +325,7 @@ class Identifier:
         *,
         anywhere: bool,
     ) -> Solution:
-        """Look near an attitude, which is worth something beforehand or (`anywhere`) is not."""
+        """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`)."""
         begin = time.perf_counter()
         xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
         if not 0.0 < window_px < math.inf:
@@ -344,7 +333,7 @@ class Identifier:
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
         window = window_px / self._px_per_rad
-        prior = self._turns_within(window)
+        prior = self._rotation_volume(window)
         if anywhere:
             prior, numbers = ROTATIONS, numbers.copy()
             numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
@@ -353,14 +342,14 @@ class Identifier:
         )
         return self._solution(answer, "tracking", begin)
 
-    def _turns_within(self, window_rad: float) -> float:
-        """Volume of the turns that leave every star of the field within a window, rad³."""
+    def _rotation_volume(self, window_rad: float) -> float:
+        """Volume of the rotations that keep every star of the field within a window, rad³."""
         # a star at the border of the field stays within it after a roll of window/(field's radius)
         radius = math.sqrt(self._camera.width * self._camera.height / math.pi) / self._px_per_rad
         return min(2.0 * math.pi * window_rad**2 * min(window_rad / radius, math.pi), ROTATIONS)
 
     def warm_up(self) -> None:
-        """Compile, or load, the kernels, so that the first real frame is not late."""
+        """Compile or load the kernels, so that the first image is not delayed."""
         xy = self._camera.border(2)[:6]
         self.identify(xy, np.ones(6))
         self.track(xy, np.ones(6), Attitude.identity())
@@ -368,7 +357,7 @@ class Identifier:
     def with_camera(
         self, camera: Camera, *, fov_tolerance: float = 0.0, effort: Effort | None = None
     ) -> Identifier:
-        """Identifier for a camera like this one (same size, focal length within the tolerance), sharing the index.
+        """Identifier that shares the index, for a camera of the same size and a focal length within the tolerance.
 
         Parameters
         ----------
@@ -377,7 +366,7 @@ class Identifier:
         fov_tolerance : float
             Relative uncertainty of its focal length.
         effort : Effort, optional
-            Bounds of its search, by default those of this one; no window may be wider than this one's.
+            Bounds of its search, by default those of this identifier; no window may be wider.
         """
         if (camera.width, camera.height) != (self._camera.width, self._camera.height):
             raise StaridError(
@@ -386,7 +375,7 @@ class Identifier:
             )
         other = object.__new__(Identifier)
         other.__dict__.update(self.__dict__)
-        other._set_camera(camera, fov_tolerance, effort or self._effort)
+        other._configure(camera, fov_tolerance, effort or self._effort)
         return other
 
     def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
@@ -413,7 +402,7 @@ class Identifier:
 
 
 def _scale_variation(camera: Camera) -> float:
-    """How differently the sides of triangles scale across the field, per relative change of the focal length."""
+    """Spread across the field of the scale of triangles' sides, per relative change of the focal length."""
     angle = min(camera.field_radius_rad, 0.5 * math.pi)
     if camera.model == "pinhole":
         return 2.0 * math.sin(angle) ** 2
@@ -421,6 +410,6 @@ def _scale_variation(camera: Camera) -> float:
 
 
 def scaled_camera(camera: Camera, factor: float) -> Camera:
-    """Camera with the focal length times a factor."""
+    """Camera with the focal length multiplied by a factor."""
     fx, fy = camera.focal_px
     return dataclasses.replace(camera, focal_px=(fx * factor, fy * factor))

@@ -1,4 +1,4 @@
-"""Which index suits a camera: depth, pattern size and fineness from its field and its pixels."""
+"""The index that suits a camera: its depth, pattern size and resolution from the field and the pixels."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ from starid.geometric.pattern_index import (
 )
 
 STARS_PER_FIELD: Final = 200
-"""Catalogue stars a field, on the average, that the default limiting magnitude aims at."""
+"""Mean number of catalogue stars per field at the default limiting magnitude."""
 
 BRIGHTEST_LIMIT: Final = 6.0
 FAINTEST_LIMIT: Final = 9.0
-"""The default limiting magnitude stays between these: Hipparcos thins out beyond the second."""
+"""Range of the default limiting magnitude: Hipparcos is incomplete beyond the second."""
 
 BRIGHT_QUOTA: Final = 5
 LARGEST_QUOTA: Final = 20
 SMALLEST_QUOTA: Final = 6
-"""Pattern stars in half the field's area: a few bright ones, and deep ones, many where the index allows."""
+"""Pattern stars in half the field's area: a few bright ones, and as many deep ones as the size of the index allows."""
 
 MOST_BRIGHT: Final = 120_000
 MOST_DEEP: Final = 420_000
-"""Triangles at most, about, of bright and of deep pattern stars."""
+"""Approximate limits of the numbers of triangles of bright and of deep pattern stars."""
 
 BRIGHT_SIDES: Final = (0.04, 1.3)
 DEEP_SIDES: Final = (0.12, 0.95)
-"""Shortest and longest side as shares of the field's width; narrow fields stop short of the longest."""
+"""Shortest and longest side as shares of the field's width; narrow fields have a smaller longest side."""
 
 MIDDLE_SIDE: Final = 0.5
-"""Rather fewer deep pattern stars than triangles that must be smaller than this share."""
+"""The number of deep pattern stars is reduced rather than their longest side below this share."""
 
 SIDE_BINS: Final = 128
 _STARS_PER_QUOTA: Final = 30.0
-"""Pattern stars of the whole sky, times the field's solid angle, over the quota; found by building."""
+"""Pattern stars of the whole sky, times the field's solid angle, over the quota; measured on indices."""
 
 _TRIANGLES_PER_QUOTA2: Final = 6.0
-"""Triangles a pattern star over (quota² · (longest side / width)⁴); found by building."""
+"""Triangles per pattern star over (quota² · (longest side / width)⁴); measured on indices."""
 
 
 def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> float:
-    """V to which a field holds `STARS_PER_FIELD` on the average, in steps of ¼, within 6…9."""
+    """V at which a field holds `STARS_PER_FIELD` on average, in steps of ¼, within 6…9."""
     wanted = STARS_PER_FIELD * 4.0 * math.pi / field_area_sr
     row = min(int(wanted), len(catalog)) - 1
     limit = math.ceil(4.0 * float(catalog.v[row])) / 4.0
@@ -79,11 +79,11 @@ def index_settings(
     Parameters
     ----------
     camera, catalog
-        What it is for.
+        Camera and catalogue of the index.
     limiting_magnitude : float
         Faintest V.
     blend_px, window_px : float
-        Distance within which two stars are seen as one, and the largest matching window, pixels.
+        Distance below which two stars are merged, and the largest matching window, pixels.
     """
     area = field_solid_angle(camera)
     width = math.sqrt(area)
@@ -109,22 +109,22 @@ def index_settings(
 
 
 def _longest_share(triangles: int, quota: int, area: float) -> float:
-    """Longest side, as a share of the field's width, that gives about so many triangles."""
+    """Longest side, as a share of the field's width, that yields about a number of triangles."""
     per_star = triangles * area / (_STARS_PER_QUOTA * quota)
     return float((per_star / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25)
 
 
 def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str | Path) -> IndexArrays:
-    """Map the index from the cache, or build it and keep it there.
+    """Map the index from the cache, or build and cache it.
 
     Parameters
     ----------
     stars : StarCatalog
-        As `starid.geometric.pattern_index.seen_stars` gives them.
+        From `starid.geometric.pattern_index.seen_stars`.
     settings : IndexSettings
-        What to build.
+        Settings of the index.
     cache : bool or path
-        The cache folder, a folder given, or (False) memory only.
+        True for the cache folder, a path for another folder, False for memory only.
     """
     text = repr((INDEX_VERSION, stars.identity, astuple(settings)))
     key = hashlib.sha256(text.encode()).hexdigest()[:16]

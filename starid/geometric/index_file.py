@@ -1,4 +1,4 @@
-"""The identification index on disk: written whole or not at all, checked, and mapped into memory.
+"""The identification index on disk: written atomically, verified by a checksum, and mapped into memory.
 
 Layout: magic, length of the header (u64, little-endian), header (JSON: key, checksum of the data, name,
 dtype, shape and offset of each array), then the arrays, each beginning on a multiple of 64 bytes.
@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.cache import write_atomically
+from starid.files import write_atomically
 from starid.geometric.pattern_index import IndexArrays
 
 _log = logging.getLogger(__name__)
@@ -72,19 +72,19 @@ def unpack(buffer: bytes | mmap.mmap, key: str) -> IndexArrays:
 
 
 def load(path: Path, key: str) -> IndexArrays | None:
-    """Map an index file; None, with a warning in the log, where it is damaged or foreign."""
+    """Map an index file; None, with a warning in the log, where it is damaged or of another index."""
     try:
         with path.open("rb") as stream:
             return unpack(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), key)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        _log.warning("index file %s is not usable (%s): built anew", path, error)
+        _log.warning("index file %s is not usable (%s): built again", path, error)
         return None
 
 
 def store(path: Path, arrays: IndexArrays, key: str) -> IndexArrays:
-    """Write an index file and map it; where that fails the index is kept in memory."""
+    """Write an index file and map it; where that fails the index stays in memory."""
     content = pack(arrays, key)
     try:
         write_atomically(path, lambda part: _write(part, content))

@@ -1,4 +1,4 @@
-"""Look-up of triangles in the index by their sides."""
+"""Lookup of triangles in the index by their sides."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.pattern_index import SIDE_BINS, SIDE_STEP, SIDE_STEPS, IndexArrays, pattern_row
+from starid.jit import inner
 
 
 @inner
 def _first_at_least(sides: NDArray[np.uint16], begin: int, end: int, shortest: int) -> int:
-    """First triangle of a run whose shortest side is at least so long; `end` where there is none."""
+    """First triangle of a run whose shortest side has at least a length; `end` where there is none."""
     while begin < end:
         middle = (begin + end) >> 1
         if int(np.int64(sides[middle, 2])) < shortest:
@@ -24,7 +24,7 @@ def _first_at_least(sides: NDArray[np.uint16], begin: int, end: int, shortest: i
 
 
 @inner
-def look_up(
+def find_triangles(
     index: IndexArrays,
     triangle: tuple[float, float, float],
     hand: int,
@@ -32,9 +32,9 @@ def look_up(
     spread: float,
     found: NDArray[np.int64],
 ) -> int:
-    """Fill in the index's triangles with the given sides, longest first; return how many.
+    """Find the triangles of the index with three sides, longest first, within a tolerance; return their number.
 
-    With a `spread` the sides may all be longer or shorter by one factor within 1 ± spread.
+    With a `spread` the sides may be scaled by a common factor within 1 ± spread.
     """
     sides, row_start = index.sides, index.row_start
     bins, steps = int(index.numbers[SIDE_BINS]), 1.0 / index.numbers[SIDE_STEP]

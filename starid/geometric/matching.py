@@ -1,4 +1,4 @@
-"""Match detections to catalogue stars near where an attitude puts them."""
+"""Matching of detections to catalogue stars under an attitude."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.observation import (
     MAGNITUDE,
     SIGMA_U,
@@ -26,13 +25,14 @@ from starid.geometric.observation import (
 )
 from starid.geometric.pattern_index import GRID_CELLS, GRID_MARGIN, STAR_MAGNITUDE, IndexArrays
 from starid.geometric.sky_grid import cell_of
+from starid.jit import inner
 
 WINDOW_SIGMAS: Final = 4.0
 """Half-width of a matching window in units of the centroid noise."""
 
 SMALLEST_WINDOW_PX: Final = 0.15
 BY_NOISE: Final = 0.0
-"""Reach that stands for windows of `WINDOW_SIGMAS` times each detection's noise."""
+"""Value of the reach that selects windows of `WINDOW_SIGMAS` times each detection's noise."""
 
 
 @inner
@@ -67,7 +67,7 @@ def residual(
 
 @inner
 def middle_value(values: NDArray[np.float64], count: int) -> float:
-    """Median (the lower one of an even number) of the first `count` values, which it reorders (quickselect)."""
+    """Median (the lower one of an even number) of the first `count` values, reordered in place (quickselect)."""
     low, high, middle = 0, count - 1, (count - 1) // 2
     while low < high:
         pivot = values[(low + high) // 2]
@@ -134,7 +134,7 @@ def match_detections(
     index: IndexArrays,
     seen: Table,
     rotation: NDArray[np.float64],
-    refused: NDArray[np.bool_],
+    excluded: NDArray[np.bool_],
     windows: tuple[float, float, float, float],
     zero_point: float,
     scatter: float,
@@ -142,24 +142,24 @@ def match_detections(
     costs: NDArray[np.float64],
     owners: NDArray[np.int64],
 ) -> int:
-    """Match each detection to the likeliest star in its window; return how many.
+    """Match each detection to the likeliest star in its window; return the number of matches.
 
-    The likeliest has the least ``(r/σ)² + (Δm/s)²``. A star claimed twice stays with the cheaper claim.
+    The likeliest star has the least cost ``(r/σ)² + (Δm/s)²``. Of two detections of one star the cheaper one keeps it.
 
     Parameters
     ----------
-    refused : ndarray (n,) of bool
-        Detections that are not to be matched.
+    excluded : ndarray (n,) of bool
+        Detections that are not matched.
     windows : (reach, sigma, gate, px_per_rad)
-        Window in pixels, the same for all, or `BY_NOISE`; noise of a detection of unit error, pixels;
-        largest deviation from the expected magnitude; least pixels per radian in the field, for the first
+        Window of all detections in pixels, or `BY_NOISE`; noise of a detection of unit error, pixels;
+        largest deviation from the expected magnitude; least pixels per radian in the field, for a first
         coarse test.
     zero_point, scatter : float
         Catalogue minus instrumental magnitude, and its scatter s.
     stars, costs : ndarray (n,)
         Filled: index star or −1, and its cost.
     owners : ndarray of a power of two, > 2·n
-        Workspace: an open hash of star → detection.
+        Workspace: an open-addressing hash of star → detection.
     """
     mask = owners.shape[0] - 1
     for slot in range(owners.shape[0]):
@@ -168,7 +168,7 @@ def match_detections(
         stars[i] = -1
     matched = 0
     for i in range(stars.shape[0]):
-        if refused[i]:
+        if excluded[i]:
             continue
         best, best_cost = _best_star(index, seen, rotation, i, windows, zero_point, scatter)
         if best < 0:

@@ -1,4 +1,4 @@
-"""Detections as the identification kernels see them: one table of directions, gradients and magnitudes."""
+"""The table of detections in the identification kernels: directions, gradients and magnitudes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
+from starid.jit import inner
 from starid.projection import (
     CX,
     CY,
@@ -47,21 +47,21 @@ SIGMA_U: Final = 10
 SIGMA_V: Final = 11
 """One-sigma errors of column and row, pixels, or in units of an unknown common one."""
 SOURCE: Final = 12
-"""Row of the detection as given."""
+"""Row of the detection in the caller's arrays."""
 OFFSET_U: Final = 13
 OFFSET_V: Final = 14
 """Position from the camera's centre, pixels."""
 COLUMNS: Final = 15
 
 NOWHERE: Final = 1e-9
-"""Length of the direction of a detection that sees none."""
+"""Length of the direction of a detection outside the image circle."""
 
 FAINTEST: Final = 99.0
 """Instrumental magnitude of a detection without positive flux."""
 
 
 class Raw(NamedTuple):
-    """What the caller gave: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
+    """Input of the caller: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
 
     params: NDArray[np.float64]
     xy: NDArray[np.float64]
@@ -71,7 +71,7 @@ class Raw(NamedTuple):
 
 @inner
 def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Rows by falling flux (Shell sort, gaps of Ciura); equal ones keep no particular order."""
+    """Rows by falling flux (Shell sort, gaps of Ciura); the order of equal ones is undefined."""
     n = flux.shape[0]
     order = np.empty(n, dtype=np.int64)
     for i in range(n):
@@ -88,8 +88,10 @@ def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @inner
-def look(params: NDArray[np.float64], scale: float, column: float, row: float, table: Table, n: int) -> bool:
-    """Fill in direction and gradients of a position, the focal length divided by `scale`; False if unseen."""
+def fill_direction(
+    params: NDArray[np.float64], scale: float, column: float, row: float, table: Table, n: int
+) -> bool:
+    """Fill in direction and gradients of a position, the focal length divided by `scale`; False outside the image circle."""
     fx, fy, model = params[FX] / scale, params[FY] / scale, params[MODEL]
     a, b = (column - params[CX]) / fx, (row - params[CY]) / fy
     j11, j12, j22 = 1.0, 0.0, 1.0
@@ -120,13 +122,13 @@ def look(params: NDArray[np.float64], scale: float, column: float, row: float, t
 
 @inner
 def observe(raw: Raw) -> Table:
-    """Sort detections by falling flux and look along them; those that see no direction are left out."""
+    """Sort detections by falling flux and compute their directions; those outside the image circle are left out."""
     order = by_falling_flux(raw.flux)
     params, xy, flux, sigmas = raw.params, raw.xy, raw.flux, raw.sigmas
     table = np.empty((flux.shape[0], COLUMNS))
     n = 0
     for row in order:
-        if not look(params, 1.0, xy[row, 0], xy[row, 1], table, n):
+        if not fill_direction(params, 1.0, xy[row, 0], xy[row, 1], table, n):
             continue
         table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
         table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
@@ -137,22 +139,22 @@ def observe(raw: Raw) -> Table:
 
 
 @inner
-def observe_again(raw: Raw, given: Table, scale: float, seen: Table) -> None:
+def observe_again(raw: Raw, observed: Table, scale: float, seen: Table) -> None:
     """Fill `seen` with the same detections under a focal length divided by `scale`.
 
-    A detection that sees no direction then gets one of no length to speak of: it lies near no star.
+    A detection outside the image circle gets a direction of length `NOWHERE`, which is near no star.
     """
-    for i in range(given.shape[0]):
+    for i in range(observed.shape[0]):
         for column in range(COLUMNS):
-            seen[i, column] = given[i, column]
-        row = int(np.int64(given[i, SOURCE]))
-        if not look(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], seen, i):
+            seen[i, column] = observed[i, column]
+        row = int(np.int64(observed[i, SOURCE]))
+        if not fill_direction(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], seen, i):
             seen[i, X], seen[i, Y], seen[i, Z] = 0.0, 0.0, NOWHERE
 
 
 @inner
 def scaled(model: float, x: float, y: float, z: float, scale: float) -> tuple[float, float, float]:
-    """Unit direction seen where the focal length is divided by `scale` (distortion left aside)."""
+    """Unit direction seen where the focal length is divided by `scale` (without the distortion)."""
     if scale == 1.0:
         return x, y, z
     if model == PINHOLE:

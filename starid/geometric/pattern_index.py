@@ -1,15 +1,14 @@
-"""The identification index: blended catalogue stars, sky grid, star counts and triangles of bright stars.
+"""The identification index: merged catalogue stars, sky grid, star counts and triangles of bright stars.
 
-Triangles are made of *pattern stars*, picked by falling brightness, a star being taken while fewer than a
-quota of taken ones lie within a neighbourhood of half the field's area: so every part of the sky, rich or
-poor, offers about as many, and a half-blocked field still holds some. With a small quota come the *bright*
-pattern stars: any three of them that can be in the field together make a triangle, for fields that show
-little else. With a large quota come the *deep* ones: triangles of middling size, for fields full of false
-stars. A narrow field has more sky to cover, and gets by with smaller triangles.
+The corners of triangles are *pattern stars*, selected by falling brightness: a star is selected while fewer than a quota
+of selected ones lie within a neighbourhood of half the field's area. Rich and poor regions of the sky thus have about as
+many, and a half-blocked field still holds some. A small quota selects the *bright* pattern stars: any three of them that
+fit the field make a triangle, for fields that show few other stars. A large quota selects the *deep* ones: triangles of
+medium size, for fields with many false stars. A narrow field has more sky to cover and uses smaller triangles.
 
 Sides are chords of the unit sphere (2·sin(angle/2)), sorted longest first; corner k lies opposite side k.
-Triangles stand in rows of like handedness, longest and middle side, each row sorted by the shortest, so that
-a query reads a few short runs.
+Triangles are stored in rows of equal handedness, binned longest and binned middle side, each sorted by the shortest
+side, so that a query reads a few short runs.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.camera import Camera
-from starid.catalog import StarCatalog, blend, companions
+from starid.catalog import StarCatalog, companions, merge_close_stars
 from starid.errors import StaridError
-from starid.geometric.jit_kernels import entry, inner
 from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.geometric.sky_grid import FACES, build_sky_grid, cell_of
+from starid.jit import compiled_ieee, inner
 
 INDEX_VERSION: Final = 5
-"""Raised whenever the same catalogue and settings would give another index."""
+"""Increased whenever the same catalogue and settings would yield another index."""
 
 SIDE_STEPS: Final = 65535
-"""Sides are stored in this many steps of the longest chord."""
+"""Number of steps of the longest chord in which sides are stored."""
 
 BRIGHTEST_BIN: Final = -2.0
 """Magnitude at which the bins of the star counts begin."""
@@ -40,23 +39,23 @@ BRIGHTEST_BIN: Final = -2.0
 BINS_PER_MAGNITUDE: Final = 4
 COUNT_CELLS: Final = 12
 _BLEND_DEPTH: Final = 1.5
-"""Stars this much fainter than the limit join a blend wherever they are; fainter ones join a star within the limit."""
+"""Stars down to this far below the limit are merged with any star; fainter ones only with a star within the limit."""
 
 
 class IndexArrays(NamedTuple):
-    """The index as the kernels take it.
+    """The arrays of the index, for the kernels.
 
     Attributes
     ----------
     stars : ndarray (m, 4) float64
-        Unit vector ICRS and V magnitude of the (blended) stars, brightest first.
+        Unit vector ICRS and V magnitude of the merged stars, brightest first.
     grid_start, grid_stars : ndarray int32
         Sky grid, see `starid.geometric.sky_grid`.
     counts : ndarray (cells + 1, bins) int32
         Stars down to a magnitude bin in a cap with the area of the field around each coarse cell; the last
         row counts the whole sky.
     row_start : ndarray int32
-        Triangles of row r (`pattern_row`) stand in ``[start[r], start[r + 1])``, the shortest side rising.
+        Triangles of row r (`pattern_row`) are in ``[start[r], start[r + 1])``, by rising shortest side.
     sides : ndarray (p, 3) uint16
         Longest, middle and shortest chord in steps.
     corners : ndarray (p, 3) uint16
@@ -93,16 +92,16 @@ DEEP_LONGEST: Final = 6
 
 @dataclass(frozen=True)
 class IndexSettings:
-    """What an index is built for.
+    """Settings of an index.
 
     Attributes
     ----------
     limiting_magnitude : float
         Faintest V of a star in it.
     blend_rad : float
-        Stars closer than this are seen as one.
+        Stars closer than this are merged.
     window_rad : float
-        Largest distance at which a detection is looked up: the margin of the sky grid.
+        Largest distance between a detection and its star: the margin of the sky grid.
     field_area_sr : float
         Solid angle of the field.
     bright_sides_rad, deep_sides_rad : (float, float)
@@ -111,7 +110,7 @@ class IndexSettings:
     bright_quota, deep_quota : int
         Pattern stars within a neighbourhood of half the field's area.
     cells_per_edge : int
-        Fineness of the sky grid.
+        Cells along the edge of a face of the sky grid.
     side_bins : int
         Bins for the longest and the middle side.
     """
@@ -141,10 +140,12 @@ class IndexSettings:
 
 
 def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float) -> StarCatalog:
-    """Stars to a limit as the sensor sees them: doubles closer than `blend_rad` merged, brightest first."""
+    """Stars to a limiting magnitude as a sensor resolves them: those closer than `blend_rad` merged, brightest first."""
     deep = catalog.v <= limiting_magnitude + _BLEND_DEPTH
     deep[companions(catalog, limiting_magnitude, blend_rad)] = True
-    return blend(catalog.subset(deep), blend_rad, as_fitted=True).brighter_than(limiting_magnitude)
+    return merge_close_stars(catalog.subset(deep), blend_rad, as_fitted=True).brighter_than(
+        limiting_magnitude
+    )
 
 
 def _adjacency(
@@ -202,7 +203,7 @@ def pattern_row(hand: int, longest: int, middle: int, bins: int) -> int:
     return (hand * bins * (bins + 1) + longest * (longest + 1)) // 2 + middle
 
 
-@entry
+@compiled_ieee
 def _triangles(
     vectors: NDArray[np.float64],
     start: NDArray[np.int64],
@@ -255,7 +256,7 @@ def _triangles(
     return patterns, binned
 
 
-@entry
+@compiled_ieee
 def _count_field_stars(
     vectors: NDArray[np.float64], magnitudes: NDArray[np.float64], cap_cosine: float, bins: int
 ) -> NDArray[np.int32]:
@@ -290,7 +291,7 @@ def magnitude_bin(magnitude: float, bins: int) -> int:
 
 
 def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
-    """Index over stars sorted by falling brightness, as `seen_stars` gives them.
+    """Index over stars sorted by falling brightness, from `seen_stars`.
 
     Raises
     ------

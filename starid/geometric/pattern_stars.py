@@ -1,4 +1,4 @@
-"""Which stars patterns are made of: by falling brightness, while a neighbourhood holds fewer than its quota."""
+"""Selection of pattern stars by falling brightness, with a quota per neighbourhood."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 _FINEST_CELL: Final = 0.01
-"""Least edge of a cell of the look-up grid, on the unit sphere: bounds its memory."""
+"""Least edge of a cell of the lookup grid, on the unit sphere: bounds its memory."""
 
 
-@entry
+@compiled_ieee
 def _pick(vectors: NDArray[np.float64], chord: float, quota: int, finest_cell: float) -> NDArray[np.bool_]:
-    """Take stars in order while fewer than `quota` taken ones lie within the chord of them.
+    """Select stars in order while fewer than `quota` selected ones lie within the chord of them.
 
-    Taken stars are kept in lists, one for each cell of a cubic grid as wide as the chord.
+    Selected stars are kept in lists, one for each cell of a cubic grid as wide as the chord.
     """
     edge = max(chord, finest_cell)
     cells = int(2.0 / edge) + 1
@@ -48,7 +48,7 @@ def _pick(vectors: NDArray[np.float64], chord: float, quota: int, finest_cell: f
 
 
 def pick_pattern_stars(vectors: NDArray[np.float64], cap_area_sr: float, quota: int) -> NDArray[np.int64]:
-    """Rows of the stars that patterns are made of.
+    """Select the rows of the pattern stars.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def pick_pattern_stars(vectors: NDArray[np.float64], cap_area_sr: float, quota: 
     cap_area_sr : float
         Solid angle of the cap around a star that counts as its neighbourhood.
     quota : int
-        Taken stars that a neighbourhood may hold before a star in it.
+        Most selected stars in a neighbourhood.
     """
     radius = math.acos(max(1.0 - cap_area_sr / (2.0 * math.pi), -1.0))
     return np.flatnonzero(_pick(vectors, 2.0 * math.sin(0.5 * radius), quota, _FINEST_CELL))

@@ -1,6 +1,6 @@
-"""From a coarse attitude to the best one: match, solve, estimate the noise, match again.
+"""Refinement of a coarse attitude: match, solve, estimate the noise, repeat.
 
-Residuals are pixels: ``r = G (u − A c)``, u the direction that a detection sees, c the catalogue star, G the
+Residuals are pixels: ``r = G (u − A c)``, u the direction of a detection, c that of the catalogue star, G the
 derivative of the pixel position by the direction. A turn of the sensor by a small vector v moves the star's
 predicted position by ``G (A c × v)``, which makes weighted least squares a 3 × 3 system; where the focal
 length is unknown, its logarithm is the fourth unknown. Pixel residuals weighted by each star's own error make
@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.matching import (
     BY_NOISE,
     match_detections,
@@ -46,21 +45,22 @@ from starid.geometric.settings import (
     SIGMAS_KNOWN,
     WINDOW,
 )
+from starid.jit import inner
 
 MAX_ROUNDS: Final = 12
 """Rounds of matching and solving."""
 
 FEW_MATCHED: Final = 30
-"""Up to so many matches each is tested against the others: one outlier moves all the rest."""
+"""Up to this number of matches, each is tested as an outlier against the others."""
 
 OUTLIER_CHANCE: Final = 3.3e-4
-"""Chance that the test takes a good star for an outlier: that of the window of 4 sigma."""
+"""Probability that the test rejects a good star: that of a window of 4 sigma."""
 
 LEAST_GATE: Final = 0.5
-"""Deviation from the expected magnitude that is always borne."""
+"""Deviation from the expected magnitude that is always accepted."""
 
 PRIOR_FREEDOM: Final = 10.0
-"""Weight of the errors that the caller gives, in degrees of freedom, against what the residuals say."""
+"""Weight of the caller's errors against the residuals, in degrees of freedom."""
 
 MAGNITUDE_FLOOR: Final = 0.1
 MAGNITUDE_CEILING: Final = 1.0
@@ -70,7 +70,7 @@ _MAD_TO_SIGMA: Final = 1.4826
 SCALE: Final = 0
 """Factor on the tangents of the directions."""
 VARIANCE: Final = 1
-"""Mean square of residual over given error, per degree of freedom."""
+"""Mean square of residual over the caller's error, per degree of freedom."""
 RMS: Final = 2
 """Root mean square distance of the matched stars, pixels."""
 ZERO_POINT: Final = 3
@@ -78,13 +78,13 @@ ZERO_POINT: Final = 3
 SCATTER: Final = 4
 """Its scatter, magnitudes."""
 SCALE_VARIANCE: Final = 5
-"""Variance of the logarithm of the scale in units of the given errors, 0 where it is fixed."""
+"""Variance of the logarithm of the scale in units of the caller's errors, 0 where it is fixed."""
 NUMBERS: Final = 6
 
 
 @inner
-def turn(rotation: NDArray[np.float64], vx: float, vy: float, vz: float) -> None:
-    """Turn the sensor by +v, in place: ``A ← exp(−[v]×)·A`` (Rodrigues)."""
+def rotate_sensor(rotation: NDArray[np.float64], vx: float, vy: float, vz: float) -> None:
+    """Rotate the sensor by +v, in place: ``A ← exp(−[v]×)·A`` (Rodrigues)."""
     angle2 = vx * vx + vy * vy + vz * vz
     angle = math.sqrt(angle2)
     s, c = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
@@ -131,10 +131,10 @@ def solve_symmetric(
 
 @inner
 def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: NDArray[np.float64]) -> None:
-    """Fill (2, 4) with how the predicted position of detection i moves with turn and scale.
+    """Fill (2, 4) with the derivatives of the predicted position of detection i by rotation and scale.
 
-    For a turn v it moves by G (c × v), c = (x, y, z) being the star in the sensor; a larger scale, a shorter
-    focal length, draws it to the centre.
+    A rotation v of the sensor moves it by G (c × v), c = (x, y, z) being the star in the sensor frame; a larger scale,
+    that is a shorter focal length, moves it to the centre.
     """
     ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
     vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
@@ -154,7 +154,7 @@ def _outlier(
     freedom: int,
     settings: NDArray[np.float64],
 ) -> int:
-    """Match that the others speak against most, if by more than chance would have it; else −1.
+    """The match most inconsistent with the others, if beyond chance; else −1.
 
     Leaving match i out lowers χ² by ``r' (1 − H)⁻¹ r``, H its own block of the hat matrix; the drop over
     what remains follows an F distribution with 2 and ν − 2 degrees of freedom, whose tail is
@@ -278,7 +278,7 @@ def distances(
 
 @inner
 def _same(stars: NDArray[np.int64], previous: NDArray[np.int64]) -> bool:
-    """Whether the matches stand still; `previous` is brought up to date."""
+    """Whether the matches are unchanged; `previous` is updated."""
     same = True
     for i in range(stars.shape[0]):
         if stars[i] != previous[i]:
@@ -289,9 +289,9 @@ def _same(stars: NDArray[np.int64], previous: NDArray[np.int64]) -> bool:
 
 @inner
 def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> float:
-    """Turn the leading block into the normal matrix of the rotation whatever the scale is.
+    """Marginalise the scale: the leading block becomes the normal matrix of the rotation alone.
 
-    Returns the variance of the logarithm of the scale whatever the rotation is.
+    Returns the marginal variance of the logarithm of the scale.
     """
     solve_symmetric(normal, normal[3], 3, scratch)
     weight = normal[3, 3]
@@ -307,7 +307,7 @@ def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> f
 def refine(
     index: IndexArrays,
     raw: Raw,
-    given: Table,
+    observed: Table,
     settings: NDArray[np.float64],
     least_matched: int,
     seen: Table,
@@ -316,22 +316,22 @@ def refine(
     normal: NDArray[np.float64],
     numbers: NDArray[np.float64],
 ) -> int:
-    """Match and solve until the matches stand still.
+    """Match and solve until the matches no longer change.
 
     Parameters
     ----------
-    raw, given
-        Detections as the caller gave them, and sorted (`observe`).
+    raw, observed
+        Detections of the caller, and sorted (`observe`).
     least_matched : int
-        Fewer matches are a failure.
+        Fewer matches fail.
     seen : Table
-        Where the focal length is free: filled with the detections under the refined one. Else `given`.
+        Where the focal length is free: filled with the detections under the refined one. Else `observed`.
     rotation : ndarray (3, 3)
         ICRS→sensor; coarse on entry, refined on return.
     stars : ndarray (n,) int64
         Filled: index star of each detection, −1 without.
     normal : ndarray (4, 4)
-        Filled: normal matrix of the rotation in units of the given errors (leading 3 × 3).
+        Filled: normal matrix of the rotation in units of the caller's errors (leading 3 × 3).
     numbers : ndarray (`NUMBERS`,)
         `SCALE` and `ZERO_POINT` on entry, all of them on return.
 
@@ -340,24 +340,24 @@ def refine(
     int
         Stars matched, 0 where it failed.
     """
-    n = given.shape[0]
+    n = observed.shape[0]
     star_table = index.stars
     previous, costs, scratch = np.empty(n, dtype=np.int64), np.empty(n), np.empty(max(n, 4))
     size = 16
     while size < 4 * n:
         size *= 2
-    owners, refused = np.empty(size, dtype=np.int64), np.zeros(n, dtype=np.bool_)
+    owners, excluded = np.empty(size, dtype=np.int64), np.zeros(n, dtype=np.bool_)
     right, step = np.empty(4), np.zeros(4)
     free_scale = settings[SCALE_TOLERANCE] > 0.0
     unknowns = 4 if free_scale else 3
     if free_scale:
-        observe_again(raw, given, numbers[SCALE], seen)
+        observe_again(raw, observed, numbers[SCALE], seen)
     gate, numbers[SCATTER] = settings[MAGNITUDE_GATE], settings[MAGNITUDE_GATE]
     reach, sigma = settings[WINDOW], 1.0
     matched = 0
     for number in range(MAX_ROUNDS):
         matched = match_detections(
-            index, seen, rotation, refused, (reach, sigma, gate, settings[PX_PER_RAD]),
+            index, seen, rotation, excluded, (reach, sigma, gate, settings[PX_PER_RAD]),
             numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
         )  # fmt: skip
         if matched < least_matched:
@@ -368,10 +368,10 @@ def refine(
             return 0
         for k in range(unknowns):
             chi2 -= right[k] * step[k]
-        turn(rotation, step[0], step[1], step[2])
+        rotate_sensor(rotation, step[0], step[1], step[2])
         if free_scale:
             numbers[SCALE] *= math.exp(step[3])
-            observe_again(raw, given, numbers[SCALE], seen)
+            observe_again(raw, observed, numbers[SCALE], seen)
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom
         if stable:
@@ -380,7 +380,7 @@ def refine(
                 worst = _outlier(star_table, seen, rotation, stars, normal, chi2, freedom, settings)
             if worst < 0:
                 break
-            refused[worst] = True
+            excluded[worst] = True
         sigma = math.sqrt(numbers[VARIANCE])
         if number == 0:
             # wrong pairs may be among the first matches: robust estimates

@@ -1,9 +1,8 @@
 """Lost in space: triangles of bright detections looked up in the index, each hit tested and refined.
 
-Detections are taken by falling flux; triangle (i, j, k) is tried after all triangles of brighter stars, so
-that few false stars among the brightest delay the answer and many do not prevent it: when the brightest are
-exhausted, triangles drawn from a wider choice follow. At last, where clutter fills much of the field, its
-parts are searched one by one.
+Triangles of the brightest detections come first, in the order of their faintest member, so that a few false stars among
+the brightest only delay the solution. Random triangles of a larger set of detections follow. Last, for fields with much
+clutter, each quadrant and the middle are searched separately.
 """
 
 from __future__ import annotations
@@ -18,12 +17,11 @@ from starid.geometric.answer import (
     LEAST_MATCHED,
     Answer,
     Candidate,
-    finish,
-    judged,
+    make_answer,
     new_candidate,
+    test_and_refine,
 )
-from starid.geometric.jit_kernels import entry, inner
-from starid.geometric.lookup import look_up
+from starid.geometric.lookup import find_triangles
 from starid.geometric.observation import MAGNITUDE, OFFSET_U, OFFSET_V, Raw, Table, X, Y, Z, observe, scaled
 from starid.geometric.pattern_index import (
     DEEP_LONGEST,
@@ -51,25 +49,26 @@ from starid.geometric.settings import (
     TOO_FEW,
 )
 from starid.geometric.verification import ROTATIONS, hit_odds, test_order
+from starid.jit import compiled_ieee, inner
 from starid.projection import HEIGHT, MODEL, WIDTH
 
 SYSTEMATIC: Final = 14
 """Brightest detections of which every triangle is tried first."""
 
 DRAWN_FROM: Final = 200
-"""Brightest detections from which further triangles are drawn."""
+"""Brightest detections from which random triangles are drawn."""
 
 STRICT_TOLERANCE: Final = 0.5
-"""Tolerance of their sides as a share of that of the first: they are many, and each must be cheap."""
+"""Tolerance of the sides of random triangles over that of the first ones: they are many, and each must be cheap."""
 
 STRICT_GATE: Final = 0.6
-"""Deviation of their magnitudes as a share of that of the first."""
+"""Magnitude gate of random triangles over that of the first ones."""
 
 PARTS: Final = 5
 """Parts of the field: four quadrants and the middle."""
 
 MOST_FOUND: Final = 4096
-"""Triangles of the index tried for one of detections."""
+"""Most triangles of the index tried for one triangle of detections."""
 
 _SEED: Final = 88172645463325252
 
@@ -78,7 +77,7 @@ _SEED: Final = 88172645463325252
 def copy_corner(
     table: NDArray[np.float64], source: int, model: float, scale: float, frame: Table, row: int
 ) -> None:
-    """Copy a unit vector to a row of a frame, as seen with the focal length divided by `scale`."""
+    """Copy a unit vector, for a focal length divided by `scale`, to a row of a frame."""
     frame[row, 0], frame[row, 1], frame[row, 2] = scaled(
         model, table[source, X], table[source, Y], table[source, Z], scale
     )
@@ -86,7 +85,7 @@ def copy_corner(
 
 @inner
 def make_frame(frame: Table) -> None:
-    """Turn three unit vectors (rows) into an orthonormal frame: sum, second − third made normal to it, normal."""
+    """Replace three unit vectors (rows) by an orthonormal frame: sum, orthogonalised second − third, cross product."""
     along, square_sum, square_side = 0.0, 0.0, 0.0
     for axis in range(3):
         total = frame[0, axis] + frame[1, axis] + frame[2, axis]
@@ -108,7 +107,7 @@ def make_frame(frame: Table) -> None:
 
 @inner
 def set_sensor_frame(
-    given: Table,
+    observed: Table,
     detections: tuple[int, int, int],
     model: float,
     scale: float,
@@ -119,10 +118,10 @@ def set_sensor_frame(
     Parameters
     ----------
     model, scale : float
-        Model of the camera, and by what its focal length is to be divided.
+        Model of the camera, and the divisor of its focal length.
     """
     for row in range(3):
-        copy_corner(given, detections[row], model, scale, frames[0], row)
+        copy_corner(observed, detections[row], model, scale, frames[0], row)
     make_frame(frames[0])
 
 
@@ -130,9 +129,9 @@ def set_sensor_frame(
 def set_rotation(
     star_table: NDArray[np.float64], stars: tuple[int, int, int], frames: NDArray[np.float64]
 ) -> None:
-    """Fill ``frames[2]`` with the ICRS→sensor matrix that carries three stars into the detections of ``frames[0]``.
+    """Fill ``frames[2]`` with the ICRS→sensor matrix that maps three stars to the detections of ``frames[0]``.
 
-    The second and the third should be far apart: they give the roll. ``frames[1]`` is workspace.
+    The second and the third should be far apart: they determine the roll. ``frames[1]`` is workspace.
     """
     sensor, sky = frames[0], frames[1]
     for row in range(3):
@@ -148,7 +147,7 @@ def set_rotation(
 def _try_patterns(
     index: IndexArrays,
     raw: Raw,
-    given: Table,
+    observed: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
     tests: tuple[NDArray[np.float64], NDArray[np.int64]],
@@ -158,15 +157,15 @@ def _try_patterns(
     count: int,
     gate: float,
 ) -> float:
-    """Try the index's triangles found for one of detections.
+    """Try the triangles of the index found for one triangle of detections.
 
-    Returns the bound of the first that stands, left in `candidate`, or 0.
+    Returns the bound of the first accepted one, left in `candidate`, or 0.
     """
     stars, sides, corner_stars = index.stars, index.sides, index.corners
     frames, numbers = candidate.frames, candidate.numbers
     i, j, k = corners
     spread = settings[SCALE_TOLERANCE]
-    mi, mj, mk = given[i, MAGNITUDE], given[j, MAGNITUDE], given[k, MAGNITUDE]
+    mi, mj, mk = observed[i, MAGNITUDE], observed[j, MAGNITUDE], observed[k, MAGNITUDE]
     numbers[SCALE] = 1.0
     framed = False
     for n in range(count):
@@ -186,17 +185,17 @@ def _try_patterns(
         if spread > 0.0:
             numbers[SCALE] = sides[pattern, 0] * index.numbers[SIDE_STEP] / longest_side
         if spread > 0.0 or not framed:
-            set_sensor_frame(given, corners, raw.params[MODEL], numbers[SCALE], frames)
+            set_sensor_frame(observed, corners, raw.params[MODEL], numbers[SCALE], frames)
             framed = True
         set_rotation(stars, (a, b, c), frames)
-        _, bound = judged(index, raw, given, settings, candidate, tests, corners, ROTATIONS)
+        _, bound = test_and_refine(index, raw, observed, settings, candidate, tests, corners, ROTATIONS)
         if bound < settings[LOG_CHANCE]:
             return bound
     return 0.0
 
 
 @inner
-def _drawn(state: np.uint64, choice: int) -> tuple[np.uint64, int, int, int]:
+def _draw_three(state: np.uint64, choice: int) -> tuple[np.uint64, int, int, int]:
     """Step of a xorshift generator, and three numbers below `choice` from it (16 bits each)."""
     state ^= state << np.uint64(13)
     state ^= state >> np.uint64(7)
@@ -211,21 +210,21 @@ def _drawn(state: np.uint64, choice: int) -> tuple[np.uint64, int, int, int]:
 
 
 @inner
-def _worth_looking_up(given: Table, i: int, j: int, k: int, bounds: tuple[float, float, float]) -> bool:
-    """Whether a triangle of detections has sides within the bounds, and is none too flat."""
-    c0, c1, c2 = chord(given, j, k), chord(given, i, k), chord(given, i, j)
+def _worth_looking_up(observed: Table, i: int, j: int, k: int, bounds: tuple[float, float, float]) -> bool:
+    """Whether a triangle of detections has sides within the bounds and is not too flat."""
+    c0, c1, c2 = chord(observed, j, k), chord(observed, i, k), chord(observed, i, j)
     shortest, longest = min(c0, c1, c2), max(c0, c1, c2)
     return shortest >= bounds[0] and longest <= bounds[1] and c0 + c1 + c2 - 2.0 * longest >= bounds[2]
 
 
 @inner
-def _members(raw: Raw, given: Table, part: int) -> NDArray[np.int64]:
+def _detections_in_part(raw: Raw, observed: Table, part: int) -> NDArray[np.int64]:
     """Detections in one of the `PARTS` of the field, four quadrants and the middle, brightest first."""
     half_width, half_height = 0.25 * raw.params[WIDTH], 0.25 * raw.params[HEIGHT]
-    members = np.empty(given.shape[0], dtype=np.int64)
+    members = np.empty(observed.shape[0], dtype=np.int64)
     count = 0
-    for i in range(given.shape[0]):
-        u, v = given[i, OFFSET_U], given[i, OFFSET_V]
+    for i in range(observed.shape[0]):
+        u, v = observed[i, OFFSET_U], observed[i, OFFSET_V]
         if part == PARTS - 1:
             inside = abs(u) < half_width and abs(v) < half_height
         else:
@@ -246,7 +245,7 @@ def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
     return 0, 1, k + 1
 
 
-@entry
+@compiled_ieee
 def identify_kernel(
     index: IndexArrays,
     params: NDArray[np.float64],
@@ -255,19 +254,19 @@ def identify_kernel(
     sigmas: NDArray[np.float64],
     settings: NDArray[np.float64],
 ) -> Answer:
-    """Find the attitude of a set of detections without knowing anything of it.
+    """Find the attitude of a set of detections without prior knowledge.
 
-    In stage 0 come the triangles of the brightest detections, in stage 1 those drawn from more of them, in
+    Stage 0 tries the triangles of the brightest detections, stage 1 random triangles of more of them, and
     each further stage those of the brightest of one part of the field. The detections of a part also give its
-    sequential test, so that clutter elsewhere outvotes nothing; what it finds is refined and judged on the
+    sequential test, so that clutter elsewhere does not count; what it finds is refined and test_and_refine on the
     whole field all the same.
     """
     raw = Raw(params, xy, flux, sigmas)
-    given = observe(raw)
-    n = given.shape[0]
+    observed = observe(raw)
+    n = observed.shape[0]
     candidate = new_candidate(n)
     if n < LEAST_MATCHED:
-        return finish(TOO_FEW, given, candidate, settings, 0.0, 0, 0)
+        return make_answer(TOO_FEW, observed, candidate, settings, 0.0, 0, 0)
     odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
     found = np.empty(MOST_FOUND, dtype=np.int64)
     spread, limit, numbers = settings[SCALE_TOLERANCE], int(settings[MAX_TRIANGLES]), index.numbers
@@ -280,7 +279,7 @@ def identify_kernel(
     while True:
         if stage == 1:
             draws += 1
-            state, a, b, c = _drawn(state, min(n, DRAWN_FROM))
+            state, a, b, c = _draw_three(state, min(n, DRAWN_FROM))
             over = triangles >= limit or draws > 4 * limit
         else:
             i, j, k = _next_triangle(i, j, k)
@@ -299,24 +298,24 @@ def identify_kernel(
             if n <= SYSTEMATIC or stage > 1 + PARTS or (stage > 1 and settings[PART_STARS] < 3.0):
                 break
             if stage > 1:
-                members = _members(raw, given, stage - 2)
+                members = _detections_in_part(raw, observed, stage - 2)
                 order = members[test_order(members.shape[0])]
                 members = members[: int(settings[PART_STARS])]
             continue
-        if a in (b, c) or b == c or not _worth_looking_up(given, a, b, c, bounds):
+        if a in (b, c) or b == c or not _worth_looking_up(observed, a, b, c, bounds):
             continue
         s0, s1, s2, a, b, c = sorted_triangle(
-            chord(given, b, c), chord(given, a, c), chord(given, a, b), a, b, c
+            chord(observed, b, c), chord(observed, a, c), chord(observed, a, b), a, b, c
         )
-        hand = handedness(given, a, b, c)
-        count = look_up(index, (s0, s1, s2), hand, bounds[2], spread, found)
+        hand = handedness(observed, a, b, c)
+        count = find_triangles(index, (s0, s1, s2), hand, bounds[2], spread, found)
         triangles += 1
         candidates += count
         if count > 0:
             bound = _try_patterns(
-                index, raw, given, settings, candidate, (odds, order), (a, b, c), s0, found, count, gate
+                index, raw, observed, settings, candidate, (odds, order), (a, b, c), s0, found, count, gate
             )
             if bound < 0.0:
                 break
     status = ACCEPTED if bound < 0.0 else NOTHING
-    return finish(status, given, candidate, settings, bound, triangles, candidates)
+    return make_answer(status, observed, candidate, settings, bound, triangles, candidates)

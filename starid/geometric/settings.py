@@ -1,4 +1,4 @@
-"""Columns of the settings that the identification kernels take, one array of numbers."""
+"""Positions of the settings in the array that the identification kernels receive."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Final
 SEARCH_TOLERANCE: Final = 0
 """Largest error of a triangle's side, radians."""
 MAGNITUDE_GATE: Final = 1
-"""Largest deviation of a star's magnitude from what its flux says, magnitudes."""
+"""Largest deviation of a star's catalogue magnitude from the one of its flux."""
 MAX_TRIANGLES: Final = 2
-"""Triangles of detections looked up before giving up."""
+"""Most triangles of detections looked up."""
 SCALE_TOLERANCE: Final = 3
 """Relative error of the focal length, 0 where it is known."""
 WINDOW: Final = 4
@@ -17,7 +17,7 @@ WINDOW: Final = 4
 TEST_WINDOW: Final = 5
 """Window of the sequential test, radians."""
 LARGEST_SIGMA: Final = 6
-"""Largest centroid noise believed, pixels per axis."""
+"""Largest centroid noise accepted, pixels per axis."""
 LOG_CHANCE: Final = 7
 """Logarithm of the largest probability of a false answer, lost in space."""
 LOG_CHANCE_TRACKING: Final = 8
@@ -25,11 +25,11 @@ LOG_CHANCE_TRACKING: Final = 8
 PX_PER_RAD: Final = 9
 """Least pixels per radian in the field."""
 SIGMAS_KNOWN: Final = 10
-"""Not 0 where the errors of the positions are given."""
+"""Not 0 where the caller provides the errors of the positions."""
 FIELD_PX: Final = 11
 """Pixels in the field."""
 PART_STARS: Final = 12
-"""Brightest detections of each part of the field that triangles are made of, 0 for none."""
+"""Brightest detections of each part of the field that form triangles, 0 for none."""
 SETTING_COUNT: Final = 13
 
 NOTHING: Final = 0

@@ -1,8 +1,8 @@
-"""A cube-map grid of the sky: which catalogue stars lie near a direction, in one look-up.
+"""A cube-map grid of the sky: the catalogue stars near a direction, in one lookup.
 
 The sphere is cut into the six faces of a cube with n × n cells each. A cell lists every star inside it *or
-nearer to it than a margin*, so that all stars within the margin of any direction stand in the one cell that
-the direction falls into: no neighbours, no seams. Stars are numbered by falling brightness, and the lists
+nearer to it than a margin*, so that all stars within the margin of a direction are in the single cell of
+that direction. Stars are numbered by falling brightness, and the lists
 are sorted, so that a search can stop at a magnitude.
 """
 
@@ -14,16 +14,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 FACES: Final = 6
 _SLOPE_MARGIN: Final = 1.25
-"""Safety on the linear bound of a cube coordinate's change with angle; holds for margins to 0.2 rad."""
+"""Safety factor on the linear bound of a cube coordinate's change with angle; holds for margins to 0.2 rad."""
 
 
 @inner
 def cell_of(x: float, y: float, z: float, n: int) -> int:
-    """Cell number of a direction of any length, in a grid of n × n cells a face."""
+    """Cell number of a direction of any length, in a grid of n × n cells per face."""
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
         face, depth, u, v = 0 if x > 0.0 else 1, ax, y, z
@@ -60,7 +60,7 @@ def _reach(vector: NDArray[np.float64], face: int, n: int, margin: float) -> tup
     return first_i, last_i, first_j, last_j
 
 
-@entry
+@compiled_ieee
 def _fill(vectors: NDArray[np.float64], n: int, margin: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Count, then list; see `build_sky_grid`."""
     start = np.zeros(FACES * n * n + 1, dtype=np.int32)

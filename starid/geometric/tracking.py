@@ -1,9 +1,9 @@
 """Tracking: the attitude near a predicted one.
 
-Bright detections are paired with the catalogue stars within a window around where the prediction puts them.
-Two such pairs that keep their distance give an attitude, which goes through the same sequential test,
+Bright detections are paired with the catalogue stars within a window around their predicted directions.
+Two such pairs of equal separation determine an attitude, which goes through the same sequential test,
 refinement and verification as one found lost in space. A prediction that is off by any turn within the
-window, roll included, is followed; anything else is refused.
+window, roll included, is followed; anything else is excluded.
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ from starid.geometric.answer import (
     LEAST_MATCHED,
     Answer,
     Candidate,
-    finish,
-    judged,
+    make_answer,
     new_candidate,
+    test_and_refine,
 )
-from starid.geometric.jit_kernels import entry, inner
 from starid.geometric.matching import to_sky
 from starid.geometric.observation import MAGNITUDE, Raw, Table, observe
 from starid.geometric.pattern_index import (
@@ -45,10 +44,11 @@ from starid.geometric.settings import (
 )
 from starid.geometric.sky_grid import cell_of
 from starid.geometric.verification import hit_odds, test_order
+from starid.jit import compiled_ieee, inner
 from starid.projection import MODEL
 
 PAIRED: Final = 16
-"""Brightest detections that pairs are made of."""
+"""Brightest detections that form pairs."""
 
 CANDIDATES: Final = 6
 """Catalogue stars considered for each of them, the brightest in its window."""
@@ -58,7 +58,7 @@ CANDIDATES: Final = 6
 def _stars_near(
     index: IndexArrays, x: float, y: float, z: float, window_rad: float, found: NDArray[np.int64], row: int
 ) -> int:
-    """Fill a row with the brightest stars within a window around a direction; return how many."""
+    """Fill a row with the brightest stars within a window around a direction; return their number."""
     stars = index.stars
     first, last, listed = 0, stars.shape[0], False
     if window_rad <= index.numbers[GRID_MARGIN]:
@@ -69,8 +69,8 @@ def _stars_near(
             True,
         )
     count = 0
-    for place in range(first, last):
-        star = int(np.int64(index.grid_stars[place])) if listed else place
+    for entry in range(first, last):
+        star = int(np.int64(index.grid_stars[entry])) if listed else entry
         dx, dy, dz = stars[star, 0] - x, stars[star, 1] - y, stars[star, 2] - z
         if dx * dx + dy * dy + dz * dz < window_rad * window_rad:
             found[row, count] = star
@@ -84,7 +84,7 @@ def _stars_near(
 def _try_pair(
     index: IndexArrays,
     raw: Raw,
-    given: Table,
+    observed: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
     tests: tuple[NDArray[np.float64], NDArray[np.int64]],
@@ -92,17 +92,17 @@ def _try_pair(
     stars: tuple[int, int],
     prior_volume: float,
 ) -> float:
-    """Bound of the attitude that two pairs give, left in `candidate`; 0 where it falls through."""
+    """Bound of the attitude of two pairs, left in `candidate`; 0 where it is rejected."""
     i, j = detections
     a, b = stars
-    da = index.stars[a, STAR_MAGNITUDE] - given[i, MAGNITUDE]
-    db = index.stars[b, STAR_MAGNITUDE] - given[j, MAGNITUDE]
+    da = index.stars[a, STAR_MAGNITUDE] - observed[i, MAGNITUDE]
+    db = index.stars[b, STAR_MAGNITUDE] - observed[j, MAGNITUDE]
     if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
         return 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
-    set_sensor_frame(given, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
+    set_sensor_frame(observed, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
     set_rotation(index.stars, (a, a, b), candidate.frames)
-    _, bound = judged(index, raw, given, settings, candidate, tests, (i, j, j), prior_volume)
+    _, bound = test_and_refine(index, raw, observed, settings, candidate, tests, (i, j, j), prior_volume)
     return bound
 
 
@@ -110,7 +110,7 @@ def _try_pair(
 def _try_detections(
     index: IndexArrays,
     raw: Raw,
-    given: Table,
+    observed: Table,
     settings: NDArray[np.float64],
     candidate: Candidate,
     tests: tuple[NDArray[np.float64], NDArray[np.int64]],
@@ -120,12 +120,12 @@ def _try_detections(
     prior_volume: float,
     work: NDArray[np.int64],
 ) -> float:
-    """Try all pairs of stars near two detections; return the bound of the first that stands, or 0.
+    """Try all pairs of stars near two detections; return the bound of the first accepted, or 0.
 
-    `work` counts pairs, and those that keep the distance.
+    `work` counts pairs, and those of equal separation.
     """
     i, j = detections
-    separation = chord(given, i, j)
+    separation = chord(observed, i, j)
     if separation < index.numbers[DEEP_SHORTEST]:
         return 0.0
     for p in range(counts[i]):
@@ -135,13 +135,15 @@ def _try_detections(
             if a == b or abs(chord(index.stars, a, b) - separation) > settings[SEARCH_TOLERANCE]:
                 continue
             work[1] += 1
-            bound = _try_pair(index, raw, given, settings, candidate, tests, detections, (a, b), prior_volume)
+            bound = _try_pair(
+                index, raw, observed, settings, candidate, tests, detections, (a, b), prior_volume
+            )
             if bound < settings[LOG_CHANCE_TRACKING]:
                 return bound
     return 0.0
 
 
-@entry
+@compiled_ieee
 def track_kernel(
     index: IndexArrays,
     params: NDArray[np.float64],
@@ -160,28 +162,28 @@ def track_kernel(
     predicted : ndarray (3, 3)
         ICRS→sensor.
     window_rad : float
-        Largest angle of a star from where the prediction puts it.
+        Largest angle of a star from its predicted direction.
     prior_volume : float
-        Volume of the rotations that were possible beforehand, rad³.
+        Prior volume of rotations, rad³.
     """
     raw = Raw(params, xy, flux, sigmas)
-    given = observe(raw)
-    n = given.shape[0]
+    observed = observe(raw)
+    n = observed.shape[0]
     candidate = new_candidate(n)
     tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
     near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
     counts = np.zeros(PAIRED, dtype=np.int64)
     status, bound, work = TOO_FEW if n < LEAST_MATCHED else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
     for j in range(min(n, PAIRED) if status == NOTHING else 0):
-        x, y, z = to_sky(predicted, given, j)
+        x, y, z = to_sky(predicted, observed, j)
         counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
         for i in range(j):
             bound = _try_detections(
-                index, raw, given, settings, candidate, tests, (i, j), near, counts, prior_volume, work
+                index, raw, observed, settings, candidate, tests, (i, j), near, counts, prior_volume, work
             )
             if bound < 0.0:
                 status = ACCEPTED
                 break
         if status == ACCEPTED:
             break
-    return finish(status, given, candidate, settings, bound, work[0], work[1])
+    return make_answer(status, observed, candidate, settings, bound, work[0], work[1])

@@ -1,21 +1,21 @@
-"""How much an agreement between detections and catalogue is worth: tested fast, then stated.
+"""Verification: a fast sequential test, then a bound on the probability that an agreement is chance.
 
 Two stages. `worth_refining` tests a candidate attitude star by star by Wald's sequential probability ratio:
-wrong candidates die after a handful of look-ups. `log_false_probability` is the judgement.
+wrong candidates fail after a handful of lookups. `log_false_probability` computes the bound.
 
 It compares two explanations of the detections. *Chance*: each of n detections lies anywhere in the field of
 area A. *Sky*: an attitude drawn uniformly from all rotations; then each detection is, with probability a, a
-catalogue star of about its brightness, seen with the centroid noise, else anywhere. A detection matched to a
+catalogue star of about its brightness, displaced by the centroid noise, else anywhere. A detection matched to a
 star at distance r with magnitude deviation Δm thus favours the sky by
 
     (1 − a) + a · A · w · N₂(r; σ) ,  w = N(Δm; s)/λ(m)  (at most 1),
 
-λ(m) being the catalogue stars a magnitude in the field: the chance that it is just this one of the stars of
-its brightness. Unmatched ones give 1 − a. The product is integrated over the attitude (Laplace's method:
+λ(m) being the number of catalogue stars per magnitude in the field: the probability that it is this star among those
+of its brightness. Unmatched ones give 1 − a. The product is integrated over the attitude (Laplace's method:
 the posterior's volume over the prior's), over the photometric zero point, over the noise where it was
 estimated, and averaged over a few shares a. The result is a Bayes factor B whose expectation under chance
 is 1, so that by Markov's inequality chance reaches B or more with a probability of at most 1/B, however long
-the search was: 1/B is the bound that a solution states.
+the search was: 1/B is the bound reported in a solution.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import inner
 from starid.geometric.matching import residual
 from starid.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.geometric.pattern_index import (
@@ -40,6 +39,7 @@ from starid.geometric.pattern_index import (
 from starid.geometric.refinement import SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
 from starid.geometric.settings import FIELD_PX, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
 from starid.geometric.sky_grid import cell_of
+from starid.jit import inner
 from starid.projection import MODEL
 
 TRUE_SHARE: Final = 0.5
@@ -49,7 +49,7 @@ REJECT_BELOW: Final = -2.6
 """Logarithmic odds at which a candidate is dropped: four misses in a row."""
 
 ACCEPT_ABOVE: Final = 9.0
-"""Logarithmic odds at which the sequential test passes a candidate on."""
+"""Logarithmic odds at which the sequential test accepts a candidate."""
 
 MAX_TESTED: Final = 40
 """Detections tested at most."""
@@ -67,15 +67,15 @@ SHARES: Final = (0.2, 0.5, 0.9)
 """Shares of true stars among the detections that the Bayes factor is averaged over."""
 
 _SMALL: Final = 1e-150
-"""Beyond this, and its inverse, a product is turned into its logarithm."""
+"""Products below this or above its inverse are replaced by their logarithm."""
 
 SCATTER_FLOOR: Final = 0.15
-"""Least scatter of magnitudes believed in the judgement."""
+"""Least scatter of magnitudes assumed in the bound."""
 
 
 @inner
 def hit_odds(index: IndexArrays, window_rad: float) -> NDArray[np.float64]:
-    """Logarithm of the odds that a hit gives, for each magnitude limit of the look-up (bins)."""
+    """Logarithm of the odds gained by a hit, for each magnitude limit of the lookup (bins)."""
     sky, bins = index.counts.shape[0] - 1, index.counts.shape[1]
     odds = np.empty(bins)
     for b in range(bins):
@@ -86,10 +86,10 @@ def hit_odds(index: IndexArrays, window_rad: float) -> NDArray[np.float64]:
 
 @inner
 def test_order(count: int) -> NDArray[np.int64]:
-    """Order in which detections are tested: the brightest, and those of the fainter half, in turn.
+    """Order in which detections are tested: bright and faint half alternate.
 
-    The brightest are the most telling, but they are also where false stars gather. Each pattern begins at
-    another place of it, so that no handful of false stars can stop them all.
+    The brightest carry the most information, but false stars are frequent among them. Each pattern starts at a
+    different position of the order, so that a few false stars cannot block every candidate.
     """
     order = np.empty(count, dtype=np.int64)
     half = (count + 1) // 2
@@ -104,7 +104,7 @@ def test_order(count: int) -> NDArray[np.int64]:
 def worth_refining(
     index: IndexArrays,
     params: NDArray[np.float64],
-    given: Table,
+    observed: Table,
     rotation: NDArray[np.float64],
     scale: float,
     faintest_offset: float,
@@ -120,9 +120,9 @@ def worth_refining(
     params : ndarray
         The camera.
     scale : float
-        By which its focal length is to be divided (1 where it is known).
+        Divisor of its focal length (1 where it is known).
     faintest_offset : float
-        Catalogue minus instrumental magnitude that a true star can have at most.
+        Largest catalogue minus instrumental magnitude of a true star.
     odds : ndarray
         From `hit_odds`.
     order : ndarray
@@ -137,19 +137,19 @@ def worth_refining(
     total = 0.0
     hits = 0
     count = order.shape[0]
-    place = (used[0] + used[1] + used[2]) % count
+    position = (used[0] + used[1] + used[2]) % count
     for _ in range(min(count, MAX_TESTED)):
-        i = order[place]
-        place += 1
-        if place == count:
-            place = 0
+        i = order[position]
+        position += 1
+        if position == count:
+            position = 0
         if i == used[0] or i == used[1] or i == used[2]:
             continue
-        u, v, w = scaled(params[MODEL], given[i, X], given[i, Y], given[i, Z], scale)
+        u, v, w = scaled(params[MODEL], observed[i, X], observed[i, Y], observed[i, Z], scale)
         x = rotation[0, 0] * u + rotation[1, 0] * v + rotation[2, 0] * w
         y = rotation[0, 1] * u + rotation[1, 1] * v + rotation[2, 1] * w
         z = rotation[0, 2] * u + rotation[1, 2] * v + rotation[2, 2] * w
-        faintest = given[i, MAGNITUDE] + faintest_offset
+        faintest = observed[i, MAGNITUDE] + faintest_offset
         cell = cell_of(x, y, z, cells)
         hit = False
         for entry in range(grid_start[cell], grid_start[cell + 1]):
@@ -171,7 +171,7 @@ def worth_refining(
 
 @inner
 def _stars_per_magnitude(counts: NDArray[np.int32], cell: int, magnitude: float) -> float:
-    """Catalogue stars a magnitude in a field, smoothed over one magnitude; at least one."""
+    """Catalogue stars per magnitude in a field, smoothed over one magnitude; at least one."""
     bins = counts.shape[1]
     middle = magnitude_bin(magnitude, bins)
     low, high = middle - BINS_PER_MAGNITUDE // 2 - 1, min(middle + BINS_PER_MAGNITUDE // 2, bins - 1)
@@ -241,11 +241,11 @@ def log_false_probability(
     Parameters
     ----------
     seen : Table
-        Detections as the refined attitude sees them (rescaled where the focal length was free).
+        Detections under the refined attitude (rescaled where the focal length was free).
     rotation, stars, matched, normal, numbers
-        As `starid.geometric.refinement.refine` leaves them.
+        From `starid.geometric.refinement.refine`.
     prior_volume : float
-        Volume of the rotations that were possible beforehand, rad³: `ROTATIONS` when lost in space.
+        Prior volume of rotations, rad³: `ROTATIONS` when lost in space.
     """
     spread = settings[SCALE_TOLERANCE]
     freedom = 2 * matched - (4 if spread > 0.0 else 3)

@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops, compiled_sums
+from starid.jit import compiled_ieee, compiled_sums
 
 BLOCK_PX: Final = 32
-"""Side of a block; stars fill a percent of it, glare hardly bends within it."""
+"""Side of a block, pixels: stars cover a percent of it, and glare is nearly plane within it."""
 
 LEAST_NOISE_DN: Final = 12.0**-0.5
-"""Rounding to whole counts alone has this standard deviation."""
+"""Standard deviation of rounding to whole counts."""
 
 _ROW_STEP: Final = 4
 _FIRST_SAMPLES: Final = 16
@@ -26,7 +26,7 @@ _LEAST_SAMPLES: Final = 8.0
 
 
 def median(values: npt.NDArray[np.floating]) -> float:
-    """Median of a few hundred numbers at a fifth of the time that numpy's own function takes."""
+    """Median of a few hundred numbers in a fifth of the time of ``numpy.median``."""
     ordered = np.sort(values, axis=None)
     return float(0.5 * (float(ordered[(ordered.size - 1) // 2]) + float(ordered[ordered.size // 2])))
 
@@ -70,7 +70,7 @@ def _refine(
     """Plane through the samples of a block without its stars: (level, slopes by dx and dy, noise).
 
     Samples farther than 3.5 sigmas from the plane are left out, half a count more being allowed, so that rounding to
-    counts does not make the interval lopsided. The places `dx`, `dy` are measured from their mean.
+    counts does not make the interval lopsided. The offsets `dx`, `dy` are measured from their mean.
     """
     level, sigma = np.float32(start[0]), np.float32(start[1])
     along = across = np.float32(0.0)
@@ -103,18 +103,18 @@ def _refine(
     plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
 
 
-@compiled_loops
-def _sample_places(
+@compiled_ieee
+def _sample_offsets(
     columns: int, count: int, dx: npt.NDArray[np.float32], dy: npt.NDArray[np.float32]
 ) -> None:
-    """Places of the samples of a block from their mean, pixels: every fourth row, all its columns."""
+    """Offsets of the samples of a block from their mean, pixels: every fourth row, all its columns."""
     middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (count // columns - 1)
     for k in range(count):
         dx[k] = np.float32(k % columns - middle_x)
         dy[k] = np.float32((k // columns - middle_y) * _ROW_STEP)
 
 
-@compiled_loops
+@compiled_ieee
 def _block_statistics(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     block: int,
@@ -153,10 +153,10 @@ def _block_statistics(
             spread = (first[(3 * chosen) // 4] - first[chosen // 4]) / _QUARTILE_SIGMA
             if laid != (columns, count):
                 laid = (columns, count)
-                _sample_places(columns, count, dx, dy)
+                _sample_offsets(columns, count, dx, dy)
             start = (float(first[chosen // 2]), max(spread, 0.5))
             _refine(values[:count], dx[:count], dy[:count], start, plane)
-            # from the middle of the sampled pixels to the middle of the block's place on the grid
+            # from the middle of the sampled pixels to the middle of the block on the grid
             first_row = top + column % _ROW_STEP
             last_row = first_row + _ROW_STEP * (count // columns - 1)
             off_y = (row + 0.5) * block - 0.5 - 0.5 * (first_row + last_row)
@@ -181,22 +181,22 @@ def estimate_background(
     return Background(level, noise, block_px)
 
 
-@compiled_loops
-def grid_place(position: float, block: float, count: int) -> tuple[int, int, float]:
-    """The two of `count` block centres that a pixel lies between, and how far towards the second.
+@compiled_ieee
+def block_position(position: float, block: float, count: int) -> tuple[int, int, float]:
+    """The two of `count` block centres on either side of a pixel, and its fraction of the way to the second.
 
-    Beyond the outermost centres the share runs on below 0 or above 1, so that slopes go on to the image's edge.
+    Beyond the outermost centres the fraction is below 0 or above 1, so that slopes continue to the image's edge.
     """
     u = (position + 0.5) / block - 0.5
     i = min(max(int(u), 0), max(count - 2, 0))
     return i, min(i + 1, count - 1), u - i
 
 
-@compiled_loops
+@compiled_ieee
 def interpolate_at(grid: npt.NDArray[np.float32], block: float, x: float, y: float) -> float:
-    """Value of a grid of blocks at a pixel position, linear between block centres and on to the edges."""
-    i, i2, q = grid_place(y, block, grid.shape[0])
-    j, j2, p = grid_place(x, block, grid.shape[1])
+    """Value of a grid of blocks at a pixel position, linear between block centres and extrapolated to the edges."""
+    i, i2, q = block_position(y, block, grid.shape[0])
+    j, j2, p = block_position(x, block, grid.shape[1])
     upper = grid[i, j] * (1.0 - p) + grid[i, j2] * p
     lower = grid[i2, j] * (1.0 - p) + grid[i2, j2] * p
     return float(upper * (1.0 - q) + lower * q)

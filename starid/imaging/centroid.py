@@ -2,8 +2,7 @@
 
 The model of a pixel is flux × (share of the spot in the pixel) + background. Position and flux are found by
 Gauss–Newton steps on the weighted squares, each pixel weighted by the inverse of its variance under the model:
-background noise, shot noise of the star's own light, and a share of its light for what the model does not hold
-(pixel response, shape of the spot). The inverse of the normal matrix is then the covariance of the estimate, that
+background noise, shot noise of the star's own light, and a share of its light for errors of the model (pixel response, shape of the spot). The inverse of the normal matrix is then the covariance of the estimate, that
 is the Cramér–Rao bound for the noise given. Saturated pixels carry no weight.
 """
 
@@ -15,15 +14,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops, compiled_sums
 from starid.imaging.normal_table import normal
+from starid.jit import compiled_ieee, compiled_sums
 
 FIT_COLUMNS: Final = 9
 X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
 """Columns of a table of fits; STATE is one of the numbers below."""
 
 UNUSABLE: Final = 1e9
-"""Counts from which on a pixel of a window carries no weight: saturated ones and masked ones are set to infinity."""
+"""Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
 
 GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
 
@@ -38,10 +37,10 @@ _LEAST_PIXELS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _FAR: Final = 5.0
 SHORT_TRAIL_PX: Final = 0.5
-"""A shorter trail is fitted as a round spot."""
+"""Trails shorter than this are fitted as round spots, pixels."""
 
 
-@compiled_loops
+@compiled_ieee
 def spot_profile(
     centre: float,
     sigma: float,
@@ -63,7 +62,7 @@ def spot_profile(
         bell = next_bell
 
 
-@compiled_loops
+@compiled_ieee
 def spot_model(
     x: float,
     y: float,
@@ -98,7 +97,7 @@ def spot_model(
             k += 1
 
 
-@compiled_loops
+@compiled_ieee
 def trail_model(
     x: float,
     y: float,
@@ -143,7 +142,7 @@ def trail_model(
             model[2, k] = by_u * along_y + by_v * along_x
 
 
-@compiled_loops
+@compiled_ieee
 def star_model(
     x: float,
     y: float,
@@ -152,7 +151,7 @@ def star_model(
     model: npt.NDArray[np.float64],
     work: npt.NDArray[np.float64],
 ) -> None:
-    """Model of a round spot or of a trail, whichever the shape (sigma, trail x, trail y) says."""
+    """Model of a round spot or of a trail, depending on the shape (sigma, trail x, trail y)."""
     if math.hypot(shape[1], shape[2]) > SHORT_TRAIL_PX:
         trail_model(x, y, shape[0], (shape[1], shape[2]), window, model)
     else:
@@ -200,7 +199,7 @@ def _normal_equations(
     sums[6], sums[7], sums[8], sums[9], sums[10] = b_x, b_y, b_f, chi2, used
 
 
-@compiled_loops
+@compiled_ieee
 def fit_star(
     pixels: npt.NDArray[np.float32],
     window: tuple[int, int, int, int],
@@ -225,9 +224,9 @@ def fit_star(
         Standard deviation of the spot, and the trail along x and y, pixels.
     noise : (float, float, float)
         Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
-        unknown); share of its light by which the model may be wrong in a pixel.
+        unknown); relative error of the model in a pixel.
     model : ndarray (3, rows·columns)
-        Left with the model near the result.
+        On return, the model near the result.
     work : ndarray (5, side)
         Scratch; side at least that of the window, and 11.
     result : ndarray (FIT_COLUMNS,)
@@ -259,7 +258,7 @@ def fit_star(
         step_y = (c_xy * b_x + c_yy * b_y + c_yf * b_f) * scale
         step_f = (c_xf * b_x + c_yf * b_y + c_ff * b_f) * scale
         longest = max(abs(step_x), abs(step_y))
-        # a step far below the errors changes nothing that could be seen
+        # a step far below the errors is negligible
         small = max(_CONVERGED_PX, _CONVERGED_SIGMA * math.sqrt(max(c_xx, c_yy) * scale))
         small_flux = max(_CONVERGED_FLUX * flux, _CONVERGED_SIGMA * math.sqrt(c_ff * scale))
         settled = longest <= small and abs(step_f) <= small_flux
@@ -285,7 +284,7 @@ def fit_star(
 
 @compiled_sums
 def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) -> float:
-    """Flux that fits a window best at a given place, all pixels weighted alike."""
+    """Best-fitting flux at a fixed position, with equal weights of all pixels."""
     above = 0.0
     below = 1e-12
     for k in range(pixels.size):
@@ -300,10 +299,10 @@ def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) 
 def explained(
     pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    """Drop in the sum of squares of a window that the fitted shape makes, and that its highest pixel alone makes.
+    """Reduction of the sum of squares of a window by the fitted shape, and by its highest pixel alone.
 
-    Each with its best brightness. Where the highest pixel explains more than the shape of a star does, it is a hot
-    pixel or a particle's hit. Returned beside them: the sum of squares itself, and the number of pixels in it.
+    Each has its best-fitting flux. Where the highest pixel explains more than the shape of a star, it is a hot pixel or
+    a particle's hit. The sum of squares itself and its number of pixels are returned too.
     """
     highest = product = total = used = 0.0
     shape2 = 1e-12

@@ -1,4 +1,4 @@
-"""Detection: from an image to stars with sub-pixel positions, fluxes and honest errors."""
+"""Detection of stars with sub-pixel positions, fluxes and calibrated uncertainties."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ _MOST_NEIGHBOURS: Final = 64
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """What detection may know and how careful it is.
+    """Known properties of the image and thresholds of the detection.
 
     Attributes
     ----------
@@ -78,23 +78,23 @@ class DetectionSettings:
     psf_sigma_px : float or None
         Standard deviation of a star's spot; estimated from the frame if None.
     gain_e_per_dn : float or None
-        Electrons a count; with it, shot noise counts in the errors and fluxes are in electrons.
+        Electrons per count; if set, errors include shot noise and fluxes are in electrons.
     saturation_dn : int or None
         Count from which a pixel is saturated; the largest the image's type can hold if None.
     model_error : float
-        Share of a star's light in a pixel that the model of the spot may be wrong by.
+        Relative error of the model of the spot in a pixel.
     max_stars : int
-        Brightest stars that are kept.
+        Most stars returned, the brightest first.
     block_px : int
         Side of the blocks in which the background is estimated.
     follow_trails : bool
-        Whether trails of a turning sensor are looked for.
+        Whether trails of a rotating sensor are searched for.
     blend_px : float
-        Stars closer to each other than this count as one, where one spot would be fitted to them.
+        Stars closer than this are reported as one, at the position that the fit of one spot has.
     pixel_sigma : float
-        Excess over the sky, in sigmas of the noise, from which a pixel counts as lit by a star.
+        Least excess over the sky of a pixel lit by a star, in sigmas of the noise.
     min_star_pixels, max_star_pixels : int
-        Fewest and most lit pixels of a star; candidates with others are refused.
+        Fewest and most lit pixels of a star; other candidates are rejected.
     """
 
     threshold_sigma: float = 5.5
@@ -132,16 +132,16 @@ class DetectionSettings:
 
 @dataclass(frozen=True)
 class Detections:
-    """Stars found on a frame, brightest first.
+    """Stars found on an image, brightest first.
 
     Attributes
     ----------
     xy_px : ndarray (n, 2)
         Positions; pixel centres are integers. On a trail, its middle.
     flux, flux_sigma : ndarray (n,)
-        Light and its error, in electrons if the gain was given, else in counts.
+        Flux and its error, in electrons if the gain is set, else in counts.
     xy_sigma_px : ndarray (n, 2)
-        Errors of the position along x and y, one standard deviation.
+        One-sigma errors of the position along x and y, pixels.
     saturated, edge : ndarray (n,) of bool
         The star has saturated pixels; its light is cut by the image's edge.
     background, noise : float
@@ -150,10 +150,10 @@ class Detections:
         Width of the spot that was used.
     trail_px : float
         Median length of the stars' trails; 0 where they are round.
-    refused : int
-        Candidates that stood out of the noise and are no stars: hot pixels, bodies, edges.
+    rejected : int
+        Candidates above the noise that are not stars: hot pixels, bodies, edges.
     reason : str
-        Why there is no star; empty where there is one.
+        Why no star was found; empty otherwise.
     """
 
     xy_px: npt.NDArray[np.float64]
@@ -166,7 +166,7 @@ class Detections:
     noise: float
     psf_sigma_px: float
     trail_px: float
-    refused: int
+    rejected: int
     reason: str
 
     @property
@@ -187,49 +187,49 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     image : ndarray (h, w), uint8 or uint16
         Counts, one channel, at least 16 × 16 pixels.
     settings : DetectionSettings, optional
-        What is known of the image.
+        Known properties of the image.
 
     Returns
     -------
     Detections
-        Empty, with a reason, where nothing stands out.
+        Empty, with a reason, where no star is found.
 
     Raises
     ------
     StaridError
-        The image is not one of the above.
+        The image has another type or shape.
     """
     chosen = DetectionSettings() if settings is None else settings
-    counts = _checked(image)
+    counts = _checked_image(image)
     saturation = chosen.saturation_dn if chosen.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
     background = estimate_background(counts, chosen.block_px)
     if background.median_level >= saturation:
-        return _nothing(background, "image is saturated all over: shorten the exposure")
+        return _no_detections(background, "image is saturated all over: shorten the exposure")
     sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
     peaks, heights = _peaks(counts, background, sigma, chosen.threshold_sigma)
-    shape = _shape(counts, background, peaks, chosen, saturation)
+    shape = _estimate_shape(counts, background, peaks, chosen, saturation)
     if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
         peaks, heights = _peaks(counts, background, shape.sigma_px, chosen.threshold_sigma)
-        shape = _shape(counts, background, peaks, chosen, saturation, shape.sigma_px)
+        shape = _estimate_shape(counts, background, peaks, chosen, saturation, shape.sigma_px)
     if shape.trail_px > _TRAIL_FILTER_PX:
         peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
     if len(peaks) == 0:
         flat = float(counts.min()) == float(counts.max())
-        return _nothing(
+        return _no_detections(
             background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
         )
-    found, misfits = _measured(counts, background, peaks, heights, shape, chosen, saturation)
+    found, misfits = _measure_candidates(counts, background, peaks, heights, shape, chosen, saturation)
     suspicious = misfits >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(found))
     if suspicious and chosen.follow_trails and shape.trail_px == 0.0:
         shape = _trails_among_round(counts, background, peaks, shape, saturation)
         if shape.trail_px > 0.0:
             peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
-            found, _ = _measured(counts, background, peaks, heights, shape, chosen, saturation)
+            found, _ = _measure_candidates(counts, background, peaks, heights, shape, chosen, saturation)
     return found
 
 
-def _checked(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Refuse what is no grey image of counts; give the rest in the processor's own byte order, rows unbroken."""
+def _checked_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """Validate a grey image of counts; return it contiguous and in native byte order."""
     if not isinstance(image, np.ndarray):
         raise StaridError(f"image: a {type(image).__name__} given, an array (h, w) of uint8 or uint16 needed")
     if image.ndim != 2:
@@ -244,13 +244,13 @@ def _checked(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDAr
     return np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
 
 
-def _nothing(background: Background, reason: str, refused: int = 0) -> Detections:
+def _no_detections(background: Background, reason: str, rejected: int = 0) -> Detections:
     """Detections without a star."""
     none = np.zeros(0)
     pairs = np.zeros((0, 2))
     no = np.zeros(0, dtype=bool)
     level, noise = background.median_level, background.median_noise
-    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, refused, reason)
+    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, rejected, reason)
 
 
 def _peaks(
@@ -300,7 +300,7 @@ def _trail_peaks(
 def _search(
     search: Callable[[Grid, npt.NDArray[np.int32], Grid], int], background: Background, factor: float
 ) -> tuple[npt.NDArray[np.int32], Grid]:
-    """Search for peaks above `factor` times the noise, or above more where there are too many to list."""
+    """Search for peaks above `factor` times the noise, or above a higher threshold where there are too many."""
     peaks = np.empty((_MOST_PEAKS, 2), dtype=np.int32)
     heights = np.empty(_MOST_PEAKS, dtype=np.float32)
     while True:
@@ -317,7 +317,7 @@ def _search(
     return peaks[order], heights[order]
 
 
-def _shape(
+def _estimate_shape(
     counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     background: Background,
     peaks: npt.NDArray[np.int32],
@@ -330,7 +330,7 @@ def _shape(
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
     tries = peaks[: 4 * _STARS_FOR_SHAPE]
     grid = (background.level, float(background.block_px))
-    # a few stars tell whether there are trails at all; more are needed only to follow them
+    # a few stars show whether there are trails at all; more are needed only to follow them
     for wanted in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
         table = np.empty((wanted, MOMENT_COLUMNS))
         count = moments_of(counts, tries, *grid, start, _SHAPE_WINDOW_PX, float(saturation), table)
@@ -355,7 +355,7 @@ def _trails_among_round(
     shape: SpotShape,
     saturation: int,
 ) -> SpotShape:
-    """Look whether stars leave trails though the brightest objects are round."""
+    """Check whether stars leave trails although the brightest objects are round."""
     tries = peaks[:_PEAKS_FOR_TRAILS]
     table = np.empty((len(tries), MOMENT_COLUMNS))
     limits = (shape.sigma_px, _SHAPE_WINDOW_PX, float(saturation))
@@ -363,7 +363,7 @@ def _trails_among_round(
     return trails_among_round(table[:count], counts.shape[1], counts.shape[0], shape)
 
 
-def _fitted(
+def _fit_candidates(
     windows: Table,
     pixels: Grid,
     sensor: tuple[float, float, float, float, float],
@@ -371,7 +371,7 @@ def _fitted(
     size: tuple[int, int],
     blend_px: float,
 ) -> tuple[Table, Table, npt.NDArray[np.uint8]]:
-    """Windows, fits and flags of the candidates, and of the companions that bad fits betray."""
+    """Windows, fits and flags of the candidates, and of the companions that bad fits indicate."""
     count = len(windows)
     stars, flags = np.zeros((count, FIT_COLUMNS)), np.zeros(count, dtype=np.uint8)
     first = np.empty(count + 1, dtype=np.int32)
@@ -397,7 +397,7 @@ def _fitted(
     )
 
 
-def _measured(
+def _measure_candidates(
     counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     background: Background,
     peaks: npt.NDArray[np.int32],
@@ -406,7 +406,7 @@ def _measured(
     settings: DetectionSettings,
     saturation: int,
 ) -> tuple[Detections, int]:
-    """Fit the candidates and keep the stars; tell beside them how many fits the shape of a star does not explain."""
+    """Fit the candidates and keep the stars; also count the fits that the shape of a star does not explain."""
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
     gain = settings.gain_e_per_dn
     per_dn = 0.0 if gain is None else 1.0 / gain
@@ -422,12 +422,12 @@ def _measured(
     sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, saturation - background.median_level)
     lit = (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels))
     size = (counts.shape[1], counts.shape[0])
-    windows, stars, flags = _fitted(windows, pixels, sensor, lit, size, settings.blend_px)
+    windows, stars, flags = _fit_candidates(windows, pixels, sensor, lit, size, settings.blend_px)
     good = np.flatnonzero(stars[:, STATE] == GOOD)
     if good.size == 0:
-        return _nothing(background, "nothing on the image has the shape of a star", count), count
+        return _no_detections(background, "nothing on the image has the shape of a star", count), count
     again = (stars[:, STATE] == TWICE) | (windows[:, COLUMNS] == SEEN_BEFORE)
-    refused = len(stars) - good.size - int(np.count_nonzero(again))
+    rejected = len(stars) - good.size - int(np.count_nonzero(again))
     good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
     fits, marks = stars[good], flags[good]
     freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
@@ -447,7 +447,7 @@ def _measured(
         typical,
         shape.sigma_px,
         shape.trail_px,
-        refused,
+        rejected,
         "",
     )
     misfits = int(np.count_nonzero(is_bad) + np.count_nonzero(stars[:, STATE] == NOT_A_STAR))

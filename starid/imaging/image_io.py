@@ -1,4 +1,4 @@
-"""Image files: PNG, TIFF and JPEG of 8 or 16 bit, read only if grey and whole, written whole."""
+"""Reading and writing of grey PNG, TIFF and JPEG images of 8 or 16 bits."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.cache import write_atomically
 from starid.errors import StaridError
-from starid.files import MEGABYTE, is_stream, read_bytes
+from starid.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
 IMAGE_LIMIT: Final = 1000 * MEGABYTE
 """Largest image file that is read, bytes: a colour TIFF of 16 bits of the largest cameras has some 900 MB."""
@@ -33,7 +32,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
     path : path
         The file.
     allow_colour : bool
-        Turn a colour image into grey (luma of BT.601, alpha dropped) instead of refusing it.
+        Turn a colour image into grey (luma of BT.601, alpha dropped) instead of rejecting it.
 
     Returns
     -------
@@ -69,18 +68,22 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
         raise StaridError(f"image {source}: pixels of type {pixels.dtype}; 8 or 16 bit whole numbers needed")
     low, high = int(pixels.min()), int(pixels.max())
     if low == high:
-        look = {0: "all black", 256**pixels.dtype.itemsize - 1: "all white"}.get(low, "without any contrast")
-        raise StaridError(f"image {source}: {look}, every pixel is {low}; give a frame that shows stars")
+        appearance = {0: "all black", 256**pixels.dtype.itemsize - 1: "all white"}.get(
+            low, "without any contrast"
+        )
+        raise StaridError(
+            f"image {source}: {appearance}, every pixel is {low}; give a frame that shows stars"
+        )
     return np.ascontiguousarray(pixels)
 
 
 def image_suffix(path: Path) -> str:
-    """Return the suffix that chooses the format of an image to write: that of its name, .png for a device or pipe without.
+    """Return the suffix that selects the format of an image to write; .png for a device or pipe without a suffix.
 
     Raises
     ------
     StaridError
-        The suffix is that of no format known here.
+        The suffix is not that of a supported format.
     """
     suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
     if suffix not in _SUFFIXES:
@@ -89,12 +92,12 @@ def image_suffix(path: Path) -> str:
 
 
 def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Write a grey or colour image, whole or not at all.
+    """Write a grey or colour image atomically.
 
     Parameters
     ----------
     path : path
-        Its suffix chooses the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy); a device or pipe
+        Its suffix selects the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy); a device or pipe
         without one gets a PNG.
     image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
         Colour in the order blue, green, red.
@@ -110,7 +113,7 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
     suffix = image_suffix(target)
     if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
         raise StaridError(
-            f"image {target}: JPEG holds 8 bits a pixel, this frame has 16; write a PNG or TIFF"
+            f"image {target}: JPEG holds 8 bits per pixel, this image has 16; write a PNG or TIFF"
         )
     done, packed = cv2.imencode(suffix, image)
     if not done:
@@ -126,7 +129,7 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
 
 
 def _check_whole(source: Path, content: bytes) -> None:
-    """Refuse what is no PNG, TIFF or JPEG, and PNG or JPEG files that break off."""
+    """Reject files that are not PNG, TIFF or JPEG, and truncated PNG and JPEG files."""
     if content.startswith(_PNG):
         whole = _png_is_whole(content)
     elif content.startswith(_JPEG):
@@ -145,7 +148,7 @@ def _truncated(source: Path) -> StaridError:
 
 
 def _png_is_whole(content: bytes) -> bool:
-    """Walk the chunks: every checksum right, and the end chunk there."""
+    """Whether every chunk of a PNG has the right checksum and the end chunk is present."""
     at = len(_PNG)
     while at + _CHUNK_FRAME <= len(content):
         size = int.from_bytes(content[at : at + 4], "big")

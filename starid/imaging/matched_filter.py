@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.background import grid_place
-from starid.imaging.jit_loops import compiled_loops, compiled_sums
+from starid.imaging.background import block_position
+from starid.jit import compiled_ieee, compiled_sums
 
 INTEGER_TAPS_SUM: Final = 16
-"""Sum of the integer filter's taps along one axis; a byte smoothed along both axes fills 16 bits then."""
+"""Sum of the integer filter's taps along one axis: a byte smoothed along both axes fits 16 bits."""
 
 _SHARP_BELOW_PX: Final = 0.65
 _INTEGER_UP_TO_PX: Final = 1.3
@@ -52,14 +52,14 @@ def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
     return _SHARP_TAPS if sigma_px < _SHARP_BELOW_PX else _SOFT_TAPS
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_down(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     y: int,
     taps: npt.NDArray[np.float32],
     out: npt.NDArray[np.float32],
 ) -> None:
-    """Smooth row y of the image across rows; beyond the first and the last row these go on."""
+    """Smooth row y of the image across rows; the first and the last row are repeated beyond the edge."""
     height, width = image.shape
     reach = taps.size - 1
     bottom = height - 1
@@ -82,11 +82,11 @@ def _smooth_down(
             out[x] += tap * np.float32(np.int32(up[x]) + np.int32(down[x]))
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_along(
     padded: npt.NDArray[np.float32], taps: npt.NDArray[np.float32], out: npt.NDArray[np.float32]
 ) -> None:
-    """Smooth a row that is padded by the reach of the filter at both ends; beyond them it goes on."""
+    """Smooth a row padded by the reach of the filter at both ends with the values there."""
     width = out.size
     reach = taps.size - 1
     for k in range(reach):
@@ -109,7 +109,7 @@ def _smooth_along(
             out[x] += tap * (left[x] + right[x])
 
 
-@compiled_loops
+@compiled_ieee
 def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
     """Values of row i of a grid of blocks at every image column."""
     columns = grid.shape[1]
@@ -126,22 +126,22 @@ def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDA
         start = max(end, start)
 
 
-@compiled_loops
-def _between(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[np.float32]) -> None:
-    """Threshold of a row between two lines of it."""
+@compiled_ieee
+def _threshold_row(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[np.float32]) -> None:
+    """Interpolate the threshold of a row between two grid lines."""
     upper, lower = lines[0], lines[1]
     for x in range(limit.size):
         limit[x] = upper[x] + q * (lower[x] - upper[x])
 
 
-@compiled_loops
+@compiled_ieee
 def _flag_groups(
     row: npt.NDArray[np.float32],
     limit: npt.NDArray[np.float32],
     above: npt.NDArray[np.uint8],
     flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Mark the groups of 32 pixels in which one lies above its limit; `above` is scratch of 32 bytes a group, zeros."""
+    """Mark the groups of 32 pixels with one above its limit; `above` is workspace of 32 zero bytes per group."""
     for x in range(row.size):
         above[x] = row[x] > limit[x]
     words = above.view(np.uint64)
@@ -168,7 +168,7 @@ def _flag_groups_integer(
         flags[whole] = 1
 
 
-@compiled_loops
+@compiled_ieee
 def _peaks_of_row(
     y: int,
     row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
@@ -180,9 +180,9 @@ def _peaks_of_row(
     peaks: npt.NDArray[np.int32],
     heights: npt.NDArray[np.float32],
 ) -> int:
-    """Add the peaks of row y above its limit, in the groups that are marked, to the list; return how many there are.
+    """Add the peaks of row y above its limit, in the groups that are marked, to the list; return their number.
 
-    A peak is a pixel with no higher neighbour, nor an earlier one as high. The three rows have a zero more at either end.
+    A peak is a pixel with no higher neighbour, nor an earlier one as high. The three rows have an additional zero at either end.
     """
     is_top = np.empty(_GROUP, np.bool_)
     for group in range(flags.size):
@@ -216,19 +216,19 @@ def _peaks_of_row(
     return count
 
 
-@compiled_loops
-def _set_lines(
+@compiled_ieee
+def _update_grid_lines(
     grid: npt.NDArray[np.float32], block: float, y: int, current: int, lines: npt.NDArray[np.float32]
 ) -> tuple[int, np.float32]:
-    """Have the two lines of a grid of blocks ready that row y lies between; return which, and how far between."""
-    i, i2, q = grid_place(float(y), block, grid.shape[0])
+    """Update the two grid lines on either side of row y; return the first one and the fraction between them."""
+    i, i2, q = block_position(float(y), block, grid.shape[0])
     if i != current:
         _grid_line(grid, i, block, lines[0])
         _grid_line(grid, i2, block, lines[1])
     return i, np.float32(q)
 
 
-@compiled_loops
+@compiled_ieee
 def find_peaks(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     threshold: npt.NDArray[np.float32],
@@ -257,7 +257,7 @@ def find_peaks(
     Returns
     -------
     int
-        Number of peaks; m of them means that there was no room for all, and that rows further down were not seen.
+        Number of peaks; m means that the list is full and later rows were not searched.
     """
     height, width = image.shape
     reach = taps.size - 1
@@ -277,15 +277,15 @@ def find_peaks(
             smooth[y % 3] = 0.0
         if y > 0:
             # row y − 1 has both neighbours now
-            line, q = _set_lines(threshold, block, y - 1, line, lines)
+            line, q = _update_grid_lines(threshold, block, y - 1, line, lines)
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
-            _between(lines, q, limit)
+            _threshold_row(lines, q, limit)
             _flag_groups(row[1 : width + 1], limit, above, flags)
             count = _peaks_of_row(y - 1, row, before, after, limit, flags, count, peaks, heights)
     return count
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_down_integer(
     image: npt.NDArray[np.uint8], y: int, taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
 ) -> None:
@@ -301,11 +301,11 @@ def _smooth_down_integer(
         out[x] = np.uint16(np.uint16(np.uint16(centre[x]) * t0) + np.uint16(near * t1) + np.uint16(far * t2))
 
 
-@compiled_loops
+@compiled_ieee
 def _smooth_along_integer(
     padded: npt.NDArray[np.uint16], taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
 ) -> None:
-    """As `_smooth_along`, in 16-bit integers; `padded` has two more at either end."""
+    """As `_smooth_along`, in 16-bit integers; `padded` has two additional values at either end."""
     width = out.size
     padded[0] = padded[1] = padded[2]
     padded[width + 2] = padded[width + 3] = padded[width + 1]
@@ -316,7 +316,7 @@ def _smooth_along_integer(
         out[x] = np.uint16(np.uint16(padded[x + 2] * t0) + np.uint16(near * t1) + np.uint16(far * t2))
 
 
-@compiled_loops
+@compiled_ieee
 def find_peaks_in_bytes(
     image: npt.NDArray[np.uint8],
     threshold: npt.NDArray[np.float32],
@@ -344,7 +344,7 @@ def find_peaks_in_bytes(
             smooth[y % 3] = 0
         if y > 0:
             if (y - 1) % _LINE_STEP == 0:
-                line, q = _set_lines(threshold, block, y - 1 + _LINE_STEP // 2, line, lines)
+                line, q = _update_grid_lines(threshold, block, y - 1 + _LINE_STEP // 2, line, lines)
                 upper, lower = lines[0], lines[1]
                 for x in range(width):
                     value = np.int32(scale * (upper[x] + q * (lower[x] - upper[x])))

@@ -1,4 +1,4 @@
-"""From candidates to stars: each is fitted in its own window without its neighbours' light, and judged."""
+"""Fit of each candidate in its window without its neighbours' light, and its classification."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from starid.imaging.centroid import (
     fit_star,
     star_model,
 )
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.windows import (
     COLUMNS,
     LEFT,
@@ -40,16 +39,17 @@ from starid.imaging.windows import (
     TRAIL_X,
     TRAIL_Y,
 )
+from starid.jit import compiled_ieee
 
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
 
 FRESH: Final = (0, 3)
 AGAIN: Final = (1, 4)
-"""First and last round of `measure`: from the candidates, and on from fits that are there."""
+"""First and last round of `measure`: from the candidates, or from existing fits."""
 
 FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
-"""Further reasons, beside those of `starid.imaging.centroid`, for which a candidate is no star."""
+"""Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""
 
 _LEAST_EXPLAINED: Final = 0.55
 _SHARP_SIGMA_PX: Final = 0.5
@@ -57,7 +57,7 @@ _WANDER_PX: Final = 1.5
 _WING_SHARE: Final = 0.6
 _EDGE_SIGMA: Final = 2.5
 BAD_FIT: Final = 4.0
-"""Sum of weighted squares, per degree of freedom, from which a fit is bad."""
+"""Least sum of weighted squares per degree of freedom of a bad fit."""
 
 _STRAY_SIGMA: Final = 7.0
 _STRAY_DISTANCE_SIGMA: Final = 2.0
@@ -65,30 +65,30 @@ FIT_PARAMETERS: Final = 3
 _LEAST_SIDE: Final = 11
 
 
-@compiled_loops
+@compiled_ieee
 def find_neighbours(
     windows: npt.NDArray[np.float64],
     order: npt.NDArray[np.int64],
     first: npt.NDArray[np.int32],
     neighbours: npt.NDArray[np.int32],
 ) -> int:
-    """List for every window the others whose stars' light may reach into it.
+    """List for every window the others whose stars may contribute light to it.
 
     Parameters
     ----------
     windows : ndarray (n, WINDOW_COLUMNS)
         From `lay_windows`.
     order : ndarray (n,)
-        Their numbers in the order of START_Y.
+        Indices of the windows in the order of START_Y.
     first : ndarray (n + 1,)
         Filled: the neighbours of k are ``neighbours[first[k]:first[k + 1]]``.
     neighbours : ndarray (m,)
-        Filled as far as it goes.
+        Filled as far as it has room.
 
     Returns
     -------
     int
-        How many there are; more than m says that there was no room for all.
+        Number of neighbours; more than m means that there was not enough room.
     """
     count = 0
     place = np.empty(order.size, np.int32)
@@ -123,7 +123,7 @@ def find_neighbours(
     return count
 
 
-@compiled_loops
+@compiled_ieee
 def _mask_stray_pixel(
     pixels: npt.NDArray[np.float32],
     model: npt.NDArray[np.float64],
@@ -133,7 +133,7 @@ def _mask_stray_pixel(
     per_dn: float,
     model_error: float,
 ) -> bool:
-    """Take the pixel that contradicts the fit most, if one does and is off the star's core, out of the fit."""
+    """Mask the pixel that contradicts the fit most, if any does, outside the star's core."""
     worst = _STRAY_SIGMA * _STRAY_SIGMA
     stray = -1
     variance = window[NOISE] * window[NOISE]
@@ -154,8 +154,8 @@ def _mask_stray_pixel(
     return stray >= 0
 
 
-@compiled_loops
-def _judge(
+@compiled_ieee
+def _classify_fit(
     pixels: npt.NDArray[np.float32],
     model: npt.NDArray[np.float64],
     star: npt.NDArray[np.float64],
@@ -166,7 +166,7 @@ def _judge(
     lit: tuple[float, float, float],
     size: tuple[int, int],
 ) -> float:
-    """Decide whether a fit is a star: GOOD, or why it is not."""
+    """Return GOOD for a star, else the reason to reject the fit."""
     width, height = size
     noise, patch = window[NOISE], window[PATCH]
     length = math.hypot(window[TRAIL_X], window[TRAIL_Y])
@@ -188,7 +188,7 @@ def _judge(
     if math.hypot(star[X] - window[START_X], star[Y] - window[START_Y]) > allowed:
         return float(WANDERED)
     if patch > 0.0:
-        # the wings must call for a core that saturates
+        # the wings must imply a saturated core
         return (
             float(GOOD)
             if star[FLUX] * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn
@@ -202,7 +202,7 @@ def _judge(
     return float(GOOD)
 
 
-@compiled_loops
+@compiled_ieee
 def _flags(
     star: npt.NDArray[np.float64],
     window: npt.NDArray[np.float64],
@@ -229,24 +229,24 @@ def _flags(
     return flags
 
 
-@compiled_loops
-def _take_away(
+@compiled_ieee
+def _subtract_star(
     star: npt.NDArray[np.float64],
     shape: tuple[float, float, float],
-    place: tuple[int, int, int, int],
+    bounds: tuple[int, int, int, int],
     lights: npt.NDArray[np.float64],
     work: npt.NDArray[np.float64],
     target: npt.NDArray[np.float32],
 ) -> None:
-    """Take the light of a star, if it is one, out of a window."""
+    """Subtract the light of a star, if it is one, from a window."""
     if star[STATE] != GOOD:
         return
-    star_model(star[X], star[Y], shape, place, lights, work)
+    star_model(star[X], star[Y], shape, bounds, lights, work)
     for i in range(target.size):
         target[i] -= np.float32(star[FLUX] * lights[0, i])
 
 
-@compiled_loops
+@compiled_ieee
 def measure(
     windows: npt.NDArray[np.float64],
     pixels: npt.NDArray[np.float32],
@@ -262,8 +262,8 @@ def measure(
 ) -> None:
     """Fit and judge candidates.
 
-    The brightest come first, and each is fitted after the light of its brighter neighbours is taken away; those
-    with neighbours are then fitted again without the light of all of them.
+    The brightest come first, and each is fitted after the light of its brighter neighbours is subtracted; those with
+    neighbours are then fitted again without the light of all of them.
 
     Parameters
     ----------
@@ -279,10 +279,10 @@ def measure(
     size : (int, int)
         Columns and rows of the image.
     todo : ndarray (n,) of bool
-        Which candidates to fit; the others' fits count as they are.
+        The candidates to fit; the fits of the others are kept.
     turns : (int, int)
-        `FRESH`, or `AGAIN` to go on from fits that are there already: more rounds, in which neighbours yield to each
-        other, and in the last of which a fit that stays bad is made again without the pixel that contradicts it most.
+        First and last round: `FRESH`, or `AGAIN` to continue from existing fits. In the last round a fit that stays bad is
+        repeated without the pixel that contradicts it most.
     stars : ndarray (n, FIT_COLUMNS)
         Filled with the fits.
     flags : ndarray (n,)
@@ -310,8 +310,8 @@ def measure(
                 continue
             if turn > 0 and (star[STATE] != GOOD or (alone and not last)):
                 continue
-            place = (int(window[LEFT]), int(window[TOP]), int(window[COLUMNS]), int(window[ROWS]))
-            count = place[2] * place[3]
+            bounds = (int(window[LEFT]), int(window[TOP]), int(window[COLUMNS]), int(window[ROWS]))
+            count = bounds[2] * bounds[3]
             begin = int(window[OFFSET])
             own = pixels[begin : begin + count]
             model = models[:, :count]
@@ -321,19 +321,19 @@ def measure(
                 target = cleaned[:count]
                 target[:] = own
                 for entry in range(first[k], first[k + 1]):
-                    _take_away(stars[neighbours[entry]], shape, place, lights, work, target)
+                    _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
             guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
-            fit_star(target, place, guess, shape, noise, model, work, star)
+            fit_star(target, bounds, guess, shape, noise, model, work, star)
             if (
                 last
                 and star[STATE] == GOOD
                 and star[CHI2] > BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
                 and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
             ):
-                fit_star(target, place, (star[X], star[Y]), shape, noise, model, work, star)
+                fit_star(target, bounds, (star[X], star[Y]), shape, noise, model, work, star)
             if star[STATE] == GOOD:
-                star[STATE] = _judge(
+                star[STATE] = _classify_fit(
                     target, model, star, window, sigma, least_ratio, saturation_dn, lit, size
                 )
             if star[STATE] == GOOD:
@@ -341,14 +341,14 @@ def measure(
         _drop_doubles(stars, first, neighbours, sigma)
 
 
-@compiled_loops
+@compiled_ieee
 def _drop_doubles(
     stars: npt.NDArray[np.float64],
     first: npt.NDArray[np.int32],
     neighbours: npt.NDArray[np.int32],
     sigma: float,
 ) -> None:
-    """Mark the fainter of two fits that have come to the same place."""
+    """Mark the fainter of two fits with the same position."""
     reach = max(0.7 * sigma, 0.5)
     for k in range(stars.shape[0]):
         for place in range(first[k], first[k + 1]):

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 REACH: Final = 8.0
 """Beyond this many standard deviations the distribution is taken as 0 or 1."""
@@ -19,7 +19,7 @@ _CDF: Final = np.array([0.5 * math.erfc(-node / math.sqrt(2.0)) for node in _NOD
 _PDF: Final = np.exp(-0.5 * _NODES**2) / math.sqrt(2.0 * math.pi)
 
 
-@compiled_loops
+@compiled_ieee
 def normal(z: float) -> tuple[float, float]:
     """Distribution and density of the standard normal at z, to 1e-8."""
     if z <= -REACH:

@@ -1,4 +1,4 @@
-"""Stars too close for a peak each: a badly fitted star is tried as two, fitted together."""
+"""Deblending: a badly fitted star is fitted as two stars too close for separate peaks."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from starid.imaging.centroid import (
     Y,
     star_model,
 )
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y
+from starid.jit import compiled_ieee
 from starid.photometry import EVEN_PAIR
 
 Array = npt.NDArray[np.float64]
@@ -43,11 +43,11 @@ _FAR_SIGMA: Final = 4.0
 _CORE_SIGMA: Final = 1.0
 _ONE_PIXEL: Final = 0.5
 _DOUBTFUL: Final = 1.4
-"""Pairs closer than this many blending distances may be one star to who counts in angles: off the axis of a wide lens
-the same angle covers more pixels."""
+"""Pairs closer than this many blending distances may be one star in a catalogue merged by angle: off the axis of a wide
+lens the same angle covers more pixels."""
 
 
-@compiled_loops
+@compiled_ieee
 def _invert(matrix: Array, inverse: Array) -> bool:
     """Invert a small positive matrix by Gauss–Jordan elimination, destroying it; False if it is singular."""
     size = matrix.shape[0]
@@ -70,7 +70,7 @@ def _invert(matrix: Array, inverse: Array) -> bool:
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def fit_pair(
     pixels: npt.NDArray[np.float32],
     window: tuple[int, int, int, int],
@@ -87,14 +87,14 @@ def fit_pair(
     pixels, window, shape, noise, work
         As in `fit_star`.
     models : ndarray (6, rows·columns)
-        Left with both stars' models.
+        On return, the models of both stars.
     pair : ndarray (2, FIT_COLUMNS)
-        Holds first guesses of X, Y and FLUX; filled with the fits. CHI2 and PIXELS are those of the whole.
+        Holds first guesses of X, Y and FLUX; filled with the fits. CHI2 and PIXELS refer to both together.
 
     Returns
     -------
     bool
-        Whether the fit has come to rest.
+        Whether the fit converged.
     """
     variance, per_dn, model_error = noise
     error2 = model_error * model_error
@@ -159,11 +159,11 @@ def fit_pair(
     return False
 
 
-@compiled_loops
-def _start(
+@compiled_ieee
+def _first_guesses(
     left_over: Array, window: tuple[int, int, int, int], star: Array, sigma: float, pair: Array
 ) -> bool:
-    """First guesses of two stars in place of one, from the light that its fit leaves; False if it leaves none."""
+    """First guesses of two stars from the residual of the fit of one; False if there is no residual light."""
     left, top, columns, rows = window
     best = 0.0
     best_x = best_y = 0.0
@@ -188,7 +188,7 @@ def _start(
         pair[1, Y] += best_y
         pair[1, FLUX] = min(best * 2.0 * math.pi * sigma * sigma, star[FLUX])
         return True
-    # hardly apart: both share the light, on either side of where one was fitted
+    # hardly apart: both share the light, on either side of the single fit
     half = 0.5 * _PAIR_SIGMA * sigma / distance
     for k in range(2):
         sense = 1.0 if k == 1 else -1.0
@@ -198,7 +198,7 @@ def _start(
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def _is_better(
     pair: Array, chi2: float, sigma: float, models: Array, pixels: npt.NDArray[np.float32]
 ) -> bool:
@@ -222,26 +222,26 @@ def _is_better(
     return highest < _ONE_PIXEL * everything
 
 
-@compiled_loops
-def _shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
-    """How far from a star towards its companion, as a share of their distance, one spot would be fitted."""
+@compiled_ieee
+def _blend_shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
+    """Position of the fit of one spot between a star and its companion, as a share of their distance."""
     gaussian = math.exp(-(off_x * off_x + off_y * off_y) / (blend_px * blend_px))
     share = 1.0 - (1.0 - gaussian) * max(1.0 - (ratio / EVEN_PAIR) ** 2, 0.0)
     return share * ratio / (1.0 + ratio)
 
 
-@compiled_loops
+@compiled_ieee
 def doubt_close_pairs(stars: Array, order: npt.NDArray[np.int64], blend_px: float) -> None:
-    """Widen the errors of the brighter star of a pair that is told apart, but hardly.
+    """Increase the errors of the brighter star of a pair that is barely resolved.
 
-    A catalogue whose close pairs are blended may have it as one star, elsewhere by the shift of a blend.
+    A catalogue with merged close pairs may hold it as one star, displaced by the shift of the merged position.
 
     Parameters
     ----------
     stars : ndarray (n, FIT_COLUMNS)
         Fits; VAR_X and VAR_Y grow.
     order : ndarray (n,)
-        Their numbers by falling Y.
+        Indices of the stars by falling Y.
     blend_px : float
         As in `split_pairs`.
     """
@@ -258,29 +258,29 @@ def doubt_close_pairs(stars: Array, order: npt.NDArray[np.int64], blend_px: floa
             brighter, ratio = (one, other[FLUX] / one[FLUX])
             if ratio > 1.0:
                 brighter, ratio = other, 1.0 / ratio
-            shift = _shift(off_x, off_y, ratio, blend_px)
+            shift = _blend_shift(off_x, off_y, ratio, blend_px)
             brighter[VAR_X] += (shift * off_x) ** 2
             brighter[VAR_Y] += (shift * off_y) ** 2
 
 
-@compiled_loops
+@compiled_ieee
 def _merge(pair: Array, blend_px: float, star: Array) -> None:
-    """Put one star in place of two: all their light where one spot would be fitted, with the errors of the fit of one.
+    """Replace two stars by one with all their light, at the position and with the errors of the fit of one spot.
 
-    That place is the one of `starid.photometry.fitted_share`, so that pairs which are seen to be two and those which
-    are not stand where an index of blended stars has them.
+    The position is that of `starid.photometry.fitted_share`, so that resolved and unresolved pairs agree with an index
+    of merged stars.
     """
     faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
     bright = pair[1 - faint]
     off_x, off_y = pair[faint, X] - bright[X], pair[faint, Y] - bright[Y]
-    shift = _shift(off_x, off_y, pair[faint, FLUX] / bright[FLUX], blend_px)
+    shift = _blend_shift(off_x, off_y, pair[faint, FLUX] / bright[FLUX], blend_px)
     star[X], star[Y] = bright[X] + shift * off_x, bright[Y] + shift * off_y
     total = pair[0, FLUX] + pair[1, FLUX]
     star[FLUX] = total
     star[CHI2], star[PIXELS] = pair[0, CHI2], pair[0, PIXELS]
 
 
-@compiled_loops
+@compiled_ieee
 def split_pairs(
     windows: Array,
     pixels: npt.NDArray[np.float32],
@@ -294,7 +294,7 @@ def split_pairs(
     owners: npt.NDArray[np.int64],
     todo: npt.NDArray[np.bool_],
 ) -> int:
-    """Try badly fitted stars as pairs; the brighter one takes the place of the star that was fitted.
+    """Fit badly fitted stars as pairs; the brighter member replaces the original star.
 
     Parameters
     ----------
@@ -303,20 +303,20 @@ def split_pairs(
     noise : (float, float, float)
         Standard deviation of the spot, pixels; variance in counts² that a count of star light brings; model error.
     suspects : ndarray (m,)
-        Numbers of the stars to try.
+        Indices of the stars to try.
     blend_px : float
-        Pairs closer than this stay one star, where one spot would be fitted to them.
+        Pairs closer than this stay one star, at the position of the fit of one spot.
     partners : ndarray (m, FIT_COLUMNS)
         Filled with the fits of the fainter stars.
     owners : ndarray (m,)
-        Filled with the numbers of the stars they stood beside.
+        Filled with the indices of the brighter members.
     todo : ndarray (n,) of bool
-        Cleared for the stars that turn out to be pairs.
+        Cleared for the stars that are pairs.
 
     Returns
     -------
     int
-        How many pairs there are that are two stars.
+        Number of pairs resolved as two stars.
     """
     sigma, per_dn, model_error = noise
     largest, side = 1, _LEAST_SIDE
@@ -330,8 +330,13 @@ def split_pairs(
     pair = np.empty((2, stars.shape[1]))
     found = 0
     for k in suspects:
-        place = (int(windows[k, LEFT]), int(windows[k, TOP]), int(windows[k, COLUMNS]), int(windows[k, ROWS]))
-        count = place[2] * place[3]
+        bounds = (
+            int(windows[k, LEFT]),
+            int(windows[k, TOP]),
+            int(windows[k, COLUMNS]),
+            int(windows[k, ROWS]),
+        )
+        count = bounds[2] * bounds[3]
         begin = int(windows[k, OFFSET])
         shape = (sigma, windows[k, TRAIL_X], windows[k, TRAIL_Y])
         target = cleaned[:count]
@@ -339,16 +344,16 @@ def split_pairs(
         for entry in range(first[k], first[k + 1]):
             other = stars[neighbours[entry]]
             if other[STATE] == GOOD:
-                star_model(other[X], other[Y], shape, place, models[:3], work)
+                star_model(other[X], other[Y], shape, bounds, models[:3], work)
                 for i in range(count):
                     target[i] -= np.float32(other[FLUX] * models[0, i])
-        star_model(stars[k, X], stars[k, Y], shape, place, models[:3], work)
+        star_model(stars[k, X], stars[k, Y], shape, bounds, models[:3], work)
         for i in range(count):
             left_over[i] = target[i] - stars[k, FLUX] * models[0, i] if target[i] < UNUSABLE else 0.0
-        if not _start(left_over, place, stars[k], sigma, pair):
+        if not _first_guesses(left_over, bounds, stars[k], sigma, pair):
             continue
         noises = (windows[k, NOISE] ** 2, per_dn, model_error)
-        fitted = fit_pair(target, place, shape, noises, models[:, :count], work, pair)
+        fitted = fit_pair(target, bounds, shape, noises, models[:, :count], work, pair)
         if not fitted or not _is_better(pair, stars[k, CHI2], sigma, models, target):
             continue
         todo[k] = False

@@ -1,4 +1,4 @@
-"""Shape of the stars of a frame: width of the spot, and the trails that a turning sensor draws.
+"""Shape of the stars of an image: width of the spot, and the trails of a rotating sensor.
 
 Second moments of bright stars under a Gaussian weight that is adapted to the star itself (Bernstein & Jarvis 2002)
 give each star's covariance: across a trail that of the spot, along it more.
@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.imaging.background import interpolate_at, median
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, mismatch, typical_trail
+from starid.jit import compiled_ieee
 
 Array = npt.NDArray[np.float64]
 
@@ -37,7 +37,7 @@ _MOST_AGREE: Final = 0.5
 
 @dataclass(frozen=True)
 class SpotShape:
-    """Spot and trails of a frame.
+    """Spot and trails of an image.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class SpotShape:
     trail_px : float
         Median length of the trails, pixels.
     stars : int
-        Stars that the estimate rests on; 0 if it is only assumed.
+        Stars that the estimate is based on; 0 for an assumed width.
     """
 
     sigma_px: float
@@ -57,7 +57,7 @@ class SpotShape:
     stars: int
 
 
-@compiled_loops
+@compiled_ieee
 def adaptive_moments(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x0: float,
@@ -75,11 +75,11 @@ def adaptive_moments(
     image : ndarray (h, w)
         Counts.
     x0, y0, background, start_sigma
-        First guess of the place, background under it, first guess of the width.
+        First guess of the position, background there, first guess of the width.
     largest : int
-        Half-width of the window at most; a star that needs more is given up.
+        Half-width of the window at most; a star that needs more is rejected.
     saturation : float
-        Counts from which a star is saturated and given up.
+        Least count of a saturated pixel; saturated stars are rejected.
     """
     height, width = image.shape
     x, y = x0, y0
@@ -136,7 +136,7 @@ def adaptive_moments(
     return False
 
 
-@compiled_loops
+@compiled_ieee
 def moments_of(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -147,9 +147,9 @@ def moments_of(
     saturation: float,
     table: Array,
 ) -> int:
-    """Fill `table` (n, 5) with the moments of the first peaks that have them; return how many.
+    """Fill `table` (n, 5) with the moments of the first peaks that have them; return their number.
 
-    Peaks that come to the place of an earlier one (several on one trail) count once.
+    Peaks that converge to the position of an earlier one (several on one trail) count once.
     """
     count = 0
     for k in range(peaks.shape[0]):
@@ -182,7 +182,7 @@ def shape_from_moments(
     known_sigma_px : float or None
         Width of the spot, where it is known.
     assumed_sigma_px : float
-        Width to assume where too few stars tell.
+        Width to assume where there are too few stars.
     """
     still = np.zeros(FLOW_TERMS)
     if len(table) < _LEAST_FOR_SPOT:
@@ -192,23 +192,23 @@ def shape_from_moments(
     across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
     # a short trail of length L makes the split L²/24
     if math.sqrt(24.0 * median(split)) > _ROUND_BELOW_PX:
-        places, trails, length = _trails(table, width, height, across)
+        positions, trails, length = _trails(table, width, height, across)
         flow = np.zeros(FLOW_TERMS)
-        fit_flow(places, trails, flow)
-        typical, off = typical_trail(flow, places, trails)
+        fit_flow(positions, trails, flow)
+        typical, off = typical_trail(flow, positions, trails)
         if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * median(length):
             return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
     return SpotShape(_sigma(median(mean), known_sigma_px), still, 0.0, len(table))
 
 
 def long_trails(table: Array, sigma_px: float) -> npt.NDArray[np.bool_]:
-    """Which stars (n,) of a table of moments are so long that noise or a close neighbour hardly explains it."""
+    """Mask (n,) of the stars in a table of moments too long to be explained by noise or a close neighbour."""
     mean, split = _mean_and_split(table)
     return np.asarray(trail_length(mean + split, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
 
 
 def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) -> SpotShape:
-    """Trails of a frame on which most objects are round, as particles, hot pixels and reflections are: they are no stars.
+    """Trails of an image on which most objects are round and not stars: particles, hot pixels, reflections.
 
     Parameters
     ----------
@@ -217,14 +217,14 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
     width, height : int
         Size of the image.
     shape : SpotShape
-        What the round ones say; returned as it is, unless enough of the long ones agree on a flow.
+        Shape of the round objects; returned unchanged unless enough of the long ones agree on a flow.
     """
     longest = table[long_trails(table, shape.sigma_px)]
     if len(longest) < _LEAST_LONG:
         return shape
     found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
-    places, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
-    off = np.array([mismatch(found.flow, places, trails, k)[0] for k in range(len(places))])
+    positions, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
+    off = np.array([mismatch(found.flow, positions, trails, k)[0] for k in range(len(positions))])
     agree = np.count_nonzero(off < _AGREES * length)
     return found if found.trail_px > 0.0 and agree >= max(_LEAST_LONG, _MOST_AGREE * len(longest)) else shape
 
@@ -236,13 +236,13 @@ def _mean_and_split(table: Array) -> tuple[Array, Array]:
 
 
 def _trails(table: Array, width: int, height: int, across: float) -> tuple[Array, Array, Array]:
-    """Places (n, 2) as `fit_flow` takes them, trails (n, 2) and their lengths (n,), for a variance across them."""
+    """Positions (n, 2) for `fit_flow`, trails (n, 2) and their lengths (n,), for a variance across them."""
     mean, split = _mean_and_split(table)
     length = trail_length(mean + split, across)
     angle = 0.5 * np.arctan2(2.0 * table[:, 3], table[:, 2] - table[:, 4])
     trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    places = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / (0.5 * max(width, height))
-    return places, trails, length
+    positions = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / (0.5 * max(width, height))
+    return positions, trails, length
 
 
 def _sigma(variance: float, known: float | None) -> float:

@@ -1,4 +1,4 @@
-"""Width of the spot, fitted to bright stars together with place and flux."""
+"""Width of the spot, fitted to bright stars together with position and flux."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from starid.imaging.background import interpolate_at
 from starid.imaging.centroid import FIT_COLUMNS, FLUX, GOOD, STATE, X, Y, fit_star, spot_model
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _SETTLED: Final = 0.01
 _MODEL_ERROR: Final = 0.02
 
 
-@compiled_loops
+@compiled_ieee
 def _one_width(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     column: int,
@@ -36,7 +36,7 @@ def _one_width(
     saturation: float,
     result: Array,
 ) -> float:
-    """Width of the star at a peak; NaN if there is none to be had."""
+    """Width of the star at a peak; NaN where it cannot be fitted."""
     height, width = image.shape
     sigma = start
     for _ in range(_ROUNDS):
@@ -65,7 +65,7 @@ def _one_width(
         spot_model(x, y, sigma, window, model, work)
         spot_model(x, y, sigma * (1.0 + _STEP), window, wider, work)
         spot_model(x, y, sigma * (1.0 - _STEP), window, narrower, work)
-        # least squares for changes of flux and width; place does not mix with either
+        # least squares for changes of flux and width; position is uncorrelated with both
         ff = fs = ss = bf = bs = 0.0
         for k in range(pixels.size):
             share = model[0, k]
@@ -91,7 +91,7 @@ def _one_width(
     return math.nan
 
 
-@compiled_loops
+@compiled_ieee
 def spot_widths(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -102,7 +102,7 @@ def spot_widths(
     saturation: float,
     widths: Array,
 ) -> int:
-    """Fill `widths` (m,) with the spot widths of the first peaks that have one; return how many.
+    """Fill `widths` (m,) with the spot widths of the first peaks that have one; return their number.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def spot_widths(
     start : float
         First guess, pixels.
     saturation : float
-        Counts from which a star is saturated and given up.
+        Least count of a saturated pixel; saturated stars are rejected.
     """
     count = 0
     result = np.empty(FIT_COLUMNS)

@@ -1,7 +1,7 @@
-"""The matched filter for trails, first half: an image summed along the path that its stars take during the exposure.
+"""First half of the matched filter for trails: the image summed along the path of its stars during the exposure.
 
-Summed first, in integers, and smoothed with the round spot afterwards (`starid.imaging.matched_filter.find_peaks`):
-the order of the two makes no difference, but for the time.
+The sum is taken in integers before the smoothing with the round spot (`starid.imaging.matched_filter.find_peaks`). The
+result does not depend on the order; this one is faster.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
+from starid.jit import compiled_ieee
 
 _TILE_COLUMNS: Final = 128
 _TILE_ROWS: Final = 32
 _MOST_STEPS: Final = 96
 
 
-@compiled_loops
+@compiled_ieee
 def _sum_along(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     flow: npt.NDArray[np.float64],
@@ -30,9 +30,9 @@ def _sum_along(
     sums: npt.NDArray[np.uint16] | npt.NDArray[np.uint32],
     out: npt.NDArray[np.uint16],
 ) -> None:
-    """Sum of the image at `steps` places along the trail of each tile, shifted right; `sums` is a tile's row.
+    """Sum of the image at `steps` positions along the trail of each tile, shifted right; `sums` is a tile's row.
 
-    Indices are unsigned, so that no negative one need be thought of and the loops become vector instructions.
+    Indices are unsigned: without the case of negative ones the loops become vector instructions.
     """
     height, width = image.shape
     pixels, target = image.reshape(image.size), out.reshape(out.size)
@@ -61,7 +61,7 @@ def _sum_along(
 
 
 def trail_steps(flow: npt.NDArray[np.float64], width: int, height: int) -> int:
-    """Places along a trail that are about a pixel apart on the longest trail of the field."""
+    """Number of positions along a trail, about a pixel apart on the longest trail of the field."""
     corners = [(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]
     lengths = [
         math.hypot(*trail_at(flow, x * (width - 1), y * (height - 1), width, height)) for x, y in corners
@@ -86,7 +86,7 @@ def sum_along_trails(
     Returns
     -------
     sums : ndarray (h, w), uint16
-        What lies beyond the left and right edges counts nothing.
+        Pixels beyond the left and right edges count as 0.
     scale : float
         Sum where every count is 1.
     """
@@ -100,7 +100,7 @@ def sum_along_trails(
 
 
 def trail_noise_factor(sigma_px: float, trail_px: float, steps: int) -> float:
-    """Noise of an image summed so and smoothed with the spot, over `steps` times that of a pixel, for a trail's length."""
+    """Noise of an image summed along trails and smoothed, over `steps` times that of a pixel, for a trail's length."""
     taps = spot_taps(sigma_px).astype(np.float64)
     spot = np.concatenate([taps[:0:-1], taps])
     offsets = np.rint(((np.arange(steps) + 0.5) / steps - 0.5) * trail_px).astype(int)

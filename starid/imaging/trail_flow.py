@@ -1,11 +1,11 @@
-"""The trails that a turning sensor draws: one flow over the whole field.
+"""The trails of a rotating sensor as one flow over the whole field.
 
 Through a lens that keeps straight lines straight, trails follow, with (u, v) measured from the image's centre,
 
     dx = t_x + a·u² + b·u·v − r·v,    dy = t_y + a·u·v + b·v² + r·u,
 
-and nearly so through any other: t is the turn across the boresight, r that about it, a and b the perspective. The
-five numbers are fitted to the trails of bright stars, whose senses are not seen.
+and nearly so through any other: t is the rotation across the boresight, r that about it, a and b the perspective. The
+five numbers are fitted to the trails of bright stars, whose senses are unknown.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.imaging.jit_loops import compiled_loops
+from starid.jit import compiled_ieee
 
 Array = npt.NDArray[np.float64]
 
@@ -32,14 +32,14 @@ _ROUNDS: Final = 4
 _SINGULAR: Final = 1e-12
 
 
-@compiled_loops
-def _drawn(flow: Array, u: float, v: float) -> tuple[float, float]:
-    """Trail of a flow at a place."""
+@compiled_ieee
+def _flow_trail(flow: Array, u: float, v: float) -> tuple[float, float]:
+    """Trail of a flow at a position."""
     inward = flow[3] * u + flow[4] * v
     return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
 
 
-@compiled_loops
+@compiled_ieee
 def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
     """Trail (dx, dy) in pixels at an image position, up to its sense.
 
@@ -53,26 +53,26 @@ def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[
         Size of the image.
     """
     half = 0.5 * max(width, height)
-    return _drawn(flow, (x - 0.5 * (width - 1)) / half, (y - 0.5 * (height - 1)) / half)
+    return _flow_trail(flow, (x - 0.5 * (width - 1)) / half, (y - 0.5 * (height - 1)) / half)
 
 
-@compiled_loops
+@compiled_ieee
 def _rows(u: float, v: float, rows: Array) -> None:
-    """Factors (2, 5) of a flow in dx and in dy at a place."""
+    """Factors (2, 5) of a flow in dx and in dy at a position."""
     rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3], rows[0, 4] = 1.0, 0.0, -v, u * u, u * v
     rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3], rows[1, 4] = 0.0, 1.0, u, u * v, v * v
 
 
-@compiled_loops
-def mismatch(flow: Array, places: Array, trails: Array, k: int) -> tuple[float, float]:
-    """Distance between the seen trail k and the flow's, and the sense (±1) in which it is the smaller."""
-    dx, dy = _drawn(flow, places[k, 0], places[k, 1])
+@compiled_ieee
+def mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[float, float]:
+    """Distance between the measured trail k and the flow's, and the sense (±1) that minimises it."""
+    dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
     forth = math.hypot(trails[k, 0] - dx, trails[k, 1] - dy)
     back = math.hypot(trails[k, 0] + dx, trails[k, 1] + dy)
     return (forth, 1.0) if forth <= back else (back, -1.0)
 
 
-@compiled_loops
+@compiled_ieee
 def _solve(matrix: Array, right: Array, used: int, out: Array) -> bool:
     """Solve the first `used` equations of a positive system by elimination; False if it is singular."""
     for column in range(used):
@@ -99,9 +99,9 @@ def _solve(matrix: Array, right: Array, used: int, out: Array) -> bool:
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def _least_squares(
-    places: Array,
+    positions: Array,
     trails: Array,
     senses: Array,
     used: int,
@@ -113,10 +113,10 @@ def _least_squares(
     """Flow of `used` terms through the trails, each in its sense (0: left out)."""
     matrix[:] = 0.0
     right[:] = 0.0
-    for k in range(places.shape[0]):
+    for k in range(positions.shape[0]):
         if senses[k] == 0.0:
             continue
-        _rows(places[k, 0], places[k, 1], rows)
+        _rows(positions[k, 0], positions[k, 1], rows)
         for axis in range(2):
             seen = senses[k] * trails[k, axis]
             for i in range(used):
@@ -126,25 +126,25 @@ def _least_squares(
     return _solve(matrix, right, used, out)
 
 
-@compiled_loops
-def _left_over(flow: Array, places: Array, trails: Array) -> float:
-    """Mean distance between seen and drawn trails, each counted as at most half its length."""
+@compiled_ieee
+def _mean_mismatch(flow: Array, positions: Array, trails: Array) -> float:
+    """Mean distance between measured trails and the flow's, each limited to half its length."""
     total = 0.0
-    for k in range(places.shape[0]):
-        off, _ = mismatch(flow, places, trails, k)
+    for k in range(positions.shape[0]):
+        off, _ = mismatch(flow, positions, trails, k)
         total += min(off, 0.5 * math.hypot(trails[k, 0], trails[k, 1]))
-    return float(total / places.shape[0])
+    return float(total / positions.shape[0])
 
 
-@compiled_loops
-def fit_flow(places: Array, trails: Array, flow: Array) -> None:
-    """Fit a flow (5,) to trails (n, 2) at places (n, 2), whatever their senses.
+@compiled_ieee
+def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
+    """Fit a flow (5,) to trails (n, 2) at positions (n, 2), of unknown sense.
 
     Starts are translations along one of the brightest stars' trails, and translation with roll through two of them
-    in either relative sense; the one that leaves least is refined by least squares without outliers. Few stars get
+    in either relative sense; the one with the least mismatch is refined by least squares without outliers. Few stars determine
     fewer terms: below 5 only the translation, below 12 no perspective.
     """
-    count = places.shape[0]
+    count = positions.shape[0]
     senses = np.zeros(count)
     matrix = np.empty((FLOW_TERMS, FLOW_TERMS))
     right = np.empty(FLOW_TERMS)
@@ -161,9 +161,9 @@ def fit_flow(places: Array, trails: Array, flow: Array) -> None:
                 if j > i:
                     senses[j] = sense
                 terms = _WITH_ROLL if j > i else _TRANSLATION
-                if not _least_squares(places, trails, senses, terms, matrix, right, rows, start):
+                if not _least_squares(positions, trails, senses, terms, matrix, right, rows, start):
                     continue
-                left = _left_over(start, places, trails)
+                left = _mean_mismatch(start, positions, trails)
                 if left < least:
                     least = left
                     flow[:] = start
@@ -171,7 +171,7 @@ def fit_flow(places: Array, trails: Array, flow: Array) -> None:
     off = np.empty(count)
     for _ in range(_ROUNDS):
         for k in range(count):
-            off[k], senses[k] = mismatch(flow, places, trails, k)
+            off[k], senses[k] = mismatch(flow, positions, trails, k)
         limit = max(_CLIP * np.median(off), _LEAST_CLIP_PX)
         kept = 0
         for k in range(count):
@@ -179,18 +179,18 @@ def fit_flow(places: Array, trails: Array, flow: Array) -> None:
                 senses[k] = 0.0
             else:
                 kept += 1
-        if kept < used or not _least_squares(places, trails, senses, used, matrix, right, rows, start):
+        if kept < used or not _least_squares(positions, trails, senses, used, matrix, right, rows, start):
             return
         flow[:] = start
 
 
-@compiled_loops
-def typical_trail(flow: Array, places: Array, trails: Array) -> tuple[float, float]:
-    """Median length of a flow's trails at places (n, 2), and median distance from the seen ones (n, 2), pixels."""
-    lengths = np.empty(places.shape[0])
-    off = np.empty(places.shape[0])
-    for k in range(places.shape[0]):
-        dx, dy = _drawn(flow, places[k, 0], places[k, 1])
+@compiled_ieee
+def typical_trail(flow: Array, positions: Array, trails: Array) -> tuple[float, float]:
+    """Median length of a flow's trails at positions (n, 2), and median distance from the measured ones (n, 2), pixels."""
+    lengths = np.empty(positions.shape[0])
+    off = np.empty(positions.shape[0])
+    for k in range(positions.shape[0]):
+        dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
         lengths[k] = math.hypot(dx, dy)
-        off[k], _ = mismatch(flow, places, trails, k)
+        off[k], _ = mismatch(flow, positions, trails, k)
     return float(np.median(lengths)), float(np.median(off))

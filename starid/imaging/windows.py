@@ -1,4 +1,4 @@
-"""Windows around candidates: how large each must be, what the sky is under it, and its pixels."""
+"""Windows around candidates: their size, the sky under them and their pixels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.imaging.background import LEAST_NOISE_DN, interpolate_at
-from starid.imaging.jit_loops import compiled_loops
 from starid.imaging.trail_flow import trail_at
+from starid.jit import compiled_ieee
 
 WINDOW_COLUMNS: Final = 14
 (
@@ -29,23 +29,23 @@ WINDOW_COLUMNS: Final = 14
     RADIUS_X,
     RADIUS_Y,
 ) = range(WINDOW_COLUMNS)
-"""Columns of a table of windows: place and size; where the pixels begin in the packed array; first guess of the star;
+"""Columns of a table of windows: position and size; start of the pixels in the packed array; first guess of the star;
 sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
 
 LARGEST_HALF_WIDTH: Final = 40
 """Half-width of a window at most, pixels."""
 
 MOST_SATURATED: Final = 400
-"""Connected saturated pixels from which on an object is no star."""
+"""Least number of connected saturated pixels of an object that is not a star."""
 
 PATCH_REACH: Final = 40
-"""So far from its peak the saturated patch of a star reaches at most, pixels."""
+"""Largest distance of the saturated patch of a star from its peak, pixels."""
 
 EXTENDED: Final = -1.0
 SEEN_BEFORE: Final = -2.0
 NO_ROOM: Final = -3.0
 ONE_PIXEL: Final = -4.0
-"""Values of COLUMNS that say why a candidate has no window."""
+"""Values of COLUMNS for candidates without a window."""
 
 _MOST_PATCHES: Final = 1000
 _RING_PIXELS: Final = 48
@@ -61,7 +61,7 @@ _ALONE_SIGMA: Final = 8.0
 _ALONE_SHARE: Final = 0.125
 
 
-@compiled_loops
+@compiled_ieee
 def light_radius(sigma: float, flux: float, noise: float) -> int:
     """Half-width of the square in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
     peak = flux / (2.0 * math.pi * sigma * sigma)
@@ -70,17 +70,17 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
     return min(max(math.ceil(reach * sigma + 0.5), 2), LARGEST_HALF_WIDTH)
 
 
-@compiled_loops
+@compiled_ieee
 def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) -> tuple[float, float]:
-    """Slopes of the background along x and y, counts a pixel."""
+    """Slopes of the background along x and y, counts per pixel."""
     return (
         0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y)),
         0.5 * (interpolate_at(level, block, x, y + 1.0) - interpolate_at(level, block, x, y - 1.0)),
     )
 
 
-@compiled_loops
-def _ring(
+@compiled_ieee
+def _ring_statistics(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x: int,
     y: int,
@@ -92,7 +92,7 @@ def _ring(
 ) -> tuple[float, float]:
     """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
 
-    The sky's slopes along x and y are taken off first.
+    The sky's slopes along x and y are subtracted first.
     """
     height, width = image.shape
     count = 0
@@ -117,7 +117,7 @@ def _ring(
     return total / (high - low), (values[high] - values[low]) / _QUARTILE_SIGMA
 
 
-@compiled_loops
+@compiled_ieee
 def _saturated_patch(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     x: int,
@@ -130,7 +130,7 @@ def _saturated_patch(
     """Follow the connected saturated pixels from (x, y); False if there are too many, or too far, for a star.
 
     Fills `patch` (7,) with their mean column and row, half their larger extent, and their first and last column and
-    row. `seen` is scratch of (2·PATCH_REACH + 1)².
+    row. `seen` is workspace of (2·PATCH_REACH + 1)².
     """
     height, width = image.shape
     seen[:] = 0
@@ -162,22 +162,22 @@ def _saturated_patch(
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: int) -> bool:
-    """Whether a pixel lies in the box around a patch that was followed before."""
+    """Whether a pixel lies in the bounding box of an earlier patch."""
     for k in range(count):
         if patches[k, 3] <= column <= patches[k, 4] and patches[k, 5] <= row <= patches[k, 6]:
             return True
     return False
 
 
-@compiled_loops
-def _sky(
+@compiled_ieee
+def _sky_under(
     around: float, spread: float, base: float, noise: float, typical_noise: float
 ) -> tuple[float, float]:
     """Sky and noise under a star, from its ring (NaN if there is none) and from the grid of blocks.
 
-    The grid has the smaller error; the ring wins where it contradicts the grid, as in glare or by a bright limb.
+    The grid has the smaller error; the ring is used where they disagree, as in glare or near a bright limb.
     """
     if spread != spread:
         return base, noise
@@ -190,11 +190,11 @@ def _sky(
     return base, noise
 
 
-@compiled_loops
-def _middle(
+@compiled_ieee
+def _first_position(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float
 ) -> tuple[float, float]:
-    """First guess of a star's place: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
+    """First guess of a star's position: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
     height, width = image.shape
     if not (0 < column < width - 1 and 0 < row < height - 1):
         return float(column), float(row)
@@ -209,7 +209,7 @@ def _middle(
     return column + min(max(1.5 * x / total, -0.7), 0.7), row + min(max(1.5 * y / total, -0.7), 0.7)
 
 
-@compiled_loops
+@compiled_ieee
 def _stands_alone(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float, noise: float
 ) -> bool:
@@ -225,7 +225,7 @@ def _stands_alone(
     return True
 
 
-@compiled_loops
+@compiled_ieee
 def lay_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -246,7 +246,7 @@ def lay_windows(
     peaks : ndarray (n, 2)
         Column and row of each candidate, the brightest first.
     flux : ndarray (n,)
-        First guess of their light, counts.
+        First guess of their flux, counts.
     level, noise, block
         Grid of the background, and the side of its blocks.
     spot : (float, float, float)
@@ -254,7 +254,7 @@ def lay_windows(
     flow : ndarray (5,)
         Flow of the trails (`starid.imaging.trail_flow`).
     windows : ndarray (n, WINDOW_COLUMNS)
-        Filled; COLUMNS tells where there is none, and why.
+        Filled; COLUMNS marks candidates without a window and why.
 
     Returns
     -------
@@ -293,8 +293,8 @@ def lay_windows(
         radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
         centre_x, centre_y = round(x), round(y)
         slopes = _slopes(level, block, x, y)
-        around, spread = _ring(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
-        sky_level, window[NOISE] = _sky(
+        around, spread = _ring_statistics(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
+        sky_level, window[NOISE] = _sky_under(
             around,
             spread,
             interpolate_at(level, block, x, y),
@@ -310,7 +310,7 @@ def lay_windows(
         rows = min(centre_y + radius_y, height - 1) - top + 1
         window[LEFT], window[TOP] = left, top
         if extra == 0.0:
-            x, y = _middle(image, column, row, sky_level)
+            x, y = _first_position(image, column, row, sky_level)
         window[START_X], window[START_Y], window[PATCH] = x, y, extra
         window[TRAIL_X], window[TRAIL_Y] = trail_x, trail_y
         window[RADIUS_X], window[RADIUS_Y] = radius_x, radius_y
@@ -323,7 +323,7 @@ def lay_windows(
     return total
 
 
-@compiled_loops
+@compiled_ieee
 def cut_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     windows: npt.NDArray[np.float64],
@@ -332,7 +332,7 @@ def cut_windows(
     saturation: float,
     pixels: npt.NDArray[np.float32],
 ) -> None:
-    """Copy the windows' pixels, one window after the other, less the sky; saturated ones become infinite.
+    """Copy the windows' pixels minus the sky, one window after another; saturated ones become infinite.
 
     The sky is a plane: `BASE` at the first guess of the star, sloped as the grid of blocks.
     """

@@ -1,8 +1,8 @@
-"""Identification for a camera of which little more than a rough field of view is known.
+"""Identification for a camera with an approximate field of view and an unknown lens.
 
-The search is given several chances, from cheap to dear: all detections, or an even choice of the brightest of
-each part of the image, so that a tree line, lettering or a nebula full of false detections has no more say than
-its share of the area; a lens without distortion, or with barrel or pincushion distortion; few or many triangles.
+The search makes several attempts, from cheap to expensive: with all detections, or with the brightest of each cell of
+the image, so that a tree line, lettering or a nebula counts only by its area; without distortion, or with barrel or
+pincushion distortion; with few or many triangles.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from starid.photograph.typical_camera import typical_camera
 from starid.solution import Reason, Solution
 
 DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
-"""Relative displacements at the corner of the image, of lenses that are tried."""
+"""Relative displacements at the corner of the image of the lenses tried."""
 
 TRIANGLES: Final = (100, 100, 1000, 5000)
 """Triangles looked up in each round; the first one has narrow windows, and it and the last one no distortions."""
@@ -32,22 +32,22 @@ TRIANGLES: Final = (100, 100, 1000, 5000)
 ALL_ROUNDS: Final = range(len(TRIANGLES))
 
 SIZE_PX: Final = 1000.0
-"""Side of a square image that the windows are given for; they grow with the image."""
+"""Side of the square image for which the windows are defined; they scale with the image."""
 
 CELLS: Final = 60
-"""Parts of the image for an even choice of detections, about."""
+"""Approximate number of cells of the image for an even choice of detections."""
 
 NARROWEST_DEG: Final = 1.0
 """Narrowest field: a square one of this width has three stars of Hipparcos on average."""
 
 MOST_AT_ONCE: Final = 500
-"""Brightest detections that take part."""
+"""Most detections used in one attempt."""
 
 WINDOW_PX: Final = 20.0
 """Widest first matching window."""
 
 MAX_FALSE: Final = 1e-7
-"""Bound on the probability of a false answer of each single chance: there are several dozens of them."""
+"""Bound on the probability of a false solution of each attempt; there are several dozens."""
 
 _STRICT: Final = Effort(max_false_probability=MAX_FALSE)
 _LENIENT: Final = Effort(
@@ -59,8 +59,8 @@ _LENIENT: Final = Effort(
 )
 
 
-class _Chance(NamedTuple):
-    """One try: detections (rows), distortion and effort."""
+class _Attempt(NamedTuple):
+    """One attempt: rows of the detections, distortion and effort."""
 
     rows: NDArray[np.intp]
     distortion: float
@@ -73,7 +73,7 @@ class RoughSearch:
     Parameters
     ----------
     camera : Camera
-        Size, model, rough focal length; where it has a distortion, no other is tried.
+        Size, model and approximate focal length; if it has distortion, no other is tried.
     catalog : StarCatalog
         The stars.
     fov_tolerance : float
@@ -82,7 +82,7 @@ class RoughSearch:
     Raises
     ------
     StaridError
-        The field is so narrow that it has too few stars of the catalogue.
+        The field is too narrow for the catalogue.
     """
 
     def __init__(self, camera: Camera, catalog: StarCatalog, *, fov_tolerance: float) -> None:
@@ -102,18 +102,18 @@ class RoughSearch:
 
     @property
     def identifier(self) -> Identifier:
-        """Identifier for the camera as it was given, with the index that the search uses."""
+        """Identifier for the nominal camera, with the index that the search uses."""
         return self._first
 
     def identify(self, xy_px: ArrayLike, flux: ArrayLike, *, rounds: Sequence[int] = ALL_ROUNDS) -> Solution:
-        """Attitude and camera; invalid, with the reason, where no chance came true.
+        """Find attitude and camera; invalid, with the reason, where every attempt fails.
 
         Parameters
         ----------
         xy_px, flux
-            As `Identifier.identify` takes them.
+            As in `Identifier.identify`.
         rounds : sequence of int
-            Which of `TRIANGLES` to go through.
+            Rounds to run, as indices of `TRIANGLES`.
         """
         begin = time.perf_counter()
         xy, brightness = (
@@ -123,14 +123,14 @@ class RoughSearch:
         solution = Solution.invalid(Reason.NO_MATCH)
         plain = self._first.camera
         straight: dict[float, NDArray[np.float64]] = {0.0: xy}
-        for chance in self._chances(xy, brightness, rounds):
-            lens = distorted(plain, chance.distortion)
-            if chance.distortion not in straight:
-                straight[chance.distortion] = plain.project(lens.back_project(xy))[0]
-            places = straight[chance.distortion]
-            rows = chance.rows[np.isfinite(places[chance.rows, 0])]
-            search = self._first.with_camera(plain, fov_tolerance=self._tolerance, effort=chance.effort)
-            solution = search.identify(places[rows], brightness[rows])
+        for attempt in self._attempts(xy, brightness, rounds):
+            lens = distorted(plain, attempt.distortion)
+            if attempt.distortion not in straight:
+                straight[attempt.distortion] = plain.project(lens.back_project(xy))[0]
+            positions = straight[attempt.distortion]
+            rows = attempt.rows[np.isfinite(positions[attempt.rows, 0])]
+            search = self._first.with_camera(plain, fov_tolerance=self._tolerance, effort=attempt.effort)
+            solution = search.identify(positions[rows], brightness[rows])
             if solution.valid:
                 found = solution.camera or plain
                 solution = dataclasses.replace(
@@ -142,10 +142,10 @@ class RoughSearch:
                 break
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
 
-    def _chances(
+    def _attempts(
         self, xy: NDArray[np.float64], flux: NDArray[np.float64], rounds: Sequence[int]
-    ) -> Iterator[_Chance]:
-        """All tries, the cheap ones first."""
+    ) -> Iterator[_Attempt]:
+        """All attempts, the cheap ones first."""
         brightest = np.argsort(-flux, kind="stable")
         choices = [brightest[:MOST_AT_ONCE]]
         choices += [even_choice(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
@@ -156,10 +156,10 @@ class RoughSearch:
             effort = self._scaled(dataclasses.replace(windows, max_triangles=TRIANGLES[number]))
             for rows in choices:
                 for distortion in DISTORTIONS[:1] if plain else DISTORTIONS:
-                    yield _Chance(rows, distortion, effort)
+                    yield _Attempt(rows, distortion, effort)
 
     def _scaled(self, effort: Effort) -> Effort:
-        """Effort with its windows grown to the size of the image."""
+        """Effort with its windows scaled to the size of the image."""
         return dataclasses.replace(
             effort,
             tolerance_px=effort.tolerance_px * self._scale,
@@ -171,7 +171,7 @@ class RoughSearch:
 def even_choice(
     xy: NDArray[np.float64], brightest: NDArray[np.intp], camera: Camera, depth: int
 ) -> NDArray[np.intp]:
-    """Rows of the `depth` brightest detections of each part of the image.
+    """Rows of the `depth` brightest detections of each cell of the image.
 
     Parameters
     ----------
@@ -180,9 +180,9 @@ def even_choice(
     brightest : ndarray (n,)
         Rows by falling flux.
     camera : Camera
-        Gives the size of the image.
+        Its width and height are those of the image.
     depth : int
-        Detections of each part.
+        Detections of each cell.
     """
     side = math.sqrt(camera.width * camera.height / CELLS)
     columns = math.ceil(camera.width / side)
@@ -197,7 +197,7 @@ def even_choice(
 
 
 def distorted(camera: Camera, displacement: float) -> Camera:
-    """Camera as wide as another, whose lens moves the image's corner by a share of its distance from the centre."""
+    """Camera of the same field of view whose distortion displaces the image's corner by a share of its radius."""
     if displacement == 0.0:
         return camera
     corner = 0.5 * math.hypot(camera.width, camera.height) / camera.focal_px[0]

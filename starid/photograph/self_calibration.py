@@ -1,8 +1,8 @@
-"""Calibration without a laboratory: from the stars of several frames and a rough field of view.
+"""Self-calibration from the stars of several images and an approximate field of view.
 
-Each frame is identified with the start camera, whose lens may be off by the tolerance; the matches
-calibrate the camera; with it all catalogue stars in the field are matched again, which brings in the corners
-that the start camera had missed; and so on until nothing changes.
+Each image is identified with the start camera, whose focal length may be off by the tolerance, and the matches calibrate
+the camera. With it the catalogue stars in the field are matched again, which adds those in the corners, until nothing
+changes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from starid.calibration import (
     check_estimate,
 )
 from starid.camera import Camera
-from starid.catalog import StarCatalog, blend, load_catalog
+from starid.catalog import StarCatalog, load_catalog, merge_close_stars
 from starid.errors import StaridError
 from starid.photograph.rough_search import RoughSearch
 from starid.solution import Solution
@@ -41,17 +41,17 @@ MODELS: Final[tuple[tuple[str, ...], ...]] = (
     DEFAULT_ESTIMATE,
     ("aspect", *DEFAULT_ESTIMATE[1:]),
 )
-"""Sets of free parameters from which "auto" takes the one that the frames justify."""
+"""Sets of free parameters; the default calibration selects the one that the images justify."""
 
 IMAGE_MODELS: Final[tuple[tuple[str, ...], ...]] = (("focal",), ("focal", "k1"), ("focal", "k1", "k2"))
-"""What one image of an unknown camera may tell: in a narrow field the optical axis cannot be told from the
+"""Sets of free parameters for one image of an unknown camera: in a narrow field the optical axis is degenerate with the
 attitude, and stays at the image's centre."""
 
 _ROUNDS: Final = 4
 _WINDOW_SIGMAS: Final = 5.0
 _LEAST_WINDOW_PX: Final = 1.0
 _SIGMA_FLOOR_PX: Final = 0.02
-_FAINTER: Final = 0.3
+_MAGNITUDE_MARGIN: Final = 0.3
 _BLEND_PX: Final = 2.0
 
 
@@ -65,24 +65,24 @@ class Stars(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """Outcome: the calibration, and which frames it rests on.
+    """A calibration and the images that it is based on.
 
     Attributes
     ----------
     calibration : Calibration
         Camera, covariance and residuals.
     frame_index : tuple of int
-        Frames given that were identified and used, in the order of `calibration.attitudes`.
+        Images that were identified and used, in the order of `calibration.attitudes`.
     matches : tuple of ndarray (m, 2), int64
-        Detection index and HIP of every pair that the calibration was given, for each of these frames.
-    refused : dict of int to str
-        Frames that could not be identified, and why.
+        Detection index and HIP of every matched pair of each of these images.
+    unidentified : dict of int to str
+        Reason by image, for those that could not be identified.
     """
 
     calibration: Calibration
     frame_index: tuple[int, ...]
     matches: tuple[NDArray[np.int64], ...]
-    refused: dict[int, str]
+    unidentified: dict[int, str]
 
 
 def self_calibrate(
@@ -94,20 +94,20 @@ def self_calibrate(
     estimate: Sequence[str] | None = None,
     models: Sequence[tuple[str, ...]] = MODELS,
 ) -> SelfCalibration:
-    """Identify frames and estimate the camera that took them.
+    """Identify images and estimate the camera that took them.
 
     Parameters
     ----------
     frames : sequence of Stars
         Detections of each frame.
     camera : Camera
-        Start value: size, model and rough focal length.
+        Start value: size, model and approximate focal length.
     catalog : StarCatalog, optional
         By default the whole of Hipparcos at its default epoch.
     fov_tolerance : float
         Relative uncertainty of the start camera's focal length.
     estimate : sequence of str, optional
-        What is free (see `starid.calibration.GROUPS`); by default the set of `models` with the least
+        Free parameters (see `starid.calibration.GROUPS`); by default the set of `models` with the least
         Bayesian information criterion.
     models : sequence of tuple of str
         Sets to choose from when `estimate` is not given.
@@ -115,7 +115,7 @@ def self_calibrate(
     Raises
     ------
     StaridError
-        No frame could be identified, or what `calibrate` refuses.
+        No image could be identified, or `calibrate` fails.
     """
     if not frames:
         raise StaridError("calibration: no frames given; at least one image with stars needed")
@@ -124,21 +124,21 @@ def self_calibrate(
     sky = load_catalog() if catalog is None else catalog
     search = RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
     solutions: dict[int, Solution] = {}
-    refused: dict[int, str] = {}
+    unidentified: dict[int, str] = {}
     for index, stars in enumerate(frames):
         solution = search.identify(stars.xy_px, stars.flux)
         if solution.valid:
             solutions[index] = solution
         else:
-            refused[index] = solution.reason.value
+            unidentified[index] = solution.reason.value
     if not solutions:
-        reasons = ", ".join(sorted(set(refused.values())))
+        reasons = ", ".join(sorted(set(unidentified.values())))
         raise StaridError(
             f"calibration: none of {len(frames)} frames could be identified ({reasons}); "
             "check the field of view, or take frames with more stars"
         )
     result = calibrate_identified(frames, solutions, camera, sky, estimate=estimate, models=models)
-    return dataclasses.replace(result, refused=refused)
+    return dataclasses.replace(result, unidentified=unidentified)
 
 
 def calibrate_identified(
@@ -162,14 +162,14 @@ def calibrate_identified(
     camera : Camera
         The camera that the frames were identified with.
     sky : StarCatalog
-        What the solutions' `catalog_index` counts in.
+        The catalogue whose rows `catalog_index` of the solutions refers to.
     estimate, models
         As in `self_calibrate`.
 
     Raises
     ------
     StaridError
-        What `calibrate` refuses.
+        `calibrate` fails.
     """
     indices = tuple(solutions)
     matched: list[CalibrationFrame] = []
@@ -187,8 +187,10 @@ def calibrate_identified(
             )
         )
     start = solutions[indices[0]].camera or camera
-    seen = blend(sky.brighter_than(faintest + _FAINTER), _BLEND_PX * camera.pixel_scale_rad)
-    _, result = next(_calibrations(matched, start, (_enough(matched, ("focal", "k1")), ("focal",))))
+    seen = merge_close_stars(
+        sky.brighter_than(faintest + _MAGNITUDE_MARGIN), _BLEND_PX * camera.pixel_scale_rad
+    )
+    _, result = next(_calibrations(matched, start, (_affordable_model(matched, ("focal", "k1")), ("focal",))))
     matches: tuple[NDArray[np.int64], ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
@@ -203,13 +205,13 @@ def calibrate_identified(
         before = result
         start = dataclasses.replace(camera, focal_px=result.camera.focal_px)
         result = _best(again, start, models) if estimate is None else calibrate(again, start, estimate)
-        if _same(before, result):
+        if _map_alike(before, result):
             break
     return SelfCalibration(result, indices, matches, {})
 
 
 def _floored_sigma(stars: Stars) -> Array | None:
-    """Errors of the positions as given, with a floor for what no detector knows of itself."""
+    """Errors of the positions, with a floor for systematic errors of the detection."""
     if stars.xy_sigma_px is None:
         return None
     floored: Array = np.hypot(stars.xy_sigma_px, _SIGMA_FLOOR_PX)
@@ -244,12 +246,12 @@ def _paired(
 
 
 def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:
-    """Count the unknowns: camera parameters and three angles a frame."""
+    """Count the unknowns: camera parameters and three angles per frame."""
     return sum(len(GROUPS[name]) for name in model) - ("focal" in model) + 3 * len(frames)
 
 
-def _enough(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the model, or the focal length alone where there are too few stars for it."""
+def _affordable_model(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the model, or the focal length alone where there are too few stars for the model."""
     equations = 2 * sum(len(frame.xy_px) for frame in frames)
     return model if equations > 2 * _unknowns(model, frames) else ("focal",)
 
@@ -259,9 +261,9 @@ def _best(
 ) -> Calibration:
     """Calibrate with each model and keep that with the least Bayesian information criterion.
 
-    Models that `calibrate` refuses are passed over; its refusal of the last is raised only if none is left.
+    Models that fail are skipped; the last error is raised only if all of them fail.
     """
-    models = [model for model in candidates if _enough(frames, model) == model] or [("focal",)]
+    models = [model for model in candidates if _affordable_model(frames, model) == model] or [("focal",)]
     tried = list(_calibrations(frames, camera, models))
     equations = 2 * sum(len(frame.xy_px) for frame in frames)
     variance = _variance_factor(tried[-1][1], frames)
@@ -275,19 +277,19 @@ def _best(
 def _calibrations(
     frames: Sequence[CalibrationFrame], camera: Camera, models: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[tuple[str, ...], Calibration]]:
-    """Calibrate with one model after the other, and give those that hold; at least one, or the last refusal."""
-    refusal: StaridError | None = None
+    """Calibrate with one model after another and yield those that succeed; raise the last error if none does."""
+    last_error: StaridError | None = None
     held = 0
     for model in models:
         try:
             result = calibrate(frames, camera, model)
         except StaridError as error:
-            refusal = error
+            last_error = error
             continue
         held += 1
         yield model, result
-    if refusal is not None and held == 0:
-        raise refusal
+    if last_error is not None and held == 0:
+        raise last_error
 
 
 def _variance_factor(result: Calibration, frames: Sequence[CalibrationFrame]) -> float:
@@ -307,8 +309,8 @@ def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], variance: f
     return total
 
 
-def _same(first: Calibration, second: Calibration) -> bool:
-    """Tell whether two calibrations map the image alike to a thousandth of a pixel."""
+def _map_alike(first: Calibration, second: Calibration) -> bool:
+    """Whether two calibrations map the image alike to a thousandth of a pixel."""
     if first.estimated != second.estimated:
         return False
     grid = second.camera.border(9)

@@ -1,4 +1,4 @@
-"""From an image to an attitude, with a known camera or with little more than a guess of its field."""
+"""Attitude from an image, with a calibrated camera or an approximate field of view."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from starid.geometric.identifier import Identifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
-from starid.photograph.views import Counts, Look, looks
+from starid.photograph.views import Counts, View, views
 from starid.solution import Reason, Solution
 
 _log = logging.getLogger(__name__)
 
 _FEW: Final = 8
-"""Fewer matched stars leave the lens as it was taken to be."""
+"""Least number of matched stars for the estimation of the lens."""
 
 _ROUNDS: Final = ((ALL_ROUNDS[:2], None), (ALL_ROUNDS[2:3], 4), (ALL_ROUNDS[3:], 1))
-"""Rounds of the search, and how many of the looks at the image get them; None while they are still to be made."""
+"""Rounds of the search, and the number of views they are run on; None for all views, which the first entry makes."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSolution:
-    """What was found on an image.
+    """The result of solving an image.
 
     Attributes
     ----------
     solution : Solution
-        Attitude and matches; they count in `detections` and `catalog`.
+        Attitude and matches; indices refer to `detections` and the catalogue.
     detections : Detections
         All stars found on the image.
     camera : Camera
-        The camera: as given, or as estimated on this image.
+        The camera, or its estimate from this image.
     stars : StarCatalog
-        Catalogue stars as the camera sees them.
+        Catalogue stars as the camera resolves them.
     mirrored : bool
-        The image shows the sky mirrored. Attitude, camera and detections then are those of the image flipped
-        left to right.
+        The image shows the sky mirrored; attitude, camera and detections are those of the image flipped left
+        to right.
     """
 
     solution: Solution
@@ -56,7 +56,7 @@ class ImageSolution:
     mirrored: bool = False
 
     def on_image(self, xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Positions (n, 2) of the solution's frame, on the image as it was given."""
+        """Convert positions (n, 2) of the solution to positions on the original image."""
         return flipped(xy_px, self.camera.width) if self.mirrored else xy_px
 
 
@@ -75,79 +75,79 @@ def solve_image(
     image : ndarray (h, w) of uint8 or uint16
         Grey.
     camera : Camera, optional
-        Default: the default camera.
+        By default `DEFAULT_CAMERA`.
     catalog : StarCatalog, optional
-        Default: the whole of Hipparcos at its default epoch.
+        By default the whole of Hipparcos at its default epoch.
     fov_tolerance : float
         Relative uncertainty of the camera's field of view. If it is not 0, the image may come from any camera:
-        focal length and, with enough stars, distortion are estimated on it, and other ways to look at it are
-        tried where the plain one fails (`starid.photograph.views`, `starid.photograph.rough_search`).
+        focal length and, with enough stars, distortion are estimated from it, and other views are tried where
+        the plain one fails (`starid.photograph.views`, `starid.photograph.rough_search`).
     settings : DetectionSettings, optional
         For the detection.
 
     Raises
     ------
     StaridError
-        The image does not have the camera's size, or detection refuses it.
+        The image does not have the camera's size, or is invalid for detection.
     """
-    given = DEFAULT_CAMERA if camera is None else camera
+    nominal = DEFAULT_CAMERA if camera is None else camera
     height, width = image.shape[:2]
-    if (width, height) != (given.width, given.height):
+    if (width, height) != (nominal.width, nominal.height):
         raise StaridError(
-            f"image of {width}×{height} pixels: the camera has {given.width}×{given.height}; "
+            f"image of {width}×{height} pixels: the camera has {nominal.width}×{nominal.height}; "
             "give the profile of the camera that took it, or its field of view"
         )
     sky = load_catalog() if catalog is None else catalog
     if fov_tolerance > 0.0:
-        return _solve_roughly(image, given, sky, fov_tolerance, settings)
+        return _solve_roughly(image, nominal, sky, fov_tolerance, settings)
     found = detect(image, settings or DetectionSettings())
-    identifier = Identifier(given, sky)
+    identifier = Identifier(nominal, sky)
     solution = identifier.identify(found.xy_px, found.flux, found.xy_sigma_px)
-    return ImageSolution(solution, found, solution.camera or given, identifier.stars)
+    return ImageSolution(solution, found, solution.camera or nominal, identifier.stars)
 
 
 def _solve_roughly(
     image: Counts, camera: Camera, sky: StarCatalog, fov_tolerance: float, settings: DetectionSettings | None
 ) -> ImageSolution:
-    """Look at the image in one way after the other until one of them shows a sky."""
+    """Try one view of the image after another until one is identified."""
     begin = time.perf_counter()
     search = RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
-    seen: list[Look] = []
+    made: list[View] = []
     answer = Solution.invalid(Reason.NO_MATCH)
     for rounds, source in _ROUNDS:
-        for look in looks(image, settings) if source is None else seen[:source]:
+        for view in views(image, settings) if source is None else made[:source]:
             if source is None:
-                seen.append(look)
-            found = look.detections
-            xy = flipped(found.xy_px, camera.width) if look.mirrored else found.xy_px
+                made.append(view)
+            found = view.detections
+            xy = flipped(found.xy_px, camera.width) if view.mirrored else found.xy_px
             answer = search.identify(xy, found.flux, rounds=rounds)
             if answer.valid:
-                return polished(answer, look, camera, search, begin)
+                return refine_solution(answer, view, camera, search, begin)
     answer = Solution.invalid(answer.reason, elapsed=time.perf_counter() - begin)
-    return ImageSolution(answer, seen[0].detections, camera, search.identifier.stars)
+    return ImageSolution(answer, made[0].detections, camera, search.identifier.stars)
 
 
-def polished(
-    solution: Solution, look: Look, camera: Camera, search: RoughSearch, begin: float
+def refine_solution(
+    solution: Solution, view: View, camera: Camera, search: RoughSearch, begin: float
 ) -> ImageSolution:
-    """Solution with the lens estimated on the same stars, where they suffice.
+    """Estimate the lens from the matched stars, where they suffice, and refine the solution with it.
 
     Parameters
     ----------
     solution : Solution
-        Valid, in the rows of the look's detections.
-    look : Look
-        What was identified.
+        A valid solution whose indices refer to the view's detections.
+    view : View
+        The view that was identified.
     camera : Camera
-        As it was taken to be.
+        The nominal camera.
     search : RoughSearch
-        What found the solution.
+        The search that found the solution.
     begin : float
-        Performance counter at the start.
+        Value of the performance counter at the start.
     """
     identifier = search.identifier
-    found = look.detections
-    if look.mirrored:
+    found = view.detections
+    if view.mirrored:
         found = dataclasses.replace(found, xy_px=flipped(found.xy_px, camera.width))
     refined = solution.camera or camera
     if solution.star_count >= _FEW:
@@ -159,15 +159,17 @@ def polished(
     if again.valid:
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
     solution = dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
-    return ImageSolution(solution, found, solution.camera or camera, identifier.stars, look.mirrored)
+    return ImageSolution(solution, found, solution.camera or camera, identifier.stars, view.mirrored)
 
 
-def _refined(stars: Stars, solution: Solution, found: Camera, given: Camera, catalog: StarCatalog) -> Camera:
-    """Camera calibrated on an identified image, or as it was found where no calibration holds."""
+def _refined(
+    stars: Stars, solution: Solution, found: Camera, nominal: Camera, catalog: StarCatalog
+) -> Camera:
+    """Camera calibrated on an identified image; `found` where the calibration fails."""
     try:
-        outcome = calibrate_identified([stars], {0: solution}, given, catalog, models=IMAGE_MODELS)
+        outcome = calibrate_identified([stars], {0: solution}, nominal, catalog, models=IMAGE_MODELS)
     except StaridError as error:
-        _log.info("lens left as it was found: %s", error)
+        _log.info("lens not calibrated: %s", error)
         return found
     return outcome.calibration.camera
 

@@ -1,4 +1,4 @@
-"""Round cameras for cameras that are known roughly: all photographs of about one field share one star index."""
+"""Typical cameras with rounded fields, so that photographs of similar fields share one star index."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ FIELD_STEP: Final = 1.2
 """Ratio of the sides of two neighbouring typical fields."""
 
 WIDTHS_PX: Final = (500, 1000, 2000)
-"""Sides of the typical images: the index merges doubles that the pixels of the image cannot tell apart."""
+"""Sides of the typical images: the index merges doubles that the pixels of the image cannot resolve."""
 
 WIDEST_SR: Final = 1.5
-"""Fields beyond this solid angle differ too much by the lens: they get an index of their own."""
+"""Fields beyond this solid angle differ too much by the lens: each gets a separate index."""
 
 
 def typical_camera(camera: Camera) -> Camera | None:
     """Camera with a square image of a rounded size whose index suits a camera; None for the widest fields.
 
-    Its pixels are no finer than the camera's, so that the index has room for the camera's matching windows;
-    only for images smaller than about 590 pixels they are finer, and such windows are cut to the index's.
+    Its pixels are no finer than the camera's, so that the index covers the camera's matching windows. Only for images
+    smaller than about 590 pixels are they finer; the windows are then limited to those of the index.
     """
     area = field_solid_angle(camera)
     if not area < WIDEST_SR:

@@ -1,8 +1,8 @@
-"""Ways to look at a photograph of unknown making, the plain one first.
+"""Preprocessed views of a photograph of unknown origin, the plain one first.
 
-Detection is made for a star sensor's frames: round spots of a pixel or two on a smooth, dark sky. A photograph
-may be out of focus, grainy or compressed, lie on nebulae or twilight, be printed white on black, or mirrored.
-Each look brings one of these nearer to what detection expects; positions are always those of the image itself.
+Detection expects a star sensor's image: round spots of a pixel or two on a smooth, dark sky. A photograph may be out of
+focus, grainy or compressed, show nebulae or twilight, or be a negative or mirrored. Each view compensates for one of
+these; positions always refer to the image itself.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from starid.imaging.detection import Detections, DetectionSettings, detect
 Counts: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 MOST_STARS: Final = 2000
-"""Detections kept of each look."""
+"""Most detections of each view."""
 
 FACTORS: Final = (2, 4)
-"""Pixels along each axis that are added up for the coarser looks."""
+"""Pixels along each axis that are averaged for the coarser views."""
 
 LEAST_SIDE_PX: Final = 180
-"""Least side of an image after that."""
+"""Least side of a coarser view."""
 
 _FAR_SIGMAS: Final = 4.0
 _LONGER: Final = 2
 _MAD_TO_SIGMA: Final = 1.4826
 
 
-class Look(NamedTuple):
-    """Detections of one look, and whether they are to be mirrored left to right."""
+class View(NamedTuple):
+    """Detections of one view, and whether their positions must be mirrored left to right."""
 
     detections: Detections
     mirrored: bool = False
 
 
-def looks(image: Counts, settings: DetectionSettings | None = None) -> Iterator[Look]:
-    """Look at an image: as it is, in the negative, coarser, mirrored.
+def views(image: Counts, settings: DetectionSettings | None = None) -> Iterator[View]:
+    """Detect stars on the image as it is, on its negative, on coarser images, and mirrored.
 
     Parameters
     ----------
     image : ndarray (h, w) of uint8 or uint16
         Grey.
     settings : DetectionSettings, optional
-        For the detection; with its own settings given, `max_stars` is kept as it is.
+        For the detection; by default `max_stars` is `MOST_STARS`.
     """
     chosen = settings or DetectionSettings(max_stars=MOST_STARS)
     plain = detect(image, chosen)
-    yield Look(plain)
+    yield View(plain)
     if has_dark_tail(image):
-        yield Look(detect(np.invert(image), chosen))
+        yield View(detect(np.invert(image), chosen))
     for factor in FACTORS:
         if min(image.shape) >= factor * LEAST_SIDE_PX:
-            yield Look(_coarser(image, factor, chosen))
-    yield Look(plain, mirrored=True)
+            yield View(_coarser(image, factor, chosen))
+    yield View(plain, mirrored=True)
 
 
 def has_dark_tail(image: Counts) -> bool:
-    """Whether more pixels are far darker than most than far brighter: it may be a negative."""
+    """Whether far dark pixels outnumber far bright ones, as in a negative."""
     middle = float(np.median(image))
     deviation = image.astype(np.float32) - np.float32(middle)
     sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(deviation))), 0.5)
@@ -72,7 +72,7 @@ def has_dark_tail(image: Counts) -> bool:
 def _coarser(image: Counts, factor: int, settings: DetectionSettings) -> Detections:
     """Detections on the means of blocks of pixels, in the pixels and counts of the image itself.
 
-    The noise of a pixel is told from that of a block as if it were independent from pixel to pixel.
+    The noise per pixel assumes that the noise of different pixels is independent.
     """
     height, width = (side // factor * factor for side in image.shape)
     blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor)

@@ -15,8 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.cache import write_atomically
-from starid.files import open_regular
+from starid.files import open_regular, write_atomically
 from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDatabase
 from starid.thesis.features import FEATURE_COUNT
 from starid.thesis.frame_grid import make_grid

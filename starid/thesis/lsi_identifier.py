@@ -25,8 +25,8 @@ from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
-from starid.geometric.validation import checked_detections
 from starid.solution import Reason, Solution
+from starid.solver_input import checked_detections
 from starid.thesis.cell_search import stored_neighbours
 from starid.thesis.coarse_match import next_candidate
 from starid.thesis.database import DatabaseParameters

@@ -19,8 +19,8 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.geometric.validation import checked_detections
 from starid.solution import Reason, Solution
+from starid.solver_input import checked_detections
 from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import FilterError, ObservedFrame
 from starid.thesis.lsi_identifier import FieldStars, LsiIdentifier, LsiOptions

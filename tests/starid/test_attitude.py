@@ -153,7 +153,7 @@ def test_random_attitudes_are_uniform() -> None:
 @pytest.mark.parametrize(
     "quaternion", [[0, 0, 0, 0], [1, 0, 0], [math.nan, 0, 0, 1], [math.inf, 0, 0, 0], [[1, 0, 0, 0]]]
 )
-def test_bad_quaternions_are_refused(quaternion: list[float]) -> None:
+def test_bad_quaternions_are_rejected(quaternion: list[float]) -> None:
     with pytest.raises(StaridError, match="attitude quaternion"):
         Attitude.from_quaternion(quaternion)
 
@@ -161,7 +161,7 @@ def test_bad_quaternions_are_refused(quaternion: list[float]) -> None:
 @pytest.mark.parametrize(
     "matrix", [np.eye(3) * 1.1, np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan), np.eye(2)]
 )
-def test_bad_matrices_are_refused(matrix: np.ndarray) -> None:
+def test_bad_matrices_are_rejected(matrix: np.ndarray) -> None:
     with pytest.raises(StaridError, match="attitude matrix"):
         Attitude.from_matrix(matrix)
 
@@ -169,6 +169,6 @@ def test_bad_matrices_are_refused(matrix: np.ndarray) -> None:
 @pytest.mark.parametrize(
     "values", [(0.0, 90.1, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, math.nan, 0.0)]
 )
-def test_bad_angles_are_refused(values: tuple[float, float, float]) -> None:
+def test_bad_angles_are_rejected(values: tuple[float, float, float]) -> None:
     with pytest.raises(StaridError, match="attitude"):
         Attitude.from_radec_roll(*values)

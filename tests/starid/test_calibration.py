@@ -1,4 +1,4 @@
-"""Calibration on simulated skies: the truth is recovered to the noise floor, and the covariance is honest."""
+"""Calibration on simulated skies: the truth is recovered to the noise floor, and the covariance is calibrated."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_other_lenses_and_false_matches(
     assert total - 16 - 4 <= result.star_count < total
 
 
-def test_covariance_is_honest(sky: StarCatalog) -> None:
+def test_the_covariance_matches_the_errors(sky: StarCatalog) -> None:
     ratios = []
     for seed in range(25):
         frames, _ = simulated(sky, WIDE, 3, 100 + seed)
@@ -177,7 +177,7 @@ def test_errors_may_differ_along_x_and_y(sky: StarCatalog) -> None:
     assert abs(error[1]) < 4.0 * result.sigmas["fy"]
 
 
-def test_bad_calibrations_are_refused(sky: StarCatalog) -> None:
+def test_bad_calibrations_are_rejected(sky: StarCatalog) -> None:
     frames, _ = simulated(sky, WIDE, 1, 8)
     with pytest.raises(StaridError, match="'k9'"):
         calibrate(frames, WIDE, ("k9",))
@@ -230,7 +230,7 @@ def test_a_model_that_folds_the_image_leaves_the_choice_to_the_others(sky: StarC
 
 
 @pytest.mark.parametrize(
-    ("xy", "reference", "sigma", "words"),
+    ("xy", "reference", "sigma", "message"),
     [
         (np.zeros((3, 3)), np.eye(3), None, "xy_px"),
         (np.full((3, 2), np.nan), np.eye(3), None, "xy_px"),
@@ -239,10 +239,10 @@ def test_a_model_that_folds_the_image_leaves_the_choice_to_the_others(sky: StarC
         (np.zeros((3, 2)), np.eye(3), np.zeros(3), "standard deviations"),
     ],
 )
-def test_bad_frames_are_refused(
-    xy: np.ndarray, reference: np.ndarray, sigma: np.ndarray | None, words: str
+def test_bad_frames_are_rejected(
+    xy: np.ndarray, reference: np.ndarray, sigma: np.ndarray | None, message: str
 ) -> None:
-    with pytest.raises(StaridError, match=words):
+    with pytest.raises(StaridError, match=message):
         CalibrationFrame(xy, reference, sigma)
 
 
@@ -264,7 +264,7 @@ def test_profile_brings_the_camera_back_exactly(tmp_path: Path, calibration: Cal
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("camera = 1", r"has no table \[camera\]"),
         ("", r"has no table \[camera\]"),
@@ -282,9 +282,9 @@ def test_profile_brings_the_camera_back_exactly(tmp_path: Path, calibration: Cal
         ('[camera]\nfov_deg = 42\nmodel = ["pinhole"]', r"camera model: \['pinhole'\] given, one of pinhole"),
     ],
 )
-def test_bad_profiles_are_named(tmp_path: Path, text: str, words: str) -> None:
+def test_bad_profiles_are_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "bad.toml").write_text(text)
-    with pytest.raises(StaridError, match=words) as caught:
+    with pytest.raises(StaridError, match=message) as caught:
         load_camera(tmp_path / "bad.toml")
     assert "bad.toml" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -324,7 +324,7 @@ def test_self_calibration_from_a_rough_field_of_view(sky: StarCatalog) -> None:
     empty = Stars(np.array([[10.0, 10.0], [500.0, 600.0]]), np.array([2.0, 1.0]))
     result = self_calibrate([*frames, empty], start, fov_tolerance=0.1)
     assert result.frame_index == (0, 1, 2, 3, 4, 5)
-    assert result.refused == {6: "too_few_stars"}
+    assert result.unidentified == {6: "too_few_stars"}
     assert mapping_error_px(WIDE, start) > 10.0
     assert mapping_error_px(WIDE, result.calibration.camera) < 0.15
     assert result.calibration.sigma_px == pytest.approx(SIGMA_PX, rel=0.2)
@@ -339,7 +339,7 @@ def test_a_perfect_lens_gets_no_more_parameters_than_it_needs(sky: StarCatalog) 
     assert mapping_error_px(DEFAULT_CAMERA, result.calibration.camera) < 0.1
 
 
-def test_frames_of_no_sky_are_refused() -> None:
+def test_frames_of_no_sky_are_rejected() -> None:
     rng = np.random.default_rng(23)
     noise = [Stars(rng.uniform(0, 936, (40, 2)), rng.uniform(1, 9, 40)) for _ in range(2)]
     with pytest.raises(StaridError, match="none of 2 frames could be identified"):

@@ -53,7 +53,7 @@ def test_project_and_back_project_are_inverse_over_the_whole_image(camera: Camer
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_only_directions_that_the_image_sees_are_inside(camera: Camera) -> None:
-    """A direction is inside exactly when the pixel it falls on looks back along it: nothing is folded in."""
+    """A direction is inside exactly when its pixel projects back to it: nothing is folded in."""
     vectors = np.random.default_rng(6).standard_normal((200_000, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     xy, inside = camera.project(vectors)
@@ -238,7 +238,7 @@ def test_from_dict_takes_a_field_of_view() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "words"),
+    ("values", "message"),
     [
         ({"width": 0}, "width"),
         ({"height": 1.5}, "height"),
@@ -263,13 +263,13 @@ def test_from_dict_takes_a_field_of_view() -> None:
         ({"fov_deg": 20.0}, "exclude"),
     ],
 )
-def test_bad_cameras_are_refused_by_name(values: dict[str, object], words: str) -> None:
-    with pytest.raises(StaridError, match=words):
+def test_bad_cameras_are_rejected_by_name(values: dict[str, object], message: str) -> None:
+    with pytest.raises(StaridError, match=message):
         Camera.from_dict({**DEFAULT_CAMERA.to_dict(), **values})
 
 
 @pytest.mark.parametrize("fov", [0.0, -1.0, 170.1, math.nan, "42", None, True, [42.0]])
-def test_bad_fields_of_view_are_refused(fov: float) -> None:
+def test_bad_fields_of_view_are_rejected(fov: float) -> None:
     with pytest.raises(StaridError, match="fov_deg"):
         Camera.from_fov(fov)
 
@@ -278,7 +278,7 @@ def test_bad_fields_of_view_are_refused(fov: float) -> None:
     "values",
     [{"width": "937"}, {"height": 0}, {"model": ["pinhole"]}, {"model": "fisheye"}, {"distortion": 0.1}],
 )
-def test_other_values_beside_a_field_of_view_are_refused_by_name(values: dict[str, object]) -> None:
+def test_other_values_beside_a_field_of_view_are_rejected_by_name(values: dict[str, object]) -> None:
     with pytest.raises(StaridError, match=f"camera {next(iter(values))}"):
         Camera.from_dict({"fov_deg": 42.0, **values})
 
@@ -288,7 +288,7 @@ def test_missing_key_is_named() -> None:
         Camera.from_dict({"width": 3, "focal_px": (1, 1), "centre_px": (1, 1)})
 
 
-def test_tables_of_the_wrong_shape_are_refused() -> None:
+def test_tables_of_the_wrong_shape_are_rejected() -> None:
     with pytest.raises(StaridError, match="directions"):
         DEFAULT_CAMERA.project([1.0, 2.0, 3.0])
     with pytest.raises(StaridError, match="positions"):

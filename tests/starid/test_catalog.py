@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from starid import cache, catalog, hipparcos
-from starid.catalog import StarCatalog, blend, companions, load_catalog
+from starid import cache, catalog, files, hipparcos
+from starid.catalog import StarCatalog, companions, load_catalog, merge_close_stars
 from starid.errors import StaridError
 from starid.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
 
@@ -182,13 +182,13 @@ def test_arrays_cannot_be_written(sky: StarCatalog) -> None:
 def test_blend_adds_light_and_weighs_positions(sky: StarCatalog) -> None:
     pair = sky.subset(sky.index_of([95947, 95951]))
     gap = float(np.linalg.norm(pair.vectors[0] - pair.vectors[1]))
-    merged = blend(pair, 40 * ARCSECOND)
+    merged = merge_close_stars(pair, 40 * ARCSECOND)
     assert merged.hip.tolist() == [95947]
     assert merged.v[0] == pytest.approx(2.90, abs=0.02), "Albireo A (3.05) and B (5.12)"
     share = flux_ratio(pair.v[1]) / flux_ratio(pair.v).sum()
     assert float(np.linalg.norm(merged.vectors[0] - pair.vectors[0])) == pytest.approx(share * gap, rel=1e-6)
     assert float(np.linalg.norm(merged.vectors[0])) == pytest.approx(1.0, abs=1e-15)
-    assert len(blend(pair, 0.1 * gap)) == 2
+    assert len(merge_close_stars(pair, 0.1 * gap)) == 2
 
 
 @pytest.mark.parametrize(("limit", "arcseconds"), [(6.0, 330.0), (4.0, 1500.0), (-2.0, 330.0), (20.0, 330.0)])
@@ -217,22 +217,22 @@ def test_a_blend_as_fitted_lies_short_of_the_centre_of_light(sky: StarCatalog) -
     pair = sky.subset(sky.index_of([95947, 95951]))
     gap = float(np.linalg.norm(pair.vectors[0] - pair.vectors[1]))
     ratio = flux_ratio(pair.v[1]) / flux_ratio(pair.v[0])
-    merged = blend(pair, gap / 0.8, as_fitted=True)
+    merged = merge_close_stars(pair, gap / 0.8, as_fitted=True)
     share = (1.0 - (1.0 - math.exp(-0.64)) * (1.0 - (ratio / 0.45) ** 2)) * ratio / (1.0 + ratio)
     assert float(np.linalg.norm(merged.vectors[0] - pair.vectors[0])) == pytest.approx(share * gap, rel=1e-5)
-    assert merged.v[0] == blend(pair, gap / 0.8).v[0]
+    assert merged.v[0] == merge_close_stars(pair, gap / 0.8).v[0]
 
 
 def test_blend_leaves_no_close_pair_of_leaders_and_no_light_behind(sky: StarCatalog) -> None:
     stars = sky.brighter_than(7.0)
-    merged = blend(stars, 180 * ARCSECOND)
+    merged = merge_close_stars(stars, 180 * ARCSECOND)
     assert 0 < len(stars) - len(merged) < 0.2 * len(stars)
     assert flux_ratio(merged.v).sum() == pytest.approx(flux_ratio(stars.v).sum(), rel=1e-12)
     assert (np.diff(merged.v) >= 0).all()
     assert set(merged.hip) <= set(stars.hip)
     untouched = merged.subset(merged.index_of(32349)[None])
     np.testing.assert_array_equal(untouched.vectors[0], stars.vectors[0])
-    assert blend(sky.subset([]), 1.0).hip.size == 0
+    assert merge_close_stars(sky.subset([]), 1.0).hip.size == 0
 
 
 def test_close_pairs_are_those_of_a_tree(sky: StarCatalog) -> None:
@@ -285,7 +285,7 @@ def test_blank_optional_fields_are_unknown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         (
             lambda rows: [rows[0], rows[1], rows[2][:100]],
@@ -303,9 +303,9 @@ def test_blank_optional_fields_are_unknown(tmp_path: Path) -> None:
         (lambda _: [], "hip2.dat"),
     ],
 )
-def test_bad_files_are_refused_by_name_and_line(tmp_path: Path, change, words: str) -> None:
+def test_bad_files_are_rejected_by_name_and_line(tmp_path: Path, change, message: str) -> None:
     (tmp_path / "hip2.dat").write_bytes(b"".join(change(lines_of_the_file(3))))
-    with pytest.raises(StaridError, match=words) as caught:
+    with pytest.raises(StaridError, match=message) as caught:
         hipparcos.read_hip2(tmp_path / "hip2.dat", expected=3)
     assert "\n" not in str(caught.value)
     assert str(tmp_path / "hip2.dat") in str(caught.value)
@@ -330,7 +330,7 @@ def test_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("epoch", [1000.0, 3000.0, math.nan])
-def test_epochs_out_of_range_are_refused(epoch: float) -> None:
+def test_epochs_out_of_range_are_rejected(epoch: float) -> None:
     with pytest.raises(StaridError, match="epoch"):
         load_catalog(epoch=epoch)
 
@@ -347,7 +347,7 @@ def test_cache_is_used_and_rebuilt_when_damaged(own_cache: Path, monkeypatch: py
     damaged[len(whole) // 2] ^= 0xFF
     stored.write_bytes(damaged)
     assert load_catalog().identity == first.identity
-    assert len(reads) == 1, "a damaged cache is built anew"
+    assert len(reads) == 1, "a damaged cache is built again"
     assert stored.read_bytes() == whole
     assert [p.name for p in own_cache.iterdir()] == [stored.name], "nothing half-written is left"
 
@@ -418,6 +418,6 @@ def test_a_failing_write_leaves_the_old_file(tmp_path: Path) -> None:
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        cache.write_atomically(target, fail)
+        files.write_atomically(target, fail)
     assert target.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["kept"]

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from starid.attitude import Attitude, turn_text
-from starid.cache import write_atomically
 from starid.camera_file import load_camera
 from starid.errors import StaridError
-from starid.files import read_bytes, read_number, read_text
+from starid.files import read_bytes, read_number, read_text, write_atomically
 from starid.hipparcos import read_hip2
 from starid.imaging.image_io import read_image, write_image
 from starid.thesis.database import DatabaseError
@@ -75,7 +74,7 @@ def test_a_folder_is_not_written_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize("into_file", [False, True])
 def test_the_standard_output_is_a_file_too(tmp_path: Path, *, into_file: bool) -> None:
     program = (
-        "import sys; from pathlib import Path; from starid.cache import write_atomically;"
+        "import sys; from pathlib import Path; from starid.files import write_atomically;"
         "print('before'); write_atomically(Path(sys.argv[1]), lambda part: part.write_text('whole\\n')); print('after')"
     )
     link, file = tmp_path / "stdout", tmp_path / "file"
@@ -102,10 +101,10 @@ def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
     assert seen[0].startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(("reader", "refusal"), READERS)
+@pytest.mark.parametrize(("reader", "error_type"), READERS)
 @pytest.mark.parametrize("kind", ["zero", "pipe", "folder"])
 def test_only_regular_files_are_read(
-    tmp_path: Path, reader: object, refusal: type[Exception], kind: str
+    tmp_path: Path, reader: object, error_type: type[Exception], kind: str
 ) -> None:
     path = tmp_path / kind
     if kind == "zero":
@@ -122,7 +121,7 @@ def test_only_regular_files_are_read(
         "try: getattr(module, sys.argv[2])(Path(sys.argv[5]))\n"
         "except error as caught: print(caught)"
     )
-    names = [reader.__module__, reader.__name__, refusal.__module__, refusal.__name__]  # type: ignore[attr-defined]
+    names = [reader.__module__, reader.__name__, error_type.__module__, error_type.__name__]  # type: ignore[attr-defined]
     done = subprocess.run(
         [sys.executable, "-c", program, *names, str(path)], capture_output=True, text=True, timeout=120
     )

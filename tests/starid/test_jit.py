@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from starid.cache import cached_files, remove
 from starid.jit import VerifiedCacheFile, source_stamp
 
 CALLER = """
@@ -35,7 +37,22 @@ def scaled(x: float) -> float:
 """
 
 
+@pytest.fixture(autouse=True)
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def write_package(folder: Path, *, slope: float = 2.0) -> None:
+    package = folder / "other_kernels"
+    package.mkdir(parents=True, exist_ok=True)
+    (package / "__init__.py").write_text("")
+    (package / "outer.py").write_text(CALLER)
+    (package / "inner.py").write_text(INNER.format(factor=0.5, slope=slope))
+
+
 def run(folder: Path) -> list[str]:
+    """Result of the kernel in a new process, and how often its machine code was loaded."""
     done = subprocess.run(
         [sys.executable, "-c", "import other_kernels.outer"],
         cwd=folder,
@@ -47,15 +64,74 @@ def run(folder: Path) -> list[str]:
 
 
 def test_a_changed_callee_in_another_module_is_noticed(tmp_path: Path) -> None:
-    package = tmp_path / "other_kernels"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "outer.py").write_text(CALLER)
-    (package / "inner.py").write_text(INNER.format(factor=0.5, slope=2.0))
+    write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
     assert run(tmp_path) == ["2.5", "1"], "the second process loads the machine code"
-    (package / "inner.py").write_text(INNER.format(factor=0.5, slope=3.0))
+    write_package(tmp_path, slope=3.0)
     assert run(tmp_path) == ["3.5", "0"], "the old code is not run"
+
+
+def test_copies_of_a_package_share_machine_code_while_their_sources_are_equal(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    write_package(first)
+    write_package(second)
+    assert run(first) == ["2.5", "0"]
+    assert run(second) == ["2.5", "1"], "compiled once for both"
+    write_package(second, slope=3.0)
+    assert run(second) == ["3.5", "0"], "other sources are compiled again"
+    assert run(first) == ["2.5", "1"], "and leave the code of the first in place"
+    assert run(second) == ["3.5", "1"]
+    assert not list(tmp_path.glob("*/other_kernels/**/*.nbc")), "nothing is kept beside the sources"
+
+
+def test_machine_code_is_kept_beside_the_sources_where_the_cache_folder_cannot_be_made(
+    tmp_path: Path, cache_folder: Path
+) -> None:
+    cache_folder.write_text("a file in the way")
+    write_package(tmp_path)
+    assert run(tmp_path) == ["2.5", "0"]
+    assert run(tmp_path) == ["2.5", "1"]
+
+
+def test_kernels_run_where_machine_code_can_be_kept_nowhere(tmp_path: Path, cache_folder: Path) -> None:
+    cache_folder.write_text("a file in the way")
+    write_package(tmp_path)
+    (tmp_path / "other_kernels" / "__pycache__").write_text("a file in the way")
+    assert run(tmp_path) == ["2.5", "0"]
+    assert run(tmp_path) == ["2.5", "0"]
+
+
+def test_the_least_recently_used_machine_code_is_evicted_beyond_the_limit(
+    tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", "0")
+    write_package(tmp_path)
+    assert run(tmp_path) == ["2.5", "0"]
+    (old,) = [each.path for each in cached_files()]
+    write_package(tmp_path, slope=3.0)
+    assert run(tmp_path) == ["3.5", "0"]
+    assert [each.path for each in cached_files() if each.path == old] == []
+    assert cached_files(), "the machine code of the last kernel stays"
+
+
+def test_loaded_machine_code_counts_as_used(tmp_path: Path) -> None:
+    write_package(tmp_path)
+    run(tmp_path)
+    for each in cached_files():
+        os.utime(each.path, (1000, 1000))
+    run(tmp_path)
+    assert any(each.used_s > 1000 for each in cached_files())
+
+
+def test_clearing_the_cache_removes_machine_code(tmp_path: Path) -> None:
+    write_package(tmp_path)
+    run(tmp_path)
+    files = cached_files()
+    assert all(each.size > 0 for each in files)
+    assert files
+    assert all(remove(each) for each in files)
+    assert cached_files() == []
+    assert run(tmp_path) == ["2.5", "0"]
 
 
 def test_stamps_follow_imports_only() -> None:
@@ -76,15 +152,11 @@ def zeroed(data: bytes) -> bytes:
     return data[:-100] + bytes(100)
 
 
-def test_damaged_machine_code_is_removed_and_compiled_again(tmp_path: Path) -> None:
-    package = tmp_path / "other_kernels"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "outer.py").write_text(CALLER)
-    (package / "inner.py").write_text(INNER.format(factor=0.5, slope=2.0))
+def test_damaged_machine_code_is_removed_and_compiled_again(tmp_path: Path, cache_folder: Path) -> None:
+    write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
     for suffix in ("nbc", "nbi"):
-        files = list(package.rglob(f"*.{suffix}"))
+        files = list(cache_folder.rglob(f"*.{suffix}"))
         assert files
         for file in files:
             file.write_bytes(truncated(file.read_bytes()))

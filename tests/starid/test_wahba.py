@@ -135,7 +135,7 @@ def test_covariance_of_stars_on_the_axes() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
-    ("body", "reference", "weights", "words"),
+    ("body", "reference", "weights", "message"),
     [
         ([[0, 0, 1]], [[0, 0, 1]], None, "1 star given"),
         ([[0, 0, 1]] * 3, [[1, 0, 0]] * 3, None, "undetermined"),
@@ -150,8 +150,8 @@ def test_covariance_of_stars_on_the_axes() -> None:
         (np.eye(3), -np.eye(3), None, "undetermined"),
     ],
 )
-def test_undetermined_and_bad_input_is_refused(method: str, body, reference, weights, words: str) -> None:
-    with pytest.raises(StaridError, match=words):
+def test_undetermined_and_bad_input_is_rejected(method: str, body, reference, weights, message: str) -> None:
+    with pytest.raises(StaridError, match=message):
         solve_wahba(body, reference, weights, method)
 
 
@@ -161,11 +161,11 @@ def test_unknown_method_is_named() -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.0, [1e-4, 1e-4], [1e-4, -1.0, 1e-4], math.nan])
-def test_bad_sigmas_are_refused(sigma: object) -> None:
+def test_bad_sigmas_are_rejected(sigma: object) -> None:
     with pytest.raises(StaridError, match="standard deviations"):
         covariance(np.eye(3), sigma)  # type: ignore[arg-type]
 
 
-def test_covariance_of_one_star_is_refused() -> None:
+def test_covariance_of_one_star_is_rejected() -> None:
     with pytest.raises(StaridError, match="undetermined"):
         covariance([[0, 0, 1]], 1e-4)

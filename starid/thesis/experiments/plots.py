@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from starid.cache import write_atomically
+from starid.files import write_atomically
 
 _STYLE: Any = {
     "font.size": 9,

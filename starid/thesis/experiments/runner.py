@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.cache import write_atomically
+from starid.files import write_atomically
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,

@@ -1,4 +1,4 @@
-"""The identifier on the scenes of the published comparison: right or refused, to the bound, with an honest covariance."""
+"""The identifier on the scenes of the published comparison: right or rejected, within the bound, with a calibrated covariance."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def test_rows_of_the_comparison_are_answered_rightly_and_to_the_bound(row: str) 
 
 
 @pytest.mark.parametrize("row", ["100 random points", "30–150 random points"])
-def test_random_points_are_refused(row: str) -> None:
+def test_random_points_are_rejected(row: str) -> None:
     for scene in scenes(ROWS[row], 100, 18):
         solution = identifier().identify(scene.xy_px, scene.flux)
         assert (solution.valid, solution.reason) == (False, Reason.NO_MATCH)
         assert np.isnan(solution.quaternion_xyzw).all()
 
 
-def test_a_mirrored_sky_is_refused() -> None:
+def test_a_mirrored_sky_is_rejected() -> None:
     for scene in scenes(ROWS["0.5"], 30, 19):
         mirrored = scene.xy_px * [-1.0, 1.0] + [936.0, 0.0]
         assert not identifier().identify(mirrored, scene.flux).valid
@@ -76,7 +76,7 @@ def test_the_parts_of_a_cluttered_field_answer_where_the_whole_does_not() -> Non
     assert found["whole"] <= 25
 
 
-def test_a_field_with_a_mirrored_half_is_right_or_refused() -> None:
+def test_a_field_with_a_mirrored_half_is_right_or_rejected() -> None:
     valid = 0
     for scene in scenes(ROWS["0.5"], 30, 22):
         left = scene.xy_px[:, 0] < 468.0
@@ -91,7 +91,7 @@ def test_a_field_with_a_mirrored_half_is_right_or_refused() -> None:
 
 
 @pytest.mark.parametrize("given", [False, True])
-def test_covariance_is_honest(given: bool) -> None:
+def test_the_covariance_matches_the_errors(given: bool) -> None:
     rng = np.random.default_rng(23)
     total, solved = 0.0, 0
     for scene in scenes(SceneSettings(5.5, 0.0), 200, 24):

@@ -77,7 +77,7 @@ def test_an_unknown_focal_length_is_found(model: str, fov_deg: float, factor: fl
         assert solution.attitude.error_to(attitude).cross_boresight_arcsec < RIGHT_ARCSEC
 
 
-def test_random_points_are_refused_at_an_unknown_focal_length_too() -> None:
+def test_random_points_are_rejected_at_an_unknown_focal_length_too() -> None:
     asked = Identifier(Camera.from_fov(25.0, 1024, 1024), fov_tolerance=0.1)
     rng = np.random.default_rng(10)
     for _ in range(4):

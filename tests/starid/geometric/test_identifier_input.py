@@ -12,8 +12,8 @@ from starid.camera import Camera, Model
 from starid.catalog import load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Effort, Identifier
-from starid.geometric.validation import FARTHEST_PX
 from starid.solution import Reason, Solution
+from starid.solver_input import FARTHEST_PX
 from tests.starid.geometric.sky_points import identifier, sky
 
 AT = Attitude.from_radec_roll(80.0, 10.0, 30.0)
@@ -21,7 +21,7 @@ NAN, INF = math.nan, math.inf
 
 
 @pytest.mark.parametrize(
-    ("xy", "flux", "sigma", "words"),
+    ("xy", "flux", "sigma", "message"),
     [
         ([[NAN, 1.0]], [1.0], None, "finite"),
         ([[1.0, INF]], [1.0], None, "finite"),
@@ -41,9 +41,9 @@ NAN, INF = math.nan, math.inf
         ([[1.0, 1.0]], [1.0], [[1.0, 1.0, 1.0]], r"errors \(1, 3\)"),
     ],
 )
-def test_bad_arrays_are_refused_in_one_line(xy: object, flux: object, sigma: object, words: str) -> None:
+def test_bad_arrays_are_rejected_in_one_line(xy: object, flux: object, sigma: object, message: str) -> None:
     for ask in (identifier().identify, lambda a, b, c: identifier().track(a, b, AT, c)):
-        with pytest.raises(StaridError, match=words) as caught:
+        with pytest.raises(StaridError, match=message) as caught:
             ask(xy, flux, sigma)
         assert "\n" not in str(caught.value)
 
@@ -130,7 +130,7 @@ def test_an_effort_out_of_range_is_named(change: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize("limit", [None, 6.0])
-def test_a_catalogue_without_a_star_is_refused(limit: float | None) -> None:
+def test_a_catalogue_without_a_star_is_rejected(limit: float | None) -> None:
     with pytest.raises(StaridError, match="identifier catalog: it holds no star"):
         Identifier(catalog=load_catalog().brighter_than(-5.0), limiting_magnitude=limit, cache=False)
 
@@ -147,7 +147,7 @@ def test_a_position_far_outside_the_image_is_only_a_false_star(model: Model) -> 
     assert 0 not in solution.detection_index
 
 
-def test_a_camera_of_another_size_is_refused() -> None:
+def test_a_camera_of_another_size_is_rejected() -> None:
     with pytest.raises(StaridError, match="937×937"):
         identifier().with_camera(Camera.from_fov(42.0, 640, 480))
 

@@ -1,4 +1,4 @@
-"""The index on disk: mapped again, and built anew where it is damaged or another's."""
+"""The index on disk: mapped again, and built again where it is damaged or of another index."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_arrays_come_back_as_they_were_and_cannot_be_written(stored: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("damage", "words"),
+    ("damage", "message"),
     [
         (lambda b: b[:0], "empty file"),
         (lambda b: b"GIF89a" + b[6:], "not an index file"),
@@ -63,7 +63,7 @@ def test_arrays_come_back_as_they_were_and_cannot_be_written(stored: Path) -> No
     ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length"],
 )
 def test_damaged_file_is_named_and_built_anew(
-    stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage, words: str
+    stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage, message: str
 ) -> None:
     good = stored.read_bytes()
     path = tmp_path / stored.name
@@ -71,7 +71,7 @@ def test_damaged_file_is_named_and_built_anew(
     with caplog.at_level(logging.WARNING):
         identifier = Identifier(CAMERA, limiting_magnitude=4.0, cache=tmp_path)
     assert str(path) in caplog.text
-    assert words in caplog.text
+    assert message in caplog.text
     assert path.read_bytes() == good
     attitude = Attitude.from_radec_roll(80.0, 10.0, 30.0)
     xy, flux, _ = sky(attitude, camera=CAMERA, limit=4.0, identified=identifier)
@@ -96,6 +96,6 @@ def test_a_folder_that_cannot_be_written_costs_only_the_file(
     assert "cannot be written" in caplog.text
 
 
-def test_a_sky_without_triangles_is_refused() -> None:
+def test_a_sky_without_triangles_is_rejected() -> None:
     with pytest.raises(StaridError, match="raise the limiting magnitude"):
         Identifier(Camera.from_fov(5.0, 512, 512), limiting_magnitude=1.0, cache=False)

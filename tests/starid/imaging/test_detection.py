@@ -157,7 +157,7 @@ def test_stars_at_the_edge_are_flagged() -> None:
 
 
 @pytest.mark.parametrize("height", [60.0, 300.0, 3000.0, 60000.0])
-def test_hot_pixels_are_refused(height: float) -> None:
+def test_hot_pixels_are_rejected(height: float) -> None:
     shape = (300, 300)
     places = scattered(30, shape, 6)
     light = sum(spot(shape, *place, 1500.0) for place in places[:15])
@@ -166,10 +166,10 @@ def test_hot_pixels_are_refused(height: float) -> None:
     number, spurious = matched(found, places[:15])
     assert np.all(number >= 0)
     assert len(spurious) == 0
-    assert found.refused >= 15
+    assert found.rejected >= 15
 
 
-def test_saturated_hot_pixels_are_refused() -> None:
+def test_saturated_hot_pixels_are_rejected() -> None:
     shape = (200, 200)
     light = spot(shape, 50.0, 50.0, 1500.0)
     light[100, 120] = 70000.0
@@ -358,7 +358,7 @@ def test_star_sizes_can_be_limited() -> None:
     small = detect(image, DetectionSettings(max_star_pixels=12))
     assert len(small) == 1
     assert small.xy_px[0] == pytest.approx((150.0, 150.0), abs=0.3)
-    assert small.refused >= 1
+    assert small.rejected >= 1
 
 
 def test_at_most_max_stars() -> None:
@@ -399,7 +399,7 @@ def test_black_and_white_and_flat_have_a_reason(dtype: type, shape: tuple[int, i
         (None, "a NoneType given"),
     ],
 )
-def test_what_is_no_image_is_refused_in_one_line(image: object, text: str) -> None:
+def test_what_is_no_image_is_rejected_in_one_line(image: object, text: str) -> None:
     with pytest.raises(StaridError) as caught:
         detect(image)  # type: ignore[arg-type]
     assert text in str(caught.value)
@@ -416,7 +416,7 @@ def test_what_is_no_image_is_refused_in_one_line(image: object, text: str) -> No
         {"model_error": 2.0},
     ],
 )
-def test_bad_settings_are_refused(values: dict[str, float]) -> None:
+def test_bad_settings_are_rejected(values: dict[str, float]) -> None:
     with pytest.raises(StaridError, match=rf"detection {next(iter(values))}: "):
         DetectionSettings(**values)  # type: ignore[arg-type]
 

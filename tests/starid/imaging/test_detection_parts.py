@@ -1,4 +1,4 @@
-"""The parts of detection by themselves: background, filters, flow of trails, widths, and the normal table."""
+"""The components of detection: background, filters, flow of trails, widths, and the normal table."""
 
 from __future__ import annotations
 

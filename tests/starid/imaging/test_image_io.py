@@ -1,4 +1,4 @@
-"""Image files: what is read is what was written, and everything else is refused in one line."""
+"""Image files: what is read is what was written, and everything else is rejected in one line."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_jpeg_with_a_tail_is_whole(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "jpg"])
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.9, 0.999])
-def test_truncated_files_are_refused(
+def test_truncated_files_are_rejected(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], suffix: str, share: float
 ) -> None:
     path = written(tmp_path, f"a.{suffix}", GREY8)
@@ -58,7 +58,7 @@ def test_truncated_files_are_refused(
     assert capfd.readouterr().err == "", "the decoder's own complaints stay out of the way"
 
 
-def test_png_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
+def test_png_with_a_flipped_bit_is_rejected(tmp_path: Path) -> None:
     path = written(tmp_path, "a.png", GREY8)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
@@ -68,7 +68,7 @@ def test_png_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "pixels", "words"),
+    ("name", "pixels", "message"),
     [
         ("c.png", np.dstack([GREY8, GREY8 // 2, GREY8 // 3]), "3 channels"),
         ("c.tif", np.dstack([GREY16] * 3), "3 channels"),
@@ -80,10 +80,10 @@ def test_png_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
         ("g.png", np.full((9, 9), 7, np.uint8), "without any contrast"),
     ],
 )
-def test_images_that_are_no_frames_are_refused(
-    tmp_path: Path, name: str, pixels: np.ndarray, words: str
+def test_images_that_are_no_frames_are_rejected(
+    tmp_path: Path, name: str, pixels: np.ndarray, message: str
 ) -> None:
-    with pytest.raises(StaridError, match=words) as caught:
+    with pytest.raises(StaridError, match=message) as caught:
         read_image(written(tmp_path, name, pixels))
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -98,13 +98,13 @@ def test_colour_becomes_luma_when_allowed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"GIF89a" + b"\x00" * 50])
-def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_rejected(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(StaridError, match=r"PNG, TIFF or JPEG|is empty"):
         read_image(tmp_path / "a.png")
 
 
-def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
+def test_missing_files_and_folders_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(StaridError, match="no such file"):
         read_image(tmp_path / "nothing.png")
     with pytest.raises(StaridError, match="cannot be read"):
@@ -119,7 +119,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, name: str, pixels: np.ndar
     assert [p.name for p in (tmp_path / name).parent.iterdir()] == [Path(name).name]
 
 
-def test_images_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+def test_images_that_cannot_be_written_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(StaridError, match=r"suffix '\.bmp'"):
         write_image(tmp_path / "a.bmp", GREY8)
     with pytest.raises(StaridError, match="JPEG holds 8 bits"):

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from starid import field_sweep, image_solver
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_stars import pick_pattern_stars
+from starid.photograph import field_sweep, solver
 from starid.photograph.field_sweep import solve_any_field
 from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_choice
 from starid.photograph.solver import ImageSolution, solve_image
 from starid.photograph.typical_camera import typical_camera
-from starid.photograph.views import Look, has_dark_tail, looks
-from tests.starid.photograph import FOV_DEG, HEIGHT, WIDTH, photograph
+from starid.photograph.views import View, has_dark_tail, views
+from tests.starid.photograph.night_sky import FOV_DEG, HEIGHT, WIDTH, photograph
 
 CENTRE_ARCSEC = 10.0
-TOLD = Camera.from_fov(FOV_DEG * 0.92, WIDTH, HEIGHT)
+NOMINAL = Camera.from_fov(FOV_DEG * 0.92, WIDTH, HEIGHT)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def sky() -> StarCatalog:
 
 
 def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
-    """Angle between where the image's centre looks and where it is found to look."""
+    """Angle between the true and the found direction of the image's centre."""
     middle = np.array([[(WIDTH - 1) / 2, (HEIGHT - 1) / 2]])
     seen = found.solution.attitude.to_icrs(found.camera.back_project(middle))[0]
     true = truth.to_icrs(camera.back_project(middle))[0]
@@ -48,7 +48,7 @@ def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
 )
 def test_a_photograph_tells_attitude_field_and_distortion(sky, seed, defects) -> None:
     image, truth, camera = photograph(sky, seed, **defects)
-    found = solve_image(image, TOLD, sky, fov_tolerance=0.1)
+    found = solve_image(image, NOMINAL, sky, fov_tolerance=0.1)
     assert found.solution.valid
     assert not found.mirrored
     assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
@@ -57,9 +57,9 @@ def test_a_photograph_tells_attitude_field_and_distortion(sky, seed, defects) ->
 
 def test_a_negative_and_a_mirrored_photograph_are_seen_for_what_they_are(sky) -> None:
     image, truth, camera = photograph(sky, 6)
-    negative = solve_image(np.invert(image), TOLD, sky, fov_tolerance=0.1)
+    negative = solve_image(np.invert(image), NOMINAL, sky, fov_tolerance=0.1)
     assert centre_error_arcsec(negative, truth, camera) < CENTRE_ARCSEC
-    mirror = solve_image(np.ascontiguousarray(image[:, ::-1]), TOLD, sky, fov_tolerance=0.1)
+    mirror = solve_image(np.ascontiguousarray(image[:, ::-1]), NOMINAL, sky, fov_tolerance=0.1)
     assert mirror.mirrored
     assert centre_error_arcsec(mirror, truth, camera) < CENTRE_ARCSEC
     on_image = mirror.on_image(mirror.detections.xy_px)
@@ -67,19 +67,19 @@ def test_a_negative_and_a_mirrored_photograph_are_seen_for_what_they_are(sky) ->
 
 
 def test_a_lens_that_cannot_be_calibrated_leaves_the_answer(sky, monkeypatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise StaridError("calibration: folds the image")
 
     image, truth, camera = photograph(sky, 1)
-    monkeypatch.setattr(image_solver, "calibrate_identified", refuse)
-    found = solve_image(image, TOLD, sky, fov_tolerance=0.1)
+    monkeypatch.setattr(solver, "calibrate_identified", fail)
+    found = solve_image(image, NOMINAL, sky, fov_tolerance=0.1)
     assert found.solution.valid
     assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
 
 
-def test_stars_strewn_at_random_are_no_sky(sky) -> None:
+def test_random_stars_are_not_identified(sky) -> None:
     rng = np.random.default_rng(7)
-    search = RoughSearch(TOLD, sky, fov_tolerance=0.1)
+    search = RoughSearch(NOMINAL, sky, fov_tolerance=0.1)
     xy = rng.uniform(0.0, [WIDTH - 1, HEIGHT - 1], (100, 2))
     assert not search.identify(xy, 10.0 ** rng.uniform(0, 2, 100), rounds=[0]).valid
 
@@ -119,7 +119,7 @@ def test_an_even_choice_has_the_brightest_of_each_part() -> None:
     )  # half of all crowd in a corner
     flux = rng.uniform(1.0, 100.0, 600)
     brightest = np.argsort(-flux)
-    rows = even_choice(xy, brightest, TOLD, 2)
+    rows = even_choice(xy, brightest, NOMINAL, 2)
     assert brightest[0] in rows
     assert np.count_nonzero(rows >= 300) <= 2
     assert CELLS < len(rows) <= 2 * CELLS + 40
@@ -128,12 +128,12 @@ def test_an_even_choice_has_the_brightest_of_each_part() -> None:
 
 @pytest.mark.parametrize("displacement", [-0.12, 0.05])
 def test_a_distorted_lens_keeps_the_width_of_the_field(displacement) -> None:
-    lens = distorted(TOLD, displacement)
-    assert lens.fov_deg == pytest.approx(TOLD.fov_deg)
+    lens = distorted(NOMINAL, displacement)
+    assert lens.fov_deg == pytest.approx(NOMINAL.fov_deg)
     corner = np.array([[-0.5, -0.5]])
-    at_centre = lens.focal_px[0] / TOLD.focal_px[0]
-    seen = TOLD.project(lens.back_project(corner))[0] - np.array(TOLD.centre_px)
-    stretch = np.linalg.norm(corner - np.array(TOLD.centre_px)) / np.linalg.norm(seen) / at_centre
+    at_centre = lens.focal_px[0] / NOMINAL.focal_px[0]
+    seen = NOMINAL.project(lens.back_project(corner))[0] - np.array(NOMINAL.centre_px)
+    stretch = np.linalg.norm(corner - np.array(NOMINAL.centre_px)) / np.linalg.norm(seen) / at_centre
     assert stretch == pytest.approx(1.0 + displacement, abs=0.03)
 
 
@@ -141,9 +141,9 @@ def test_a_negative_is_known_by_its_dark_tail(sky) -> None:
     image, _, _ = photograph(sky, 10)
     assert not has_dark_tail(image)
     assert has_dark_tail(np.invert(image))
-    ways = list(looks(image))
-    assert isinstance(ways[0], Look)
-    assert [look.mirrored for look in ways] == [False] * (len(ways) - 1) + [True]
+    ways = list(views(image))
+    assert isinstance(ways[0], View)
+    assert [view.mirrored for view in ways] == [False] * (len(ways) - 1) + [True]
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -151,7 +151,7 @@ def test_a_coarser_look_tells_what_the_plain_one_tells(sky, bits) -> None:
     image, _, _ = photograph(sky, 12, trail_px=12.0)
     if bits == 16:
         image = image.astype(np.uint16) * 100
-    plain, coarse = (look.detections for look in list(looks(image))[:2])
+    plain, coarse = (view.detections for view in list(views(image))[:2])
     distance, twin = cKDTree(coarse.xy_px).query(plain.xy_px)
     bright = (distance < 1.0) & (plain.flux > 20.0 * plain.flux_sigma)
     assert np.count_nonzero(bright) > 20

@@ -1,4 +1,4 @@
-"""What a caller gives for detections, checked once and brought into the form of the kernels."""
+"""Validation of the detections that a star identifier receives."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from starid.errors import StaridError
 Array = NDArray[np.float64]
 
 FARTHEST_PX: Final = 1e9
-"""Farther out than this there is no image, and squares of positions overflow in the end."""
+"""Largest coordinate accepted: no image is as large, and squares of positions must not overflow."""
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:
-    """Own, contiguous copy of an array of numbers."""
+    """Contiguous copy of an array of numbers."""
     try:
         return np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
@@ -34,7 +34,7 @@ def _all_finite(array: Array) -> bool:
 def checked_detections(
     xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None
 ) -> tuple[Array, Array, Array]:
-    """Positions (n, 2), flux (n,) and errors (n, 2), ones where none are given: own, contiguous copies.
+    """Positions (n, 2), flux (n,) and errors (n, 2), ones by default, as contiguous copies.
 
     Parameters
     ----------
@@ -44,8 +44,7 @@ def checked_detections(
     Raises
     ------
     StaridError
-        The arrays do not fit each other, hold what is not a finite number, or a position beyond
-        `FARTHEST_PX`.
+        The shapes of the arrays disagree, a value is not finite, or a position is beyond `FARTHEST_PX`.
     """
     xy, brightness = _numbers(xy_px, "positions"), _numbers(flux, "flux")
     if xy.shape == (0,):
