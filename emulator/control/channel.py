@@ -35,15 +35,16 @@ import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.control.faults import FaultRequest
+from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.cycle import Measurement, as_quaternion
+from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from starhil.emulator.truth.config import FixedConfig, TruthConfig
@@ -53,9 +54,6 @@ from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError, reason
 from starid.errors import StaridError
-
-if TYPE_CHECKING:
-    from starhil.emulator.emulation import Emulation
 
 log = logging.getLogger("starhil.control")
 
@@ -71,15 +69,20 @@ class ControlServer:
     Parameters
     ----------
     emulation
-        What is controlled.
+        Emulation to control; it is open.
+    faults
+        Faults of the run.
     quit_run
-        Ends the run.
+        Called to end the run.
     token
-        What each request has to carry as `token`; empty: nothing.
+        Token that each request must carry; empty for none.
     """
 
-    def __init__(self, emulation: Emulation, quit_run: Callable[[], None], token: str = "") -> None:
+    def __init__(
+        self, emulation: Emulation, faults: Faults, quit_run: Callable[[], None], token: str = ""
+    ) -> None:
         self._emulation = emulation
+        self._faults = faults
         self._token = token
         self._socket: ControlSocket | None = None
         self._opening = asyncio.Lock()
@@ -203,14 +206,14 @@ class ControlServer:
             "link_faults": {kind.value: count for kind, count in device.counters.faults.items()},
             "truth_kind": feed.kind,
             "truth_status": truth.status.value,
-            "faults": emulation.faults.describe(),
+            "faults": self._faults.describe(),
         }
         if isinstance(feed, LiveTruth):
             answer["feed"] = {
                 "accepted": feed.accepted,
                 "refused": feed.refused,
                 "last_fault": feed.last_fault,
-                "address": emulation.ready_words.get("truth", ""),
+                "address": emulation.ready_fields.get("truth", ""),
             }
         return answer
 
@@ -252,7 +255,7 @@ class ControlServer:
         device = self._emulation.device
         async with self._opening:  # reading a file takes time: the last request shall hold
             device.cycle.truth = await self._emulation.open_truth(config)
-        return {"kind": config.kind, "address": self._emulation.ready_words.get("truth", "")}
+        return {"kind": config.kind, "address": self._emulation.ready_fields.get("truth", "")}
 
     async def _step(self, request: dict[str, Any]) -> Answer:
         _only(request, "seconds")
@@ -263,13 +266,13 @@ class ControlServer:
         return {"run_time_s": self._emulation.clock.now_ns() / NANOSECONDS}
 
     async def _fault(self, request: dict[str, Any]) -> Answer:
-        self._emulation.faults.inject(_parse(_FAULT, FaultRequest, request))
-        return {"faults": self._emulation.faults.describe()}
+        self._faults.inject(_parse(_FAULT, FaultRequest, request))
+        return {"faults": self._faults.describe()}
 
     async def _clear_faults(self, request: dict[str, Any]) -> Answer:
         _only(request)
-        self._emulation.faults.clear()
-        return {"faults": self._emulation.faults.describe()}
+        self._faults.clear()
+        return {"faults": self._faults.describe()}
 
     async def _end(self, request: dict[str, Any]) -> Answer:
         _only(request)

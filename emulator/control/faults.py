@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from collections.abc import Iterable
+from typing import Annotated, Any, Final, Protocol
 
 from pydantic import AfterValidator, Field
 
+from starhil.emulator.device.device import Device
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
-
-if TYPE_CHECKING:
-    from starhil.emulator.emulation import Emulation
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
@@ -79,11 +77,32 @@ class FaultRequest(Strict):
     """What the device sends on the CAN bus, CANopen's frames too."""
 
 
-class Faults:
-    """What is wrong with a run at present."""
+class Link(Protocol):
+    """A link as fault injection sees it."""
 
-    def __init__(self, emulation: Emulation) -> None:
-        self._emulation = emulation
+    @property
+    def bus(self) -> str:
+        """Name of the bus, `serial` or `can`: a fault of a bus affects every link on it."""
+
+    @property
+    def wire(self) -> WireFaults[Any]:
+        """The outgoing side of the wire."""
+
+
+class Faults:
+    """The faults that are injected at present.
+
+    Parameters
+    ----------
+    device
+        Device that the faults affect.
+    links
+        Its open links.
+    """
+
+    def __init__(self, device: Device, links: Iterable[Link]) -> None:
+        self._device = device
+        self._wires = [(link.bus, link.wire) for link in links]
         self._optical: dict[str, Any] = {}
 
     def inject(self, request: FaultRequest) -> None:
@@ -95,17 +114,17 @@ class Faults:
             A name is not known, or a link is not there.
         """
         self.check(request)
-        device = self._emulation.device
+        device = self._device
         if request.optical is not None:
             self._optical = dict(request.optical)
             device.cycle.faults = lambda _index: self._optical
         faults = {"serial": request.serial, "can": request.can}
-        for name, wire in self._wires():
+        for name, wire in self._wires:
             fault = faults[name]
             if fault is not None:
                 wire.settings = fault.settings()
         if request.device is not None:
-            device.deaf = request.device.stuck
+            device.unresponsive = request.device.stuck
             if request.device.reset is not None:
                 device.reset(request.device.reset)
             if request.device.error is not None:
@@ -119,7 +138,7 @@ class Faults:
         EmulatorError
             A name is not known, or a link is not there.
         """
-        enums = self._emulation.device.icd.enums
+        enums = self._device.icd.enums
         if request.device is not None:
             errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
             for key, name, known in (
@@ -128,27 +147,20 @@ class Faults:
             ):
                 if name is not None and name not in known:
                     raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
-        there = {name for name, _ in self._wires()}
+        there = {name for name, _ in self._wires}
         for name, fault in (("serial", request.serial), ("can", request.can)):
             if fault is not None and name not in there:
                 raise EmulatorError(
                     f"{name}: this run has no such link; start it with --{name}, or leave this out"
                 )
 
-    def _wires(self) -> Iterator[tuple[str, WireFaults[Any]]]:
-        """Each wire of the run under the name of its faults: both users of the CAN bus have the same."""
-        emulation = self._emulation
-        for name, link in (("serial", emulation.serial), ("can", emulation.can), ("can", emulation.canopen)):
-            if link is not None:
-                yield name, link.wire
-
     def clear(self) -> None:
         """Set everything right; the error mode is left by telecommand."""
         self._optical = {}
-        device = self._emulation.device
+        device = self._device
         device.cycle.faults = lambda _index: {}
-        device.deaf = False
-        for _, wire in self._wires():
+        device.unresponsive = False
+        for _, wire in self._wires:
             wire.settings = WireFaultSettings()
 
     def describe(self) -> dict[str, Any]:
@@ -156,9 +168,9 @@ class Faults:
         found: dict[str, Any] = {}
         if self._optical:
             found["optical"] = dict(self._optical)
-        if self._emulation.device.deaf:
+        if self._device.unresponsive:
             found["device"] = {"stuck": True}
-        for name, wire in self._wires():
+        for name, wire in self._wires:
             if not wire.settings.none:
                 found[name] = vars(wire.settings)
         return found

@@ -20,23 +20,22 @@ cannot be set by a scenario: it needs a socket, which takes time.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.control.faults import FaultRequest
-from starhil.emulator.device.scheduler import Action
+from starhil.emulator.control.faults import FaultRequest, Faults
+from starhil.emulator.device.scheduler import Action, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import configs_folder
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import LiveConfig, Strict, TruthConfig
+from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.validation_messages import explain
 from starid.errors import StaridError
-
-if TYPE_CHECKING:
-    from starhil.emulator.emulation import Emulation
 
 log = logging.getLogger("starhil.scenario")
 
@@ -57,24 +56,22 @@ class ScenarioEvent(Strict):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
-    def prepare(self, emulation: Emulation) -> Action:
-        """Make what is to be done at the run time; whatever it needs is read and checked before."""
+    def prepare(self, faults: Faults, set_truth: Callable[[TruthSource], None], folder: Path) -> Action:
+        """Return the action of the event; what it needs is read and checked now."""
         if self.fault is not None:
-            emulation.faults.check(self.fault)
-        folder = emulation.profile.folder
+            faults.check(self.fault)
         truth = None if self.truth is None else self.truth.build(self.run_time_s, folder)
 
-        def happen(_due_ns: int) -> None:
+        def act(_due_ns: int) -> None:
             if self.clear_faults:
-                emulation.faults.clear()
+                faults.clear()
             if self.fault is not None:
-                emulation.faults.inject(self.fault)
+                faults.inject(self.fault)
             if truth is not None:
-                emulation.device.cycle.truth = truth
-                emulation.close_feed()
+                set_truth(truth)
             log.info("scenario at %g s", self.run_time_s)
 
-        return happen
+        return act
 
 
 class Scenario(Strict):
@@ -83,20 +80,37 @@ class Scenario(Strict):
     name: str = ""
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
 
-    def enter(self, emulation: Emulation) -> None:
-        """Enter all events into a run whose links are open; what they need is read and checked now.
+    def enter(
+        self,
+        scheduler: Scheduler,
+        faults: Faults,
+        set_truth: Callable[[TruthSource], None],
+        folder: Path,
+    ) -> None:
+        """Schedule all events; files that they need are read and checked now.
+
+        Parameters
+        ----------
+        scheduler
+            Scheduler of the device.
+        faults
+            Faults of the run, whose links are open.
+        set_truth
+            Called with a new truth source.
+        folder
+            Folder that relative paths of truth files start from.
 
         Raises
         ------
         EmulatorError
-            An event asks for what this run does not have, or names a file that cannot be read.
+            An event names a link that this run does not have, or a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             try:
-                action = event.prepare(emulation)
+                action = event.prepare(faults, set_truth, folder)
             except (EmulatorError, StaridError) as error:
                 raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
-            emulation.device.scheduler.at(round(event.run_time_s * NANOSECONDS), action)
+            scheduler.at(round(event.run_time_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:

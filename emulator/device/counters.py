@@ -58,13 +58,6 @@ class Acknowledge:
     on_end: Callable[[ErrorCode], None] | None = None
     """Sends the answer, of a telecommand that is answered only when it is done."""
 
-    def begin(self, identifier: int) -> None:
-        """Note that a telecommand came in."""
-        self.last_telecommand = identifier
-        self.processed = False
-        self.error = ErrorCode.OK
-        self.parameter_index = 0
-
     def end(self, error: ErrorCode = ErrorCode.OK, parameter_index: int = 0) -> None:
         """Note that it is done, and how."""
         self.processed = True

@@ -1,4 +1,4 @@
-"""The device: modes, parameters, time and frames, and the one door through which requests from any link come in."""
+"""The device: its modes, parameters, time and frames, without the requests that reach it over links."""
 
 from __future__ import annotations
 
@@ -13,21 +13,17 @@ from starhil.emulator.device.file_download import FileDownload
 from starhil.emulator.device.images import ImageStore
 from starhil.emulator.device.modes import Mode, Modes, Transition
 from starhil.emulator.device.parameters import Parameters, ParameterValue
-from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.state_store import StateStore
-from starhil.emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
-from starhil.emulator.device.telemetry import TELEMETRY
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.guard import call_guarded, one_line
+from starhil.emulator.guard import call_guarded, log_internal_error, one_line
 from starhil.emulator.pipeline.frames import FrameRequest
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.values import MessageError, Value
+from starhil.protocol.values import Value
 
 log = logging.getLogger("starhil.device")
 
@@ -53,12 +49,12 @@ def outcome(work: Callable[[], None]) -> EmulatorError | None:
     except EmulatorError as error:
         return error
     except Exception as error:  # noqa: BLE001 (whoever waits for the work has to hear of its end)
-        log.error("background: internal error: %s", one_line(error))  # noqa: TRY400 (one line)
+        log_internal_error("background", error)
         return EmulatorError(f"internal error: {one_line(error)}")
     return None
 
 
-def do_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
+def run_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
     """Background that is none: for the stepped clock, where nothing may depend on how fast a disk is."""
     done(outcome(work))
 
@@ -97,7 +93,7 @@ class Device:
         imager: Imager,
         store: StateStore,
         truth: TruthSource,
-        background: Background = do_at_once,
+        background: Background = run_at_once,
     ) -> None:
         self.profile = profile
         self.icd = icd
@@ -141,23 +137,17 @@ class Device:
         self.started_ns = clock.now_ns()
         self.warm = False
         """The pipeline has told that it is ready."""
-        self.outlets: list[Callable[[Reply], None]] = []
-        """Links that take what the device sends by itself."""
         self.on_frame: list[Callable[[Measurement], None]] = []
         self.on_mode: list[Callable[[Transition], None]] = []
+        self.on_start: list[Callable[[], None]] = []
+        """Called at power-on and at each reset, when parameters and time are set for the new start."""
         self.on_reset: list[Callable[[], None]] = []
-        self.deaf = False
-        """A fault: requests are neither taken nor answered."""
+        self.unresponsive = False
+        """A fault: requests are neither counted nor answered."""
         self._background = background
         self._boot_over: Event | None = None
-        self._unsolicited: Event | None = None
         self._stored_parameters: dict[str, object] = {}
         self.parameters.observe(self._parameters_changed)
-        missing = missing_handlers(icd)
-        if missing:
-            raise EmulatorError(
-                f"interface definition {icd.name}: the device has no handler for {missing[0]}"
-            )
 
     # --- power, boot and reset ---
 
@@ -165,8 +155,8 @@ class Device:
         """Start: load what is stored, count the start, boot."""
         self._start("power_on", self.store.load())
 
-    def start_refused(self) -> None:
-        """Take back the count of a start that came to nothing, as a port or a file could not be had."""
+    def withdraw_start(self) -> None:
+        """Do not count the last start: it failed because a port or file is not available."""
         self.boot_count = (self.boot_count - 1) & 0xFFFF
         self._persist(lambda error: log.error("%s", error) if error else None)
 
@@ -195,7 +185,8 @@ class Device:
         self.mode_changes = self.frames_valid = 0
         for name in self.parameters.restore(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; its default is used", name)
-        self._plan_unsolicited()
+        for observer in self.on_start:
+            call_guarded("start", observer)
         self._persist(lambda error: log.error("%s", error) if error else None)
         if self.store.corrupt:
             log.warning("the stored state was not whole: it is set aside, defaults are used")
@@ -321,146 +312,6 @@ class Device:
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if names & {"update_rate", "exposure", "delay_time"}:
             self.cycle.retime()
-        if names & {"unsolicited_rate", "unsolicited_selection"}:
-            self._plan_unsolicited()
-
-    def _plan_unsolicited(self) -> None:
-        if self._unsolicited is not None:
-            self._unsolicited.cancel()
-            self._unsolicited = None
-        rate = float(self.parameters["unsolicited_rate"])
-        if rate > 0.0:
-            self._unsolicited = self.scheduler.at(self.clock.now_ns(), self._send_unsolicited)
-
-    def _send_unsolicited(self, due_ns: int) -> None:
-        period_ns = max(1, round(NANOSECONDS / float(self.parameters["unsolicited_rate"])))
-        missed = max(0, (self.clock.now_ns() - due_ns) // period_ns)
-        self._unsolicited = self.scheduler.at(due_ns + (missed + 1) * period_ns, self._send_unsolicited)
-        row = self.icd.telemetry_by_id.get(int(self.parameters["unsolicited_selection"]))
-        if row is None or self.deaf:
-            return
-        try:
-            data = self.telemetry(row.name)
-        except Refused:  # an image is being opened: nothing to tell this time
-            return
-        destination = int(self.parameters["host_address"])
-        reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=destination)
-        for outlet in self.outlets:
-            call_guarded("unsolicited telemetry", outlet, reply)
-
-    # --- requests ---
-
-    def handle(self, request: Request, later: Callable[[Reply], None] | None = None) -> list[Reply] | None:
-        """Take a request from a link; return what goes back over the same link, in order.
-
-        Parameters
-        ----------
-        request
-            What arrived.
-        later
-            Takes the answer to a telecommand that is answered only when it is done; None is returned then.
-        """
-        if self.deaf:
-            return []
-        if request.kind is RequestKind.TELEMETRY:
-            self.counters.telemetry = (self.counters.telemetry + 1) & 0xFFFF
-            return [self._answer_telemetry(request)]
-        self.counters.telecommands = (self.counters.telecommands + 1) & 0xFFFF
-        code, replies = self._execute(request)
-        if code is None:
-            if later is not None:
-                self.acknowledge.on_end = lambda code: later(_answer(request, code))
-            return None
-        return [_answer(request, code), *replies]
-
-    def fault(self, fault: LinkFault) -> None:
-        """Count input on a link that made no request."""
-        if not self.deaf:
-            log.debug("%s: %s", fault.kind.value, fault.detail)
-            self.counters.fault(fault)
-
-    def telemetry(self, name: str) -> bytes:
-        """Return the data of a telemetry row."""
-        return self.icd.telemetry[name].encode(TELEMETRY[name](self), saturate=True)
-
-    def telemetry_values(self, name: str) -> dict[str, Value]:
-        """Return a telemetry row in physical units, as it stands before encoding."""
-        return TELEMETRY[name](self)
-
-    def telecommand(self, name: str, values: dict[str, Value]) -> tuple[ErrorCode, int]:
-        """Do a telecommand whose values are checked; return its error code so far and the field it is about."""
-        code, index, _ = self._do(name, values, 0)
-        return code or ErrorCode.OK, index
-
-    def _answer_telemetry(self, request: Request) -> Reply:
-        row = self.icd.telemetry_by_id.get(request.id)
-        code = ErrorCode.OK
-        if row is None:
-            code = ErrorCode.INVALID_ID
-        elif request.data:
-            code = ErrorCode.INVALID_LENGTH
-        if row is None or code is not ErrorCode.OK:
-            return Reply(ReplyKind.NACK, request.id, code=code, destination=request.source)
-        try:
-            data = self.telemetry(row.name)
-        except Refused as refused:
-            return Reply(ReplyKind.NACK, request.id, code=refused.code, destination=request.source)
-        return Reply(ReplyKind.TELEMETRY, request.id, data, destination=request.source)
-
-    def _execute(self, request: Request) -> tuple[ErrorCode | None, list[Reply]]:
-        row = self.icd.telecommands_by_id.get(request.id)
-        if row is None:
-            self._note(request.id, ErrorCode.INVALID_ID, 0)
-            return ErrorCode.INVALID_ID, []
-        try:
-            values = row.decode(request.data)
-        except MessageError as error:
-            self._note(request.id, error.code, error.index)
-            return error.code, []
-        code, _, replies = self._do(row.name, values, request.source)
-        return code, replies
-
-    def _do(
-        self, name: str, values: dict[str, Value], source: int
-    ) -> tuple[ErrorCode | None, int, list[Reply]]:
-        """Do a decoded telecommand, and note in the acknowledge what became of it; no code where that is still open."""
-        if not self.acknowledge.processed:
-            self.counters.overrun()
-        acknowledge = Acknowledge(self.icd.telecommands[name].id, processed=False)
-        self.acknowledge = acknowledge
-        try:
-            replies = TELECOMMANDS[name](self, values, acknowledge)
-        except Refused as refused:
-            acknowledge.end(refused.code, refused.index)
-            return refused.code, refused.index, []
-        except MessageError as error:
-            acknowledge.end(error.code, error.index)
-            return error.code, error.index, []
-        if replies is None:  # the handler ends the acknowledge
-            if name not in ANSWERED_WHEN_DONE:
-                return ErrorCode.OK, 0, []
-            return acknowledge.error if acknowledge.processed else None, 0, []
-        acknowledge.end()
-        return (
-            ErrorCode.OK,
-            0,
-            [Reply(reply.kind, reply.id, reply.data, reply.code, destination=source) for reply in replies],
-        )
-
-    def _note(self, identifier: int, code: ErrorCode, index: int) -> None:
-        if not self.acknowledge.processed:
-            self.counters.overrun()
-        self.acknowledge = Acknowledge(identifier, processed=True, error=code, parameter_index=index)
-
-
-def _answer(request: Request, code: ErrorCode) -> Reply:
-    kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-    return Reply(kind, request.id, code=code, destination=request.source)
-
-
-def missing_handlers(icd: InterfaceDefinition) -> list[str]:
-    """Names of the rows of a definition that the device has no handler for."""
-    return sorted((set(icd.telemetry) - set(TELEMETRY)) | (set(icd.telecommands) - set(TELECOMMANDS)))
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:

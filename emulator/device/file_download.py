@@ -7,16 +7,11 @@ frame u32>`. The layout of the index is ours.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from starhil.emulator.device.images import ImageStore
 from starhil.protocol.image_transfer import HoleMap, block_checksum, burst_packet, packet_count
 from starhil.protocol.messages import BURST_ID, Reply, ReplyKind
-from starhil.protocol.values import Value
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
 
 BMP_TYPE: Final = 4
 INDEX_ENTRY: Final = struct.Struct("<BBHII")
@@ -67,12 +62,3 @@ class FileDownload:
         count = packet_count(len(self.data))
         numbers = range(count) if ignore_hole_map else self.arrived.missing(count)
         return [Reply(ReplyKind.BURST, BURST_ID, burst_packet(self.data, number)) for number in numbers]
-
-
-def hole_map_values(part: int) -> Callable[[Device], dict[str, Value]]:
-    """Telemetry of one part of the hole map."""
-
-    def hole_map(device: Device) -> dict[str, Value]:
-        return {"map": device.files.arrived.part(part)}
-
-    return hole_map

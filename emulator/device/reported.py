@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.frames import ZERO, Quaternion, Triple
 from starid.attitude import Attitude
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
-    from starhil.emulator.device.parameters import Parameters
 
 
 @dataclass(frozen=True)

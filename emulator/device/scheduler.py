@@ -59,11 +59,3 @@ class Scheduler:
         if due_ns is None or due_ns > now_ns:
             return None
         return heapq.heappop(self._queue)
-
-    def run_due(self, now_ns: int) -> int:
-        """Do all that is due at `now_ns`, in order, with what these events enter; return how many."""
-        done = 0
-        while (event := self.pop_due(now_ns)) is not None:
-            event.action(event.due_ns)
-            done += 1
-        return done

@@ -8,10 +8,11 @@ except for the rows in `ANSWERED_WHEN_DONE`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.counters import Acknowledge
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.images import edge_of
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.refusal import Refused
@@ -19,11 +20,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.protocol.messages import FIRST_TELEMETRY_ID, ErrorCode, Reply
 from starhil.protocol.values import MessageError, Value
 
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
-
 Values: TypeAlias = dict[str, Value]
-Handler: TypeAlias = "Callable[[Device, Values, Acknowledge], list[Reply] | None]"
+Handler: TypeAlias = Callable[[Device, Values, Acknowledge], list[Reply] | None]
 
 SRAM_STORED: Final = 0
 """Bank of the image that save_image stored; the other one holds the last frame."""

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, split_unix
-from starhil.emulator.device.file_download import hole_map_values
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import Reported, reported
 from starhil.emulator.pipeline.frames import MatchedStar
 from starhil.protocol.image_transfer import frame_checksum
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
 
 Values: TypeAlias = dict[str, Value]
 
@@ -298,6 +295,14 @@ def file_block(device: Device) -> Values:
     }
 
 
+def _hole_map(part: int) -> Callable[[Device], Values]:
+    def hole_map(device: Device) -> Values:
+        """120 to 127: one eighth of the hole map."""
+        return {"map": device.files.arrived.part(part)}
+
+    return hole_map
+
+
 _STAR_TRACKER: Final = (
     "star_performance_1",
     "star_performance_2",
@@ -335,6 +340,6 @@ TELEMETRY: Final[dict[str, Callable[[Device], Values]]] = {
     "star_performance_2": star_performance_2,
     "image_status": image_status,
     "file_block": file_block,
-    **{f"hole_map_{part}": hole_map_values(part) for part in range(1, 9)},
+    **{f"hole_map_{part}": _hole_map(part) for part in range(1, 9)},
 }
 """Row name → its values in physical units; what is left out is sent as zero."""

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from typing import Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Pieces, WireFaults
 from starhil.protocol.errors import ProtocolError
@@ -47,8 +47,8 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     Parameters
     ----------
-    device
-        What answers.
+    requests
+        The device's handling of requests.
     transport
         Where items (bytes, frames) come from and go to.
     pieces
@@ -57,14 +57,18 @@ class DeviceLink(ABC, Generic[Item, Style]):
         Seed of wire faults.
     """
 
-    def __init__(self, device: Device, transport: Transport[Item], pieces: Pieces[Item], seed: int) -> None:
+    def __init__(
+        self, requests: Requests, transport: Transport[Item], pieces: Pieces[Item], seed: int
+    ) -> None:
+        device = requests.device
+        self._requests = requests
         self._device = device
         self._loop = asyncio.get_running_loop()
         self.transport: Final = transport
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
         self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, device.clock, device.scheduler, seed)
-        device.outlets.append(self._unsolicited)
+        requests.unsolicited_receivers.append(self._unsolicited)
         device.on_reset.append(self._forget)
 
     @abstractmethod
@@ -105,14 +109,14 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     def _take(self, event: Request | LinkFault) -> None:
         if isinstance(event, LinkFault):
-            self._device.fault(event)
+            self._requests.count_fault(event)
             return
         style = self._style()  # the answer to a change of style still goes out in the old one
 
         def answer(reply: Reply) -> None:
             self._send(reply, style)
 
-        for reply in self._device.handle(event, answer) or ():
+        for reply in self._requests.handle(event, answer) or ():
             answer(reply)
 
     def _watch(self) -> None:
@@ -124,7 +128,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
     def _flush(self, _due_ns: int) -> None:
         self._timer = None
         for fault in self._receiver.flush(self._now()):
-            self._device.fault(fault)
+            self._requests.count_fault(fault)
         self._watch()
 
     def _forget(self) -> None:

@@ -7,7 +7,7 @@ import random
 from collections import deque
 from collections.abc import Sequence
 
-from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.protocol.can_framing import (
@@ -49,18 +49,20 @@ class CanLink(DeviceLink[CanFrame, int]):
     Parameters
     ----------
     frame_gap_s
-        Least time between two frames that the device sends, seconds.
+        Minimum time between two frames that the device sends, seconds.
     """
 
+    bus = "can"
+
     def __init__(
-        self, device: Device, transport: Transport[CanFrame], frame_gap_s: float = 0.0, seed: int = 0
+        self, requests: Requests, transport: Transport[CanFrame], frame_gap_s: float = 0.0, seed: int = 0
     ) -> None:
-        super().__init__(device, transport, CanPieces(), seed)
+        super().__init__(requests, transport, CanPieces(), seed)
         self._gap_s = frame_gap_s
         self._waiting: deque[CanFrame] = deque()
         self._next: asyncio.TimerHandle | None = None
         self._address = BusAddress("address", "links.can.address")
-        device.parameters.observe(self._parameters_changed)
+        self._device.parameters.observe(self._parameters_changed)
 
     async def start(self) -> str:
         """Join the bus; return what was taken."""

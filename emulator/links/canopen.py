@@ -9,13 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import Measurement
-from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.requests import Requests
+from starhil.emulator.device.scheduler import Event
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.wire_faults import WireFaults
@@ -29,13 +30,10 @@ from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Reply, Request, RequestKind
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.values import MessageError, Value
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.scheduler import Event
-    from starhil.protocol.errors import ProtocolError
 
 log = logging.getLogger("starhil.canopen")
 
@@ -95,14 +93,15 @@ class DeviceApplication:
 
     Parameters
     ----------
-    device
-        What answers.
+    requests
+        The device's handling of requests.
     finish
         Tells the result of a write that was deferred.
     """
 
-    def __init__(self, device: Device, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
-        self._device = device
+    def __init__(self, requests: Requests, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
+        self._requests = requests
+        self._device = requests.device
         self._finish = finish
         self._frame: Picture | None = None
 
@@ -113,7 +112,7 @@ class DeviceApplication:
     def telemetry(self, row: Row) -> bytes:
         """Return the present bytes of a telemetry row."""
         try:
-            return self._device.telemetry(row.name)
+            return self._requests.telemetry(row.name)
         except Refused as refused:
             check_status(refused.code, row.name)
             raise
@@ -130,7 +129,7 @@ class DeviceApplication:
                 refusal = abort
             self._finish(deferred, refusal)
 
-        replies = self._device.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
+        replies = self._requests.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
         if replies is None:
             return deferred
         for reply in replies[:1]:
@@ -201,8 +200,8 @@ class CanopenLink:
 
     Parameters
     ----------
-    device
-        What it is.
+    requests
+        The device's handling of requests.
     transport
         Where frames come from and go to.
     storage
@@ -213,17 +212,19 @@ class CanopenLink:
     The node-ID is the device's parameter `canopen_node`, unless LSS has stored another.
     """
 
+    bus = "can"
+
     def __init__(
         self,
-        device: Device,
+        requests: Requests,
         transport: Transport[CanFrame],
         storage: ParameterStorage | None = None,
         seed: int = 0,
     ) -> None:
-        self._device = device
+        device = self._device = requests.device
         self.transport: Final = transport
         dictionary = build_dictionary(device.icd)
-        self.application = DeviceApplication(device, self._finish)
+        self.application = DeviceApplication(requests, self._finish)
         dictionary.application = self.application
         bit_rates = frozenset(dictionary.layout.bit_rates)
         self.slave = CanopenSlave(dictionary, self._wanted_node, storage=storage, bit_rates=bit_rates)
@@ -269,7 +270,7 @@ class CanopenLink:
         return self._device.clock.now_ns() / NANOSECONDS
 
     def _receive(self, frame: CanFrame) -> None:
-        if not frame.extended and not self._device.deaf:
+        if not frame.extended and not self._device.unresponsive:
             self._do(lambda now: self.slave.receive(frame, now))
 
     def _do(self, action: Action) -> None:
@@ -281,7 +282,7 @@ class CanopenLink:
         try:
             while self._actions:
                 frames = self._actions.popleft()(self._now())
-                if not self._device.deaf:
+                if not self._device.unresponsive:
                     for frame in frames:
                         self.wire.send(frame)
                 for event in self.slave.take_events():
@@ -388,8 +389,8 @@ class CanopenLink:
 
 
 def open_canopen(
-    device: Device, transport: Transport[CanFrame], state_dir: Path | None, seed: int
+    requests: Requests, transport: Transport[CanFrame], state_dir: Path | None, seed: int
 ) -> CanopenLink:
     """Make the link with its parameters in `state_dir`, or in memory until the process ends."""
     storage = MemoryStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
-    return CanopenLink(device, transport, storage, seed)
+    return CanopenLink(requests, transport, storage, seed)

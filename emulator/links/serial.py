@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.protocol.messages import Reply
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
-
-if TYPE_CHECKING:
-    from starhil.protocol.transports.serial import SerialTransport
+from starhil.protocol.transports.serial import SerialTransport
 
 JUNK_BYTES: Final = 8
 
@@ -38,14 +36,16 @@ class SerialPieces:
 class SerialLink(DeviceLink[bytes, Dialect]):
     """Binds a device to a serial transport, at the bit rate of its parameter `serial_baud`.
 
-    Unsolicited telemetry goes out in dialect c only.
+    Unsolicited telemetry is sent in dialect c only.
     """
 
-    def __init__(self, device: Device, transport: SerialTransport, seed: int = 0) -> None:
-        super().__init__(device, transport, SerialPieces(), seed)
+    bus = "serial"
+
+    def __init__(self, requests: Requests, transport: SerialTransport, seed: int = 0) -> None:
+        super().__init__(requests, transport, SerialPieces(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
-        device.parameters.observe(self._parameters_changed)
+        self._device.parameters.observe(self._parameters_changed)
 
     def _wanted_baud(self) -> int:
         return int(self._device.parameters["serial_baud"])

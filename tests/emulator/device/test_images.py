@@ -95,7 +95,7 @@ def test_the_last_frame_can_be_downloaded_without_a_capture(bench):
     assert bench.command("init_image_download", sram=1, image_size="size_64") is ErrorCode.OK
     assert not bench.read("acknowledge")["processed"]
     row = bench.icd.telemetry["image_frame"]
-    assert bench.device.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
+    assert bench.requests.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
     bench.step(0.2)
     assert bench.read("acknowledge")["processed"]
     assert bench.device.images.download.frame == bench.picture.frames[-1].index
@@ -162,7 +162,7 @@ def test_a_capture_ends_when_the_pipeline_is_lost(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
     bench.command("save_image", image_size="size_64")
-    bench.imager._handle = lambda _request: Failure("gone", fatal=True)
+    bench.imager._handle = lambda _request: Failure("gone")
     bench.device.pipeline_lost()
     bench.step(0.25)
     assert bench.read("image_status") == {"percent": 0, "status": "storage_error"}
