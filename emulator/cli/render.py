@@ -76,8 +76,8 @@ def command(
         raise EmulatorError(
             f"--rate {' '.join(f'{value:g}' for value in rate)}: at most {_FASTEST_DEG_S:g} degrees/s in all are needed"
         )
-    image_suffix(output)
     prepare_output(output, "-o")
+    image_suffix(output)
     if fov is not None and not fov >= _NARROWEST_DEG:
         raise EmulatorError(f"--fov {fov:g}: at least {_NARROWEST_DEG:g} degrees are needed")
     scene = _scene(profile, fov, size, model)

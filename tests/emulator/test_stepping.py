@@ -94,6 +94,7 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
 
     async def scenario(emulation, _line):
         statistics = emulation.serial.transport.statistics
+        os.open(emulation.ready_fields["serial"], os.O_RDWR | os.O_NOCTTY)  # a peer that reads nothing
         await emulation.stepper.step(STEP_S)
         await emulation.stepper.step(STEP_S)
         assert statistics.dropped > 0

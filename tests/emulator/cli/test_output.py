@@ -117,7 +117,6 @@ def test_every_command_refuses_what_is_not_finite() -> None:
     [
         ("catalog --limit nan", "--limit"),
         ("catalog --cone 1 inf 3", "--cone"),
-        ("bench latency --rate nan", "--rate"),
         ("campaign lost-in-space --require-valid nan", "--require-valid"),
         ("features --ra 1 --dec 2 --kappa=-inf", "--kappa"),
     ],
