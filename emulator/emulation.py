@@ -284,7 +284,7 @@ class Emulation:
             The pipeline cannot be made: a missing catalogue, a camera that cannot be.
         """
         awake = asyncio.create_task(self._awake.wait())
-        patience = asyncio.get_running_loop().call_later(PATIENCE_S, _tell_of_first_start)
+        patience = asyncio.get_running_loop().call_later(PATIENCE_S, _warn_of_first_compilation)
         warming = self._warming
         if warming is None:
             raise EmulatorError("emulation: not started")
@@ -356,7 +356,7 @@ def camera_constants(warm: Warm) -> dict[str, Value]:
     }
 
 
-def _tell_of_first_start() -> None:
+def _warn_of_first_compilation() -> None:
     log.warning("a first start compiles its kernels, about a minute; the links answer already")
 
 

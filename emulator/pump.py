@@ -31,12 +31,12 @@ class ClockPump:
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
-        scheduler.on_change = self._changed
+        scheduler.on_add = self._event_added
 
     def start(self) -> None:
         """Begin."""
         self._running = True
-        self._plan()
+        self._schedule_next()
 
     def stop(self) -> None:
         """Let time stand."""
@@ -45,10 +45,10 @@ class ClockPump:
             self._timer.cancel()
             self._timer = None
 
-    def _changed(self) -> None:
+    def _event_added(self) -> None:
         """Look anew when the loop comes around: whoever entered the event has its own work to end first."""
         if self._running and (self._timer is None or self._due_s() < self._timer.when()):
-            self._plan()
+            self._schedule_next()
 
     def _due_s(self) -> float:
         """Time on the loop's clock of the next event."""
@@ -58,12 +58,12 @@ class ClockPump:
         wait_s = (due_ns - self._clock.now_ns()) / NANOSECONDS / self._clock.speed
         return self._loop.time() + min(max(wait_s, 0.0), LONGEST_SLEEP_S)
 
-    def _plan(self) -> None:
+    def _schedule_next(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self._loop.call_at(self._due_s(), self._run)
+        self._timer = self._loop.call_at(self._due_s(), self._run_due_event)
 
-    def _run(self) -> None:
+    def _run_due_event(self) -> None:
         self._timer = None
         event = self._scheduler.pop_due(self._clock.now_ns())
         try:
@@ -71,7 +71,7 @@ class ClockPump:
                 call_guarded("event", event.action, event.due_ns)
         finally:
             if self._running:
-                self._plan()
+                self._schedule_next()
 
 
 class StepPump:

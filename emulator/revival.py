@@ -52,14 +52,14 @@ class PipelineRevival:
             self._attempts = 0
         self._lost = True
         self._device.pipeline_lost()
-        self._begin()
+        self._start_attempts()
 
     def _device_reset(self) -> None:
         if self._lost and self._attempts == len(PAUSES_S):
             self._attempts = 0
-            self._begin()
+            self._start_attempts()
 
-    def _begin(self) -> None:
+    def _start_attempts(self) -> None:
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._revive())
 

@@ -100,11 +100,11 @@ class TruthLog:
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._path = path
-        self._whole = 0
+        self._size = 0
         self._file: io.FileIO | None = None
         try:
             self._file = _open(path, overwrite=overwrite)
-            self._add(COLUMNS)
+            self._write_row(COLUMNS)
         except OSError as error:
             self.close()
             raise EmulatorError(
@@ -116,7 +116,7 @@ class TruthLog:
         if self._file is None:
             return
         try:
-            self._add([_cell(name, value) for name, value in compare(measurement).items()])
+            self._write_row([_format_cell(name, value) for name, value in compare(measurement).items()])
         except OSError as error:
             log.warning(
                 "truth log %s: cannot be written (%s); it ends before frame %d, the run goes on",
@@ -126,7 +126,7 @@ class TruthLog:
             )
             self.close()
 
-    def _add(self, cells: Iterable[str]) -> None:
+    def _write_row(self, cells: Iterable[str]) -> None:
         """Write a row, or none of it."""
         if self._file is None:
             return
@@ -142,9 +142,9 @@ class TruthLog:
                 row = row[written:]
         except OSError:
             if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-                self._file.truncate(self._whole)
+                self._file.truncate(self._size)
             raise
-        self._whole += size
+        self._size += size
 
     def close(self) -> None:
         """End the file."""
@@ -158,14 +158,14 @@ def _open(path: Path, *, overwrite: bool) -> io.FileIO:
     flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
     file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
     try:
-        _claim(path, file, overwrite=overwrite)
+        _lock_and_empty(path, file, overwrite=overwrite)
     except (EmulatorError, OSError):
         file.close()
         raise
     return file
 
 
-def _claim(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
+def _lock_and_empty(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
     """Lock a file for this process and empty it; a character device such as /dev/null is everybody's."""
     mode = os.fstat(file.fileno()).st_mode
     if stat.S_ISCHR(mode):
@@ -185,7 +185,7 @@ def _claim(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
     file.truncate()
 
 
-def _cell(name: str, value: Any) -> str:
+def _format_cell(name: str, value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -90,7 +90,7 @@ class ControlServer:
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._frames: deque[Measurement] = deque(maxlen=KEPT_FRAMES)
-        self._doing: dict[str, Callable[[dict[str, Any]], Awaitable[Answer]]] = {
+        self._actions: dict[str, Callable[[dict[str, Any]], Awaitable[Answer]]] = {
             "status": self._status,
             "truth": self._truth,
             "frames": self._last_frames,
@@ -98,7 +98,7 @@ class ControlServer:
             "step": self._step,
             "fault": self._fault,
             "clear_faults": self._clear_faults,
-            "quit": self._end,
+            "quit": self._quit_run,
         }
         emulation.device.on_frame.append(self._frames.append)
 
@@ -164,12 +164,12 @@ class ControlServer:
         if not isinstance(request, dict):
             return {"ok": False, "error": "not a JSON object on one line"}
         identity = {"id": request.pop("id")} if "id" in request else {}
-        if not self._admits(request.pop("token", None)):
+        if not self._token_is_valid(request.pop("token", None)):
             return {**identity, "ok": False, "error": "token: missing or wrong; give that of --control-token"}
         wanted = str(request.pop("do", ""))
-        action = self._doing.get(wanted)
+        action = self._actions.get(wanted)
         if action is None:
-            return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._doing)}"}
+            return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
         try:
             return {**identity, "ok": True, **await action(request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
@@ -179,13 +179,13 @@ class ControlServer:
             name = type(error).__name__
             return {**identity, "ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
-    def _admits(self, token: object) -> bool:
+    def _token_is_valid(self, token: object) -> bool:
         if not self._token:
             return True
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
     async def _status(self, request: dict[str, Any]) -> Answer:
-        _only(request)
+        _check_keys(request)
         emulation, device = self._emulation, self._emulation.device
         truth = self._state(device.clock.now_ns())
         feed = device.cycle.truth
@@ -221,7 +221,7 @@ class ControlServer:
         return self._emulation.device.cycle.truth.state(run_ns / NANOSECONDS)
 
     async def _truth(self, request: dict[str, Any]) -> Answer:
-        _only(request, "run_time_s", "unix_s")
+        _check_keys(request, "run_time_s", "unix_s")
         device = self._emulation.device
         run_ns = device.clock.now_ns()
         if "run_time_s" in request:
@@ -241,14 +241,14 @@ class ControlServer:
         }
 
     async def _last_frames(self, request: dict[str, Any]) -> Answer:
-        _only(request, "count")
+        _check_keys(request, "count")
         count = int(_number(request, "count", 1.0))
         if not 1 <= count <= KEPT_FRAMES:
             raise EmulatorError(f"count: {count} given, 1 … {KEPT_FRAMES} needed")
         return {"frames": [compare(measurement) for measurement in list(self._frames)[-count:]]}
 
     async def _set_truth(self, request: dict[str, Any]) -> Answer:
-        _only(request, "truth")
+        _check_keys(request, "truth")
         if not isinstance(request.get("truth"), dict):
             raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
@@ -258,7 +258,7 @@ class ControlServer:
         return {"kind": config.kind, "address": self._emulation.ready_fields.get("truth", "")}
 
     async def _step(self, request: dict[str, Any]) -> Answer:
-        _only(request, "seconds")
+        _check_keys(request, "seconds")
         stepper = self._emulation.stepper
         if stepper is None:
             raise EmulatorError(f"step: the clock is {self._emulation.clock.name}; run with --clock stepped")
@@ -270,12 +270,12 @@ class ControlServer:
         return {"faults": self._faults.describe()}
 
     async def _clear_faults(self, request: dict[str, Any]) -> Answer:
-        _only(request)
+        _check_keys(request)
         self._faults.clear()
         return {"faults": self._faults.describe()}
 
-    async def _end(self, request: dict[str, Any]) -> Answer:
-        _only(request)
+    async def _quit_run(self, request: dict[str, Any]) -> Answer:
+        _check_keys(request)
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
 
@@ -298,7 +298,7 @@ def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object, *un
         raise EmulatorError(explain(error, model, under=under)) from None
 
 
-def _only(request: dict[str, Any], *known: str) -> None:
+def _check_keys(request: dict[str, Any], *known: str) -> None:
     for key in request:
         if key not in known:
             raise EmulatorError(f"unknown key {key!r}; known: {', '.join(known) or 'none'}")

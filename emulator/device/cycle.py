@@ -170,7 +170,7 @@ class FrameCycle:
         """Begin to expose, now."""
         if not self.running:
             self._grid_ns = self._now_ns()
-            self._next = self._scheduler.at(self._grid_ns, self._begin)
+            self._next = self._scheduler.at(self._grid_ns, self._start_exposure)
 
     def stop(self) -> None:
         """Stop; frames on their way are dropped."""
@@ -191,7 +191,7 @@ class FrameCycle:
         if self._next is not None:
             self._next.cancel()
             start_ns = max(self._now_ns(), min(self._next.due_ns, self._grid_ns + self._period_ns()))
-            self._next = self._scheduler.at(start_ns, self._begin)
+            self._next = self._scheduler.at(start_ns, self._start_exposure)
 
     def has_fix(self, within_s: float) -> bool:
         """Whether there is an attitude to track from that is not older than `within_s`."""
@@ -215,14 +215,14 @@ class FrameCycle:
         seconds = timing.readout_s + timing.detect_s + self._identify_s(tracking=tracking)
         return round(seconds * NANOSECONDS)
 
-    def _begin(self, due_ns: int) -> None:
+    def _start_exposure(self, due_ns: int) -> None:
         """Open the shutter, and plan the next opening on the grid."""
         self._grid_ns = due_ns
         period_ns = self._period_ns()
         now_ns = self._now_ns()
         missed = max(0, (now_ns - due_ns) // period_ns)
         self.left_out += missed
-        self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._begin)
+        self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._start_exposure)
         if self._imager.pending >= max(MAX_PENDING, self._processing_ns(tracking=True) / period_ns):
             self.left_out += 1
             return
@@ -234,11 +234,11 @@ class FrameCycle:
 
         def close(close_ns: int) -> None:
             if generation == self._generation:
-                self._end(close_ns, start_ns, mid_ns, mode, exposure_s, period_ns / NANOSECONDS)
+                self._end_exposure(close_ns, start_ns, mid_ns, mode, exposure_s, period_ns / NANOSECONDS)
 
         self._scheduler.at(end_ns, close)
 
-    def _end(
+    def _end_exposure(
         self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
     ) -> None:
         """Close the shutter: what was seen goes to the pipeline."""
@@ -252,11 +252,11 @@ class FrameCycle:
 
         def arrived(answer: Answer) -> None:
             if generation == self._generation:
-                self._arrived(frame, answer)
+                self._result_arrived(frame, answer)
 
         def ready(due_ns: int) -> None:
             if generation == self._generation:
-                self._ready(frame, due_ns)
+                self._schedule_publication(frame, due_ns)
 
         self._imager.submit(request, arrived)
         self._scheduler.at(ready_ns, ready)
@@ -296,7 +296,7 @@ class FrameCycle:
             return last[1]
         return propagate(last[1], np.array(rate), (mid_ns - last[0]) / NANOSECONDS)
 
-    def _arrived(self, frame: _Frame, answer: Answer) -> None:
+    def _result_arrived(self, frame: _Frame, answer: Answer) -> None:
         if isinstance(answer, FrameResult):
             frame.result, self._failure = answer, ""
         else:
@@ -306,9 +306,9 @@ class FrameCycle:
             self._failure = text
             frame.result = FrameResult(frame.index, reason="processing_error")
         if frame.waiting_since_ns is not None:
-            self._ready(frame, frame.waiting_since_ns)
+            self._schedule_publication(frame, frame.waiting_since_ns)
 
-    def _ready(self, frame: _Frame, due_ns: int) -> None:
+    def _schedule_publication(self, frame: _Frame, due_ns: int) -> None:
         """Publish when the modelled detection of all stars is done, or as soon as the result comes after that."""
         if frame.result is None:
             frame.waiting_since_ns = due_ns
@@ -320,16 +320,16 @@ class FrameCycle:
 
             def finish(finish_ns: int) -> None:
                 if generation == self._generation:
-                    self._finish(frame, finish_ns)
+                    self._publish_in_order(frame, finish_ns)
 
             self._scheduler.at(known_ns, finish)
             return
         if frame.waiting_since_ns is not None:
             frame.late = True
             known_ns = now_ns
-        self._finish(frame, known_ns)
+        self._publish_in_order(frame, known_ns)
 
-    def _finish(self, frame: _Frame, known_ns: int) -> None:
+    def _publish_in_order(self, frame: _Frame, known_ns: int) -> None:
         """Publish a frame, after those that were exposed before it."""
         frame.finished_ns = known_ns
         while self._in_flight and self._in_flight[0].finished_ns is not None:
@@ -341,7 +341,7 @@ class FrameCycle:
         timing = self._timing
         detect_s = timing.detect_s + timing.detect_per_star_s * result.detected
         identify_s = self._identify_s(tracking=frame.tracking)
-        valid, reason, rate = self._judge(frame, result, detect_s + identify_s)
+        valid, reason, rate = self._assess(frame, result, detect_s + identify_s)
         self.published += 1
         self._publish(
             Measurement(
@@ -364,7 +364,7 @@ class FrameCycle:
             )
         )
 
-    def _judge(
+    def _assess(
         self, frame: _Frame, result: FrameResult, processing_s: float
     ) -> tuple[bool, str, Triple | None]:
         """Return whether the device stands by a result, why not, and the rate."""

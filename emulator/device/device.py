@@ -28,34 +28,34 @@ from starhil.protocol.values import Value
 log = logging.getLogger("starhil.device")
 
 Background: TypeAlias = Callable[[Callable[[], None], Callable[[EmulatorError | None], None]], None]
-"""Does slow work (the first argument) somewhere and then calls back with what it raised, or None."""
+"""Runs slow work (the first argument), then calls the second one with the error, or None."""
 
 PREDICTION_LIMIT_S: Final = 30.0
-"""Age of an attitude up to which tracking can be commanded from it, seconds."""
+"""Maximum age of an attitude from which tracking can be commanded, seconds."""
 
 STALE_PERIODS: Final = 3
-"""Update periods without a publication after which the last attitude no longer counts as valid."""
+"""Update periods without a new measurement after which the last attitude is no longer valid."""
 
 PROCESSING_ALLOWANCE_S: Final = 2.0
 
 PIPELINE_ENDED: Final = "pipeline_ended"
-"""Error of a device whose picture pipeline has ended and is not started again, a name of the enumeration `device_error`."""
+"""Name in `device_error` of the error when the pipeline has ended and is not restarted."""
 
 
 def outcome(work: Callable[[], None]) -> EmulatorError | None:
-    """Do some work and return what went wrong, whatever it was, or None."""
+    """Do some work and return its error, whatever it was, or None."""
     try:
         work()
     except EmulatorError as error:
         return error
-    except Exception as error:  # noqa: BLE001 (whoever waits for the work has to hear of its end)
+    except Exception as error:  # noqa: BLE001 (the caller must learn of any error)
         log_internal_error("background", error)
         return EmulatorError(f"internal error: {one_line(error)}")
     return None
 
 
 def run_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
-    """Background that is none: for the stepped clock, where nothing may depend on how fast a disk is."""
+    """Run the work in the foreground: on the stepped clock nothing may depend on the speed of a disk."""
     done(outcome(work))
 
 
@@ -65,24 +65,24 @@ class Device:
     Parameters
     ----------
     profile
-        What it is.
+        Profile of the unit.
     icd
-        Rows that it serves; each has a handler by its name.
+        Interface definition.
     clock
-        Run time.
+        Clock of the simulation time.
     imager
-        Where frames are made and solved.
+        Renders and solves the images.
     store
-        What survives a restart.
+        Keeps the state that survives a restart.
     truth
-        Where it looks.
+        Source of the true attitude.
     background
-        Where slow writes are done.
+        Runs slow writes.
 
     Raises
     ------
     EmulatorError
-        The profile's parameters are not allowed, or the definition has a row without a handler.
+        A parameter in the profile is unknown or out of its limits.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Device:
             self.parameters,
             profile.timing,
             self.time,
-            self._published,
+            self._frame_published,
             profile.device.rate_window,
         )
         self.cycle.truth = truth
@@ -124,7 +124,7 @@ class Device:
             imager,
             self.cycle,
             clock.now_ns,
-            self._single_frame,
+            self._request_single_frame,
             lambda: float(self.parameters["exposure"]) / 1000.0,
         )
         self.files = FileDownload(self.images)
@@ -136,7 +136,7 @@ class Device:
         self.frames_valid = 0
         self.started_ns = clock.now_ns()
         self.warm = False
-        """The pipeline has told that it is ready."""
+        """Whether the pipeline is ready."""
         self.on_frame: list[Callable[[Measurement], None]] = []
         self.on_mode: list[Callable[[Transition], None]] = []
         self.on_start: list[Callable[[], None]] = []
@@ -145,14 +145,14 @@ class Device:
         self.unresponsive = False
         """A fault: requests are neither counted nor answered."""
         self._background = background
-        self._boot_over: Event | None = None
+        self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
         self.parameters.observe(self._parameters_changed)
 
     # --- power, boot and reset ---
 
     def power_on(self) -> None:
-        """Start: load what is stored, count the start, boot."""
+        """Load the stored state, count the start and boot."""
         self._start("power_on", self.store.load())
 
     def withdraw_start(self) -> None:
@@ -161,8 +161,8 @@ class Device:
         self._persist(lambda error: log.error("%s", error) if error else None)
 
     def reset(self, cause: str) -> None:
-        """Restart, for a cause by its name in the interface definition."""
-        self._start(cause, self._content())
+        """Restart, for a cause named in the enumeration `reset_cause`."""
+        self._start(cause, self._persistent_state())
         for observer in self.on_reset:
             call_guarded("reset", observer)
 
@@ -184,36 +184,36 @@ class Device:
         self.modes.reset()
         self.mode_changes = self.frames_valid = 0
         for name in self.parameters.restore(self._stored_parameters):
-            log.warning("stored parameter %s: unknown or out of its limits; its default is used", name)
+            log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
         for observer in self.on_start:
             call_guarded("start", observer)
         self._persist(lambda error: log.error("%s", error) if error else None)
         if self.store.corrupt:
-            log.warning("the stored state was not whole: it is set aside, defaults are used")
-        if self._boot_over is not None:
-            self._boot_over.cancel()
+            log.warning("the stored state is corrupt and was set aside; using the defaults")
+        if self._boot_end is not None:
+            self._boot_end.cancel()
         boot_ns = round(self.profile.device.boot_s * NANOSECONDS)
-        self._boot_over = self.scheduler.at(self.started_ns + boot_ns, self._boot_ends)
+        self._boot_end = self.scheduler.at(self.started_ns + boot_ns, self._boot_time_over)
 
     def pipeline_ready(self, camera_constants: dict[str, Value]) -> None:
-        """Take note that frames can be made; the camera's constants become defaults where the profile gives none."""
+        """Note that the pipeline is ready; camera constants become defaults unless the profile sets them."""
         self.warm = True
-        own = self.profile.parameters  # a device may hold another idea of its camera than what the camera is
-        self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in own})
-        if self._boot_over is None and self.modes.mode is Mode.BOOT:
+        configured = self.profile.parameters  # a device may be miscalibrated on purpose
+        self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in configured})
+        if self._boot_end is None and self.modes.mode is Mode.BOOT:
             self._end_boot()
 
     def pipeline_lost(self) -> None:
-        """Take note that the pipeline has ended: the error mode, until it is back and a mode is commanded."""
+        """Enter the error mode, as the pipeline has ended; a mode can be commanded once it is ready again."""
         self.warm = False
         self.modes.fail("processing")
 
     def pipeline_given_up(self) -> None:
-        """Take note that the pipeline does not come back by itself: the error mode, until a reset."""
+        """Enter the error mode until a reset, as the pipeline is not restarted again."""
         self.modes.fail(PIPELINE_ENDED)
 
-    def _boot_ends(self, _due_ns: int) -> None:
-        self._boot_over = None
+    def _boot_time_over(self, _due_ns: int) -> None:
+        self._boot_end = None
         if self.warm:
             self._end_boot()
 
@@ -222,14 +222,14 @@ class Device:
         if self.parameters["start_mode"] == "lost_in_space" and self.modes.mode is Mode.STANDBY:
             self.modes.command(Mode.LOST_IN_SPACE, has_attitude=False)
 
-    # --- state that survives ---
+    # --- persistent state ---
 
     def save_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
-        """Store all parameters; `done` is called when they are on the disk, or with what went wrong."""
+        """Store all parameters; `done` is called with None when they are on disk, or with the error."""
         self._store_parameters(dict(self.parameters), done)
 
     def forget_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
-        """Store none: present values stay, and the defaults hold from the next restart on."""
+        """Delete the stored parameters: present values stay until the next restart, then defaults apply."""
         self._store_parameters({}, done)
 
     def _store_parameters(
@@ -243,29 +243,29 @@ class Device:
                 self.parameters.mark_stored(content)
             else:
                 log.error("%s", error)
-                if self._stored_parameters is stored:  # neither another save nor a restart has followed
+                if self._stored_parameters is stored:  # no other save or restart has followed
                     self._stored_parameters = before
             done(error)
 
         self._persist(finish)
 
     def restore_parameters(self) -> None:
-        """Set all parameters to what is stored, or to their defaults where nothing is."""
+        """Set all parameters to their stored values, or to their defaults where none is stored."""
         self.parameters.restore(self._stored_parameters)
 
     def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
-        content = self._content()
+        content = self._persistent_state()
         self._background(lambda: self.store.save(content), done)
 
-    def _content(self) -> dict[str, object]:
-        """What the store holds when all that is being saved has been: what a restart begins with."""
+    def _persistent_state(self) -> dict[str, object]:
+        """Return the state that survives a restart, with writes still in progress included."""
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---
 
     @property
     def fresh(self) -> Measurement | None:
-        """The last measurement if the device is at work and it is not out of date, else None."""
+        """The last measurement, or None if it is out of date or the mode makes no images."""
         last = self.latest
         if last is None or not self.modes.mode.makes_frames:
             return None
@@ -273,12 +273,12 @@ class Device:
         age_ns = self.clock.now_ns() - last.published_ns
         return last if age_ns <= limit_s * NANOSECONDS else None
 
-    def _single_frame(self, mid_ns: int) -> FrameRequest:
+    def _request_single_frame(self, mid_ns: int) -> FrameRequest:
         truth = self.cycle.truth.state(mid_ns / NANOSECONDS)
         exposure_s = float(self.parameters["exposure"]) / 1000.0
         return self.cycle.request(truth, exposure_s, None, solve=False)
 
-    def _published(self, measurement: Measurement) -> None:
+    def _frame_published(self, measurement: Measurement) -> None:
         self.latest = measurement
         self.frames_valid += measurement.valid
         self.modes.solved(
@@ -302,7 +302,7 @@ class Device:
             call_guarded("mode", observer, transition)
 
     def command_mode(self, wanted: Mode) -> bool:
-        """Command a mode; False if it is refused."""
+        """Command a mode; return False if it is refused."""
         if self.modes.mode is Mode.ERROR and not self.warm:
             return False
         return self.modes.command(wanted, has_attitude=self.cycle.has_fix(PREDICTION_LIMIT_S))
@@ -315,12 +315,12 @@ class Device:
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
-    """Defaults of the parameters in a profile: its own table, and what its links section says.
+    """Return the parameter defaults of a profile: its `[parameters]` and the settings of its `[links]`.
 
     Raises
     ------
     EmulatorError
-        The table names a parameter that there is none of.
+        The table names an unknown parameter.
     """
     links = profile.links
     of_links: dict[str, Value] = {

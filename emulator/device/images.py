@@ -117,7 +117,7 @@ class ImageStore:
 
         def fetch() -> None:
             self.percent, self.status = 50, "waiting_frame"
-            self._ask(edge, store)
+            self._fetch_image(edge, store)
 
         def store(answer: ImageResult | None) -> None:
             self.busy = False
@@ -136,7 +136,7 @@ class ImageStore:
             self.busy = False
             done(answer)
 
-        self._capture(lambda: self._ask(0, finish))
+        self._capture(lambda: self._fetch_image(0, finish))
 
     def _capture(self, then: Callable[[], None]) -> None:
         """Call `then` when the next frame has gone to the pipeline; in standby one is exposed for it."""
@@ -185,9 +185,9 @@ class ImageStore:
             )
             done(answer is not None)
 
-        self._ask(edge, take)
+        self._fetch_image(edge, take)
 
-    def _ask(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
+    def _fetch_image(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
         """Fetch an image from the pipeline; it is taken in after the storing time, however fast it came."""
         generation = self._generation
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)

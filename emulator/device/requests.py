@@ -81,7 +81,7 @@ class Requests:
         """Count input on a link that was not a valid request."""
         if not self.device.unresponsive:
             log.debug("%s: %s", fault.kind.value, fault.detail)
-            self.device.counters.fault(fault)
+            self.device.counters.count_fault(fault)
 
     def telemetry(self, name: str) -> bytes:
         """Return the present data of a telemetry row.

@@ -86,13 +86,13 @@ def events(change: Callable[[Any], list[Any]]) -> Damage:
 
     def damage(unit: SimulatedUnit) -> None:
         link = unit.link
-        take = link._take
+        take = link._dispatch
 
         def changed(event: Any) -> None:
             for other in change(event):
                 take(other)
 
-        link._take = changed
+        link._dispatch = changed
 
     return damage
 

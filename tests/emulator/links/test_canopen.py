@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.canopen import (
     FRAME_ROWS,
     STATUS_ROW,
-    BaseFramePieces,
     CanopenLink,
     not_before,
     open_canopen,
@@ -387,7 +387,7 @@ def test_storage_in_the_folder_of_the_state(make_bench, tmp_path):
 @pytest.mark.parametrize("data", [b"", b"\x01\x02"])
 def test_damaged_frames_stay_frames_of_the_base_format(data):
     rng = random.Random(1)
-    pieces = BaseFramePieces()
+    pieces = CanDamage(extended=False)
     frame = CanFrame(0x181, data, extended=False)
     for _ in range(50):
         damaged = pieces.corrupt(frame, rng)

@@ -9,7 +9,7 @@ from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
-from starhil.emulator.links.serial import SerialLink, SerialPieces
+from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.protocol.can_framing import (
     CanFrame,
@@ -372,7 +372,7 @@ def test_wire_faults_damage_what_goes_out(bench, settings, expected):
 def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
     clock, scheduler, sent = SteppedClock(), Scheduler(), []
     wire = WireFaults(
-        lambda item: sent.append((clock.now_ns() / 1e9, item)), SerialPieces(), clock, scheduler, 1
+        lambda item: sent.append((clock.now_ns() / 1e9, item)), SerialDamage(), clock, scheduler, 1
     )
     wire.settings = WireFaultSettings(split=2, gap_s=0.5)
     wire.send(b"abcd")
