@@ -18,8 +18,8 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
+from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
-from starhil.emulator.links.canopen import CanopenLink, open_canopen
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.frames import PipelineSetup, Warm
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
@@ -27,7 +27,7 @@ from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
 from starhil.emulator.revival import PipelineRevival
-from starhil.emulator.symlink_lock import claim_symlink
+from starhil.emulator.symlink_lock import lock_symlink
 from starhil.emulator.truth.config import FileConfig, LiveConfig, TruthConfig
 from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveFeed, LiveTruth
@@ -39,7 +39,7 @@ from starhil.protocol.values import Value
 log = logging.getLogger("starhil.run")
 
 PATIENCE_S: Final = 8.0
-"""Time after which a start that takes long is explained, seconds."""
+"""Time after which a slow start is explained in the log, seconds."""
 
 
 class Emulation:
@@ -69,17 +69,17 @@ class Emulation:
         self._requests: Requests | None = None
         self.serial: SerialLink | None = None
         self.can: CanLink | None = None
-        self.canopen: CanopenLink | None = None
+        self.canopen: Link | None = None
         self.feed: LiveFeed | None = None
-        self._feed_wanted = ""
-        """Where the feed was to listen, in the profile's words."""
+        self._configured_feed = ""
+        """Address of the live feed as configured: `ready_fields` has the actual one."""
         self.warm: Warm | None = None
         self.ready_fields: dict[str, str] = {}
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
         self._closers: list[Callable[[], object]] = []
         self._pump: ClockPump | None = None
         self.stepper: StepPump | None = None
-        self._warming: asyncio.Task[None] | None = None
+        self._warm_up_task: asyncio.Task[None] | None = None
         self._revival: PipelineRevival | None = None
         self._awake = asyncio.Event()
 
@@ -149,11 +149,11 @@ class Emulation:
         self._revival = PipelineRevival(
             self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
         )
-        self._warming = asyncio.create_task(self._warm_up())
+        self._warm_up_task = asyncio.create_task(self._warm_up())
 
     @property
     def _state_dir(self) -> Path | None:
-        """Folder of what survives a restart; None where nothing does."""
+        """Folder of the state that survives a restart; None to keep it in memory."""
         state_dir = self.profile.run.state_dir
         return self.profile.folder / Path(state_dir).expanduser() if state_dir else None
 
@@ -175,12 +175,12 @@ class Emulation:
         return background
 
     async def open_truth(self, config: TruthConfig) -> TruthSource:
-        """Make a truth source, with its socket if it is a live feed; the feed before it is closed.
+        """Build a truth source, with its socket if it is a live feed, and close the previous feed.
 
         Raises
         ------
         EmulatorError
-            A file is bad or a port cannot be had; the source before it stays.
+            A file is invalid or a port is not available; the previous source stays.
         """
         truth = await asyncio.to_thread(config.build, self.clock.now_ns() / 1e9, self.profile.folder)
         if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
@@ -189,41 +189,43 @@ class Emulation:
         if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
             wanted = f"{config.protocol}:{config.host}:{config.port}"
-            if config.port != 0 and wanted in (self.ready_fields.get("truth"), self._feed_wanted):
-                self.close_feed()  # the same port: it has to be free first
-                await asyncio.sleep(0)  # … and is so when the loop has come around
+            if config.port != 0 and wanted in (self.ready_fields.get("truth"), self._configured_feed):
+                self.close_feed()  # the same port: it must be free first
+                await asyncio.sleep(0)  # the loop closes it in its next turn
             where = await feed.start(config.protocol, config.host, config.port)
             self.close_feed()
-            self.ready_fields["truth"], self._feed_wanted = where, wanted
+            self.ready_fields["truth"], self._configured_feed = where, wanted
         else:
             self.close_feed()
         self.feed = feed
         return truth
 
     def set_truth(self, truth: TruthSource) -> None:
-        """Use a truth source that needs no socket from now on."""
+        """Replace the truth source by one without a socket."""
         self.device.cycle.truth = truth
         self.close_feed()
 
     def close_feed(self) -> None:
-        """Close the socket of the live feed, if there is one: another truth has taken its place."""
+        """Close the socket of the live feed, if there is one."""
         if self.feed is not None:
             self.feed.close()
             self.feed = None
-        self._feed_wanted = ""
+        self._configured_feed = ""
         self.ready_fields.pop("truth", None)
 
     async def _open_links(self, requests: Requests) -> None:
         device = requests.device
         links, seed = self.profile.links, self.profile.run.seed
-        stepped = isinstance(self.clock, SteppedClock)  # what leaves at one run time leaves at once
+        stepped = isinstance(
+            self.clock, SteppedClock
+        )  # no time passes between two frames or bytes of one event
         if links.serial.port != "off":
             from starhil.protocol.transports.serial import open_serial
 
             baud = int(device.parameters["serial_baud"])
             symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
             if symlink is not None:
-                self._closers.append(claim_symlink(symlink).close)
+                self._closers.append(lock_symlink(symlink).close)
             paced = None if links.serial.pace and not stepped else False
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(requests, transport, seed)
@@ -240,24 +242,26 @@ class Emulation:
             await self._open_canopen(requests)
 
     async def _open_canopen(self, requests: Requests) -> None:
-        """Let the CANopen node join the bus of the CAN link, or the one that it would have."""
+        """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""
+        from starhil.emulator.links.canopen import open_canopen
         from starhil.protocol.transports.can import open_can
 
         channel = self.profile.links.can.channel
         bus = self.ready_fields.get("can") or ("auto" if channel == "off" else channel)
         transport = open_can(bus)
-        self.canopen = open_canopen(requests, transport, self._state_dir, self.profile.run.seed)
-        taken = await self.canopen.start()
-        self.ready_fields.setdefault("can", taken)
+        link = open_canopen(requests, transport, self._state_dir, self.profile.run.seed)
+        self.canopen = link
+        opened = await link.start()
+        self.ready_fields.setdefault("can", opened)
         self.ready_fields["canopen"] = str(requests.device.parameters["canopen_node"])
 
     @property
-    def links(self) -> list[SerialLink | CanopenLink | CanLink]:
+    def links(self) -> list[Link]:
         """Links in the order in which they are closed: the CAN link may hold the hub of the bus."""
         return [link for link in (self.serial, self.canopen, self.can) if link is not None]
 
     async def _warm_up(self) -> None:
-        """Wait for the pipeline, then for boot to end."""
+        """Wait for the pipeline; the device then leaves the boot mode when its boot time is over."""
         device = self.device
         try:
             self.warm = await self.imager.start()
@@ -269,7 +273,7 @@ class Emulation:
         except EmulatorError as error:
             device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: {error}") from None
-        except ProtocolError as error:  # a constant of the camera is beyond what its parameter can be
+        except ProtocolError as error:  # a camera constant is outside the limits of its parameter
             device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
@@ -281,16 +285,16 @@ class Emulation:
         Raises
         ------
         EmulatorError
-            The pipeline cannot be made: a missing catalogue, a camera that cannot be.
+            The pipeline cannot start, for example for want of a catalogue; one line.
         """
         awake = asyncio.create_task(self._awake.wait())
         patience = asyncio.get_running_loop().call_later(PATIENCE_S, _warn_of_first_compilation)
-        warming = self._warming
-        if warming is None:
+        warm_up = self._warm_up_task
+        if warm_up is None:
             raise EmulatorError("emulation: not started")
-        await asyncio.wait({awake, warming}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({awake, warm_up}, return_when=asyncio.FIRST_COMPLETED)
         patience.cancel()
-        if warming.done() and (error := warming.exception()) is not None:
+        if warm_up.done() and (error := warm_up.exception()) is not None:
             awake.cancel()
             raise error
         await awake
@@ -298,15 +302,15 @@ class Emulation:
         return "ready " + " ".join(f"{key}={value}" for key, value in fields.items())
 
     async def close(self) -> None:
-        """End everything: links first, so that nothing new comes in, then the pipeline and the files.
+        """Close everything: links first, so that no more requests arrive, then the pipeline and the files.
 
-        A part that does not close is logged, and keeps no other one open.
+        An error in closing one is logged, and the others are closed all the same.
         """
         closers: list[Callable[[], object]] = []
         if self._pump is not None:
             closers.append(self._pump.stop)
-        if self._warming is not None:
-            closers.append(partial(_cancel, self._warming))
+        if self._warm_up_task is not None:
+            closers.append(partial(_cancel, self._warm_up_task))
         if self._revival is not None:
             closers.append(self._revival.close)
         closers += [link.close for link in self.links]
@@ -317,7 +321,7 @@ class Emulation:
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:
-    """End a task; what it has raised was reported by `ready`."""
+    """Cancel a task; `ready` has reported its exception."""
     task.cancel()
     await asyncio.wait({task})
     if not task.cancelled():
@@ -325,7 +329,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 def pipeline_setup(profile: Profile) -> PipelineSetup:
-    """What the pipeline of a profile is made of."""
+    """Return the pipeline configuration of a profile."""
     path = profile.catalog.path
     return PipelineSetup(
         camera=profile.camera.values(),
@@ -341,7 +345,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
 
 
 def camera_constants(warm: Warm) -> dict[str, Value]:
-    """Parameters that say of the camera what its optics are: a calibrated unit."""
+    """Return the camera parameters of a calibrated unit: focal length, centre and distortion, in pixels."""
     camera = warm.camera
     k1, k2, p1, p2, _ = camera["distortion"]
     focal_x, focal_y = camera["focal_px"]

@@ -1,4 +1,4 @@
-"""Callbacks that must not end whoever calls them."""
+"""Calls whose exceptions are logged instead of ending the caller."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Arguments = ParamSpec("Arguments")
 
 
 def one_line(error: BaseException) -> str:
-    """Describe an unexpected error in one line: its type, its text and where it was raised."""
+    """Return the type, text and origin of an unexpected error in one line."""
     text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:
@@ -36,7 +36,7 @@ def log_internal_error(what: str, error: Exception) -> None:
 def call_guarded(
     what: str, callback: Callable[Arguments, object], *args: Arguments.args, **kwargs: Arguments.kwargs
 ) -> None:
-    """Call back; an exception is logged as an internal error and goes no further."""
+    """Call back; an exception is logged as an internal error and not raised."""
     try:
         callback(*args, **kwargs)
     except Exception as error:  # noqa: BLE001 (whatever it is, the caller has more to do)

@@ -1,26 +1,27 @@
-"""Fault injection at three levels: what the sensor sees, what the device does, what the wires carry."""
+"""Fault injection at three levels: optical, device and wire."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Final, Protocol
+from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
 from starhil.emulator.device.device import Device
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.links.base import Link
+from starhil.emulator.links.wire_faults import WireFaultSettings
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values if sky objects can be made of them.
+    """Return the values if they are valid fields of `SkyObjects`.
 
     Raises
     ------
     ValueError
-        Names the key and what is allowed.
+        A field is invalid; the message names it and the allowed values.
     """
     try:
         SkyObjects.from_dict(values)
@@ -30,63 +31,51 @@ def check_sky(values: dict[str, Any]) -> dict[str, Any]:
 
 
 SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
-"""Fields of `SkyObjects` as TOML and JSON hold them."""
+"""Fields of `SkyObjects` as decoded from TOML or JSON."""
 
-Chance = Annotated[float, Field(ge=0.0, le=1.0)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
 
 
 NO_ERROR: Final = 0
-"""Value in the enumeration `device_error` that no error mode has."""
+"""Value in `device_error` that means no error."""
 
 
 class DeviceFault(Strict):
-    """What goes wrong in the device."""
+    """A fault of the device."""
 
     stuck: bool = False
-    """Requests are neither taken nor answered; frames go on."""
+    """Unresponsive: requests are neither counted nor answered; exposures go on."""
     error: str | None = None
-    """Enter the error mode for this cause, a name of the enumeration `device_error` that is an error."""
+    """Enter the error mode with this error, a name of the enumeration `device_error`."""
     reset: str | None = None
     """Restart now for this cause, a name of the enumeration `reset_cause`."""
 
 
 class WireFault(Strict):
-    """What goes wrong on a wire; see `WireFaultSettings`."""
+    """Faults of a wire; see `WireFaultSettings`."""
 
-    drop: Chance = 0.0
-    corrupt: Chance = 0.0
-    junk: Chance = 0.0
+    drop: Probability = 0.0
+    corrupt: Probability = 0.0
+    junk: Probability = 0.0
     delay_s: Seconds = 0.0
     split: Annotated[int, Field(ge=0, le=4096)] = 0
     gap_s: Seconds = 0.02
 
     def settings(self) -> WireFaultSettings:
-        """Make the settings of a link."""
+        """Return the settings for a link."""
         return WireFaultSettings(**self.model_dump())
 
 
 class FaultRequest(Strict):
-    """One `fault` request; what is not given stays as it is."""
+    """One `fault` request; levels that are left out keep their faults."""
 
     optical: SkyValues | None = None
-    """What the sensor sees besides the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
+    """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
     serial: WireFault | None = None
     can: WireFault | None = None
-    """What the device sends on the CAN bus, CANopen's frames too."""
-
-
-class Link(Protocol):
-    """A link as fault injection sees it."""
-
-    @property
-    def bus(self) -> str:
-        """Name of the bus, `serial` or `can`: a fault of a bus affects every link on it."""
-
-    @property
-    def wire(self) -> WireFaults[Any]:
-        """The outgoing side of the wire."""
+    """Faults of outgoing CAN frames, those of CANopen too."""
 
 
 class Faults:
@@ -106,12 +95,12 @@ class Faults:
         self._optical: dict[str, Any] = {}
 
     def inject(self, request: FaultRequest) -> None:
-        """Bring faults about; all of the request, or nothing of it.
+        """Inject the faults of a request, all or none.
 
         Raises
         ------
         EmulatorError
-            A name is not known, or a link is not there.
+            A name is unknown, or the run has no such link.
         """
         self.check(request)
         device = self._device
@@ -131,12 +120,12 @@ class Faults:
                 device.modes.fail(request.device.error)
 
     def check(self, request: FaultRequest) -> None:
-        """Check that this run can bring faults about.
+        """Check that the faults of a request can be injected.
 
         Raises
         ------
         EmulatorError
-            A name is not known, or a link is not there.
+            A name is unknown, or the run has no such link.
         """
         enums = self._device.icd.enums
         if request.device is not None:
@@ -155,7 +144,7 @@ class Faults:
                 )
 
     def clear(self) -> None:
-        """Set everything right; the error mode is left by telecommand."""
+        """Remove all faults; the error mode is left by telecommand only."""
         self._optical = {}
         device = self._device
         device.cycle.faults = lambda _index: {}
@@ -164,7 +153,7 @@ class Faults:
             wire.settings = WireFaultSettings()
 
     def describe(self) -> dict[str, Any]:
-        """Return what is wrong, by level."""
+        """Return the present faults by level."""
         found: dict[str, Any] = {}
         if self._optical:
             found["optical"] = dict(self._optical)

@@ -1,6 +1,6 @@
-"""Scenario files: what happens to a run at which run time, so that a hard day can be repeated to the byte.
+"""Scenario files: faults and truth changes at given simulation times, repeatable to the byte.
 
-TOML, one `[[at]]` table an event, in any order::
+TOML, one `[[at]]` table per event, in any order::
 
     name = "glare"
 
@@ -12,9 +12,9 @@ TOML, one `[[at]]` table an event, in any order::
     run_time_s = 40.0
     clear_faults = true
 
-`fault` and `truth` take what the control channel's `fault` and `set_truth` take. Events happen in run time, so that
-they come at the same frames whatever the clock. Names, links and truth files are checked when the run starts. A live feed
-cannot be set by a scenario: it needs a socket, which takes time.
+`fault` and `truth` have the keys of the control channel's `fault` and `set_truth`. Events occur in
+simulation time, at the same exposures whatever the clock. Names, links and truth files are checked
+when the run starts. A scenario cannot set a live feed, as opening its socket takes time.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ log = logging.getLogger("starhil.scenario")
 
 
 class ScenarioEvent(Strict):
-    """What happens at a run time."""
+    """What changes at a simulation time."""
 
     run_time_s: Annotated[float, Field(ge=0.0, le=1e9)]
     fault: FaultRequest | None = None
@@ -114,12 +114,12 @@ class Scenario(Strict):
 
 
 def load_scenario(name_or_path: str) -> Scenario:
-    """Read a scenario by its path, or by its name among those of the product.
+    """Read a scenario from a path, or by the name of one in `configs/scenarios`.
 
     Raises
     ------
     EmulatorError
-        One line: file, key and remedy.
+        The file is missing or invalid; one line with file, key and remedy.
     """
     path = Path(name_or_path).expanduser()
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):

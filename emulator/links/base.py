@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from abc import ABC, abstractmethod
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.requests import Requests
@@ -40,6 +40,24 @@ class Receiver(Protocol[Arriving_contra]):
     def flush(self, now: float) -> list[LinkFault]:
         """Drop an incomplete message that has timed out; return the faults."""
         ...
+
+
+class Link(Protocol):
+    """An open link of any kind."""
+
+    bus: ClassVar[str]
+    """Name of the bus, `serial` or `can`: a wire fault affects every link on its bus."""
+
+    @property
+    def transport(self) -> Transport[Any]:
+        """Transport of the link."""
+
+    @property
+    def wire(self) -> WireFaults[Any]:
+        """Outgoing side of the wire, with its faults."""
+
+    async def close(self) -> None:
+        """Close the transport."""
 
 
 class DeviceLink(ABC, Generic[Item, Style]):

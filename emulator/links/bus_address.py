@@ -6,7 +6,7 @@ import logging
 import socket
 from typing import Final
 
-from starhil.emulator.symlink_lock import NameTakenError, claim_name
+from starhil.emulator.symlink_lock import NameTakenError, lock_name
 
 log = logging.getLogger("starhil.link")
 
@@ -32,7 +32,7 @@ class BusAddress:
     def __init__(self, what: str, setting: str) -> None:
         self._what = what
         self._setting = setting
-        self._claim: socket.socket | None = None
+        self._lock: socket.socket | None = None
         self._bus = ""
         self.number = 0
         self.seen_elsewhere = False
@@ -45,7 +45,7 @@ class BusAddress:
         if not number or bus.startswith(OWN_PROCESS):
             return
         try:
-            self._claim = claim_name(self._what, f"{bus} {number}".encode())
+            self._lock = lock_name(self._what, f"{bus} {number}".encode())
         except NameTakenError as error:
             self._warn(f"is in use by another emulator, process {error.owner}")
 
@@ -57,9 +57,9 @@ class BusAddress:
 
     def release(self) -> None:
         """Release the address."""
-        if self._claim is not None:
-            self._claim.close()
-            self._claim = None
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _warn(self, why: str) -> None:
         other = self.number % HIGHEST + 1

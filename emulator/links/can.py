@@ -7,6 +7,7 @@ import random
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
@@ -64,7 +65,7 @@ class CanLink(DeviceLink[CanFrame, int]):
         Minimum time between two frames that the device sends, seconds.
     """
 
-    bus = "can"
+    bus: ClassVar[str] = "can"
 
     def __init__(
         self, requests: Requests, transport: Transport[CanFrame], frame_gap_s: float = 0.0, seed: int = 0

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import ClassVar, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import Measurement
@@ -147,7 +147,7 @@ class DeviceApplication:
                 self._last_image = picture
                 self._finish_write(deferred, None)
 
-        self._device.images.take_full(
+        self._device.images.capture_full(
             lambda full: done(
                 None if full is None else Picture(full.width, full.height, full.frame, full.pixels)
             )
@@ -191,7 +191,7 @@ class CanopenLink:
     The node-ID is the device's parameter `canopen_node`, unless LSS has stored another one.
     """
 
-    bus = "can"
+    bus: ClassVar[str] = "can"
 
     def __init__(
         self,

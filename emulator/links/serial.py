@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
@@ -39,7 +39,7 @@ class SerialLink(DeviceLink[bytes, Dialect]):
     Unsolicited telemetry is sent in dialect c only.
     """
 
-    bus = "serial"
+    bus: ClassVar[str] = "serial"
 
     def __init__(self, requests: Requests, transport: SerialTransport, seed: int = 0) -> None:
         super().__init__(requests, transport, SerialDamage(), seed)

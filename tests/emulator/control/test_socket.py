@@ -61,7 +61,7 @@ def test_a_folder_of_somebody_else_is_not_used(run, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     (tmp_path / "theirs").mkdir()
     (tmp_path / f"starhil-{os.geteuid()}").symlink_to(tmp_path / "theirs")
-    with pytest.raises(EmulatorError, match=r"somebody else's; give --control unix:/PATH"):
+    with pytest.raises(EmulatorError, match=r"belongs to another user; give --control unix:/PATH"):
         run(lambda *_: None)
 
 
@@ -91,7 +91,7 @@ def test_a_path_in_use_is_refused_and_left_alone(run, tmp_path):
             run(lambda *_: None, options=options)
         assert path.is_socket()
     path.unlink()
-    with pytest.raises(EmulatorError, match="is no socket; choose another path"):
+    with pytest.raises(EmulatorError, match="is not a socket; choose another path"):
         run(lambda *_: None, options=RunOptions(control=f"unix:{text}"))
     assert text.read_text() == "of great worth"
 
