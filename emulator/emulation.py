@@ -1,28 +1,24 @@
-"""A run: device, pipeline, links, truth feed and control channel put together, started and ended."""
+"""An emulation: device, pipeline, links, truth and clock, opened, started and closed together."""
 
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AsyncExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from starhil.emulator.clock import Clock, SteppedClock, make_clock
-from starhil.emulator.control.channel import ControlServer
-from starhil.emulator.control.faults import Faults
-from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.cycle import Measurement
-from starhil.emulator.device.device import Background, Device, do_at_once, outcome
+from starhil.emulator.device.device import Background, Device, outcome, run_at_once
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.guard import one_line
+from starhil.emulator.guard import close_all
+from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.frames import PipelineSetup, Warm
@@ -31,96 +27,74 @@ from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
 from starhil.emulator.revival import PipelineRevival
-from starhil.emulator.symlink_lock import claim_symlink
+from starhil.emulator.symlink_lock import lock_symlink
 from starhil.emulator.truth.config import FileConfig, LiveConfig, TruthConfig
 from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveFeed, LiveTruth
 from starhil.emulator.truth.source import TruthSource
-from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import load_icd
 from starhil.protocol.values import Value
-
-if TYPE_CHECKING:
-    from starhil.emulator.links.canopen import CanopenLink
 
 log = logging.getLogger("starhil.run")
 
 PATIENCE_S: Final = 8.0
-"""Time after which a start that takes long is explained, seconds."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What a run has beside its profile.
-
-    Attributes
-    ----------
-    truth_log
-        CSV file of truth and measurement a frame.
-    overwrite
-        Replace a truth log that exists.
-    control
-        `off`, `auto` (a Unix socket for this user alone), unix:/PATH or HOST:PORT.
-    control_token
-        What each request on the control channel has to carry; empty: nothing.
-    scenario
-        Name or path of a scenario; empty: none.
-    """
-
-    truth_log: Path | None = None
-    overwrite: bool = False
-    control: str = "off"
-    control_token: str = ""
-    scenario: str = ""
+"""Time after which a slow start is explained in the log, seconds."""
 
 
 class Emulation:
-    """One emulator with all that belongs to it.
+    """A device with its pipeline, links, truth and clock.
 
     Parameters
     ----------
     profile
-        What it is.
-    options
-        What the run has beside.
-    icd
-        Interface definition; by default the product's own.
+        Profile of the unit.
     worker
-        A picture worker that was started before; by default one is started here.
+        Pipeline worker that was started earlier; by default one is started here.
+
+    Attributes
+    ----------
+    ready_fields
+        Fields of the ready line: which port, bus or address was opened for what.
     """
 
     def __init__(
         self,
         profile: Profile,
-        options: RunOptions | None = None,
-        icd: InterfaceDefinition | None = None,
         worker: WorkerProcess | None = None,
     ) -> None:
         self.profile = profile
-        self.options = options or RunOptions()
         self.clock: Clock = make_clock(profile.run.clock)
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
-        self._icd = icd
-        self._device: Device | None = None
+        self._requests: Requests | None = None
         self.serial: SerialLink | None = None
         self.can: CanLink | None = None
-        self.canopen: CanopenLink | None = None
+        self.canopen: Link | None = None
         self.feed: LiveFeed | None = None
-        self._feed_wanted = ""
-        """Where the feed was to listen, in the profile's words."""
+        self._configured_feed = ""
+        """Address of the live feed as configured: `ready_fields` has the actual one."""
         self.warm: Warm | None = None
-        self.ready_words: dict[str, str] = {}
+        self.ready_fields: dict[str, str] = {}
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
         self._closers: list[Callable[[], object]] = []
         self._pump: ClockPump | None = None
         self.stepper: StepPump | None = None
-        self.faults = Faults(self)
-        self.control: ControlServer | None = None
-        self.ended = asyncio.Event()
-        self._warming: asyncio.Task[None] | None = None
+        self._warm_up_task: asyncio.Task[None] | None = None
         self._revival: PipelineRevival | None = None
         self._awake = asyncio.Event()
+
+    @property
+    def requests(self) -> Requests:
+        """The device's handling of requests.
+
+        Raises
+        ------
+        EmulatorError
+            The emulation is not open.
+        """
+        if self._requests is None:
+            raise EmulatorError("emulation: not open")
+        return self._requests
 
     @property
     def device(self) -> Device:
@@ -129,11 +103,9 @@ class Emulation:
         Raises
         ------
         EmulatorError
-            The run was not started.
+            The emulation is not open.
         """
-        if self._device is None:
-            raise EmulatorError("emulation: not started")
-        return self._device
+        return self.requests.device
 
     def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
         setup = pipeline_setup(self.profile)
@@ -143,40 +115,33 @@ class Emulation:
             worker.end()
         return ThreadImager(setup)
 
-    async def start(self) -> None:
-        """Bring up truth, device and links, in this order; the pipeline warms behind.
+    async def open(self) -> None:
+        """Open truth and links and switch the device on; its time stands still until `begin`.
 
         Raises
         ------
         EmulatorError, ProtocolError
-            A file, port or bus cannot be had; one line.
+            A file, port or bus is not available; one line.
         """
-        icd = self._icd or load_icd()
         store = self._open_store()
         truth = await self.open_truth(self.profile.truth)
         stepped = isinstance(self.clock, SteppedClock)
-        background = do_at_once if stepped else self._in_background()
-        device = Device(self.profile, icd, self.clock, self.imager, store, truth, background)
-        self._device = device
-        if self.options.truth_log is not None:
-            truth_log = TruthLog(self.options.truth_log, overwrite=self.options.overwrite)
-            device.on_frame.append(truth_log.write)
-            self._closers.append(truth_log.close)
+        background = run_at_once if stepped else self._in_background()
+        device = Device(self.profile, load_icd(), self.clock, self.imager, store, truth, background)
+        self._requests = Requests(device)
         device.on_frame.append(_log_frame)
-        scenario = load_scenario(self.options.scenario) if self.options.scenario else None
         device.power_on()
         try:
-            await self._open_links(device)
-            if scenario is not None:
-                scenario.enter(self)
-            if self.options.control != "off":
-                self.control = ControlServer(self, self.ended.set, self.options.control_token)
-                self.ready_words["control"] = await self.control.start(self.options.control)
+            await self._open_links(self._requests)
         except (EmulatorError, ProtocolError):
-            device.start_refused()
+            device.withdraw_start()
             raise
+
+    def begin(self) -> None:
+        """Let time pass and start the pipeline; `ready` waits for it."""
+        device = self.device
         if isinstance(self.clock, SteppedClock):
-            transports = [link.transport for link in self._links()]
+            transports = [link.transport for link in self.links]
             self.stepper = StepPump(device.scheduler, self.clock, self.imager, transports)
         else:
             self._pump = ClockPump(device.scheduler, self.clock)
@@ -184,11 +149,11 @@ class Emulation:
         self._revival = PipelineRevival(
             self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
         )
-        self._warming = asyncio.create_task(self._warm_up())
+        self._warm_up_task = asyncio.create_task(self._warm_up())
 
     @property
     def _state_dir(self) -> Path | None:
-        """Folder of what survives a restart; None where nothing does."""
+        """Folder of the state that survives a restart; None to keep it in memory."""
         state_dir = self.profile.run.state_dir
         return self.profile.folder / Path(state_dir).expanduser() if state_dir else None
 
@@ -210,12 +175,12 @@ class Emulation:
         return background
 
     async def open_truth(self, config: TruthConfig) -> TruthSource:
-        """Make a truth source, with its socket if it is a live feed; the feed before it is closed.
+        """Build a truth source, with its socket if it is a live feed, and close the previous feed.
 
         Raises
         ------
         EmulatorError
-            A file is bad or a port cannot be had; the source before it stays.
+            A file is invalid or a port is not available; the previous source stays.
         """
         truth = await asyncio.to_thread(config.build, self.clock.now_ns() / 1e9, self.profile.folder)
         if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
@@ -224,69 +189,79 @@ class Emulation:
         if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
             feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
             wanted = f"{config.protocol}:{config.host}:{config.port}"
-            if config.port != 0 and wanted in (self.ready_words.get("truth"), self._feed_wanted):
-                self.close_feed()  # the same port: it has to be free first
-                await asyncio.sleep(0)  # … and is so when the loop has come around
+            if config.port != 0 and wanted in (self.ready_fields.get("truth"), self._configured_feed):
+                self.close_feed()  # the same port: it must be free first
+                await asyncio.sleep(0)  # the loop closes it in its next turn
             where = await feed.start(config.protocol, config.host, config.port)
             self.close_feed()
-            self.ready_words["truth"], self._feed_wanted = where, wanted
+            self.ready_fields["truth"], self._configured_feed = where, wanted
         else:
             self.close_feed()
         self.feed = feed
         return truth
 
+    def set_truth(self, truth: TruthSource) -> None:
+        """Replace the truth source by one without a socket."""
+        self.device.cycle.truth = truth
+        self.close_feed()
+
     def close_feed(self) -> None:
-        """Close the socket of the live feed, if there is one: another truth has taken its place."""
+        """Close the socket of the live feed, if there is one."""
         if self.feed is not None:
             self.feed.close()
             self.feed = None
-        self._feed_wanted = ""
-        self.ready_words.pop("truth", None)
+        self._configured_feed = ""
+        self.ready_fields.pop("truth", None)
 
-    async def _open_links(self, device: Device) -> None:
+    async def _open_links(self, requests: Requests) -> None:
+        device = requests.device
         links, seed = self.profile.links, self.profile.run.seed
-        stepped = isinstance(self.clock, SteppedClock)  # what leaves at one run time leaves at once
+        stepped = isinstance(
+            self.clock, SteppedClock
+        )  # no time passes between two frames or bytes of one event
         if links.serial.port != "off":
             from starhil.protocol.transports.serial import open_serial
 
             baud = int(device.parameters["serial_baud"])
             symlink = Path(links.serial.symlink).expanduser() if links.serial.symlink else None
             if symlink is not None:
-                self._closers.append(claim_symlink(symlink).close)
+                self._closers.append(lock_symlink(symlink).close)
             paced = None if links.serial.pace and not stepped else False
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
-            self.serial = SerialLink(device, transport, seed)
-            self.ready_words["serial"] = await self.serial.start()
-            self.ready_words["dialect"] = str(device.parameters["serial_dialect"])
+            self.serial = SerialLink(requests, transport, seed)
+            self.ready_fields["serial"] = await self.serial.start()
+            self.ready_fields["dialect"] = str(device.parameters["serial_dialect"])
         if links.can.channel != "off":
             from starhil.protocol.transports.can import open_can
 
             self.can = CanLink(
-                device, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
+                requests, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
             )
-            self.ready_words["can"] = await self.can.start()
+            self.ready_fields["can"] = await self.can.start()
         if links.canopen.node:
-            await self._open_canopen(device)
+            await self._open_canopen(requests)
 
-    async def _open_canopen(self, device: Device) -> None:
-        """Let the CANopen node join the bus of the CAN link, or the one that it would have."""
+    async def _open_canopen(self, requests: Requests) -> None:
+        """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""
         from starhil.emulator.links.canopen import open_canopen
         from starhil.protocol.transports.can import open_can
 
         channel = self.profile.links.can.channel
-        bus = self.ready_words.get("can") or ("auto" if channel == "off" else channel)
+        bus = self.ready_fields.get("can") or ("auto" if channel == "off" else channel)
         transport = open_can(bus)
-        self.canopen = open_canopen(device, transport, self._state_dir, self.profile.run.seed)
-        taken = await self.canopen.start()
-        self.ready_words.setdefault("can", taken)
-        self.ready_words["canopen"] = str(device.parameters["canopen_node"])
+        link = open_canopen(requests, transport, self._state_dir, self.profile.run.seed)
+        self.canopen = link
+        opened = await link.start()
+        self.ready_fields.setdefault("can", opened)
+        self.ready_fields["canopen"] = str(requests.device.parameters["canopen_node"])
 
-    def _links(self) -> list[SerialLink | CanopenLink | CanLink]:
-        """Return the links of the run in the order in which they are closed: the CAN link may hold the hub of the bus."""
+    @property
+    def links(self) -> list[Link]:
+        """Links in the order in which they are closed: the CAN link may hold the hub of the bus."""
         return [link for link in (self.serial, self.canopen, self.can) if link is not None]
 
     async def _warm_up(self) -> None:
-        """Wait for the pipeline, then for boot to end."""
+        """Wait for the pipeline; the device then leaves the boot mode when its boot time is over."""
         device = self.device
         try:
             self.warm = await self.imager.start()
@@ -296,10 +271,10 @@ class Emulation:
             )
             device.pipeline_ready(camera_constants(self.warm))
         except EmulatorError as error:
-            device.start_refused()
+            device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: {error}") from None
-        except ProtocolError as error:  # a constant of the camera is beyond what its parameter can be
-            device.start_refused()
+        except ProtocolError as error:  # a camera constant is outside the limits of its parameter
+            device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
@@ -310,60 +285,43 @@ class Emulation:
         Raises
         ------
         EmulatorError
-            The pipeline cannot be made: a missing catalogue, a camera that cannot be.
+            The pipeline cannot start, for example for want of a catalogue; one line.
         """
         awake = asyncio.create_task(self._awake.wait())
-        patience = asyncio.get_running_loop().call_later(PATIENCE_S, _tell_of_first_start)
-        warming = self._warming
-        if warming is None:
+        patience = asyncio.get_running_loop().call_later(PATIENCE_S, _warn_of_first_compilation)
+        warm_up = self._warm_up_task
+        if warm_up is None:
             raise EmulatorError("emulation: not started")
-        await asyncio.wait({awake, warming}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({awake, warm_up}, return_when=asyncio.FIRST_COMPLETED)
         patience.cancel()
-        if warming.done() and (error := warming.exception()) is not None:
+        if warm_up.done() and (error := warm_up.exception()) is not None:
             awake.cancel()
             raise error
         await awake
-        words = {**self.ready_words, "seed": str(self.profile.run.seed), "clock": self.clock.name}
-        return "ready " + " ".join(f"{key}={value}" for key, value in words.items())
+        fields = {**self.ready_fields, "seed": str(self.profile.run.seed), "clock": self.clock.name}
+        return "ready " + " ".join(f"{key}={value}" for key, value in fields.items())
 
     async def close(self) -> None:
-        """End everything: links first, so that nothing new comes in, then the pipeline and the files.
+        """Close everything: links first, so that no more requests arrive, then the pipeline and the files.
 
-        A part that does not close is logged, and keeps no other one open.
+        An error in closing one is logged, and the others are closed all the same.
         """
-        async with AsyncExitStack() as stack:
-            for close in self._closers:  # entered in the reverse order: the last one is closed first
-                stack.push_async_callback(_close_guarded, close)
-            self._closers.clear()
-            stack.push_async_callback(_close_guarded, partial(self._writer.shutdown, wait=True))
-            stack.push_async_callback(_close_guarded, self.imager.close)
-            stack.push_async_callback(_close_guarded, self.close_feed)
-            if self.control is not None:
-                stack.push_async_callback(_close_guarded, self.control.close)
-            for link in reversed(self._links()):
-                stack.push_async_callback(_close_guarded, link.close)
-            if self._revival is not None:
-                stack.push_async_callback(_close_guarded, self._revival.close)
-            if self._warming is not None:
-                stack.push_async_callback(_close_guarded, partial(_cancel, self._warming))
-            if self._pump is not None:
-                stack.push_async_callback(_close_guarded, self._pump.stop)
-
-
-async def _close_guarded(close: Callable[[], object]) -> None:
-    """Close one part; what that raises is logged."""
-    try:
-        closing = close()
-        if inspect.isawaitable(closing):
-            await closing
-    except Exception as error:  # the other parts are to be closed still
-        what = str(error) if isinstance(error, (EmulatorError, ProtocolError)) else one_line(error)
-        log.error("closing: %s", what)  # noqa: TRY400 (one line)
-        log.debug("closing", exc_info=True)
+        closers: list[Callable[[], object]] = []
+        if self._pump is not None:
+            closers.append(self._pump.stop)
+        if self._warm_up_task is not None:
+            closers.append(partial(_cancel, self._warm_up_task))
+        if self._revival is not None:
+            closers.append(self._revival.close)
+        closers += [link.close for link in self.links]
+        closers += [self.close_feed, self.imager.close, partial(self._writer.shutdown, wait=True)]
+        closers += reversed(self._closers)
+        self._closers.clear()
+        await close_all(closers)
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:
-    """End a task; what it has raised was reported by `ready`."""
+    """Cancel a task; `ready` has reported its exception."""
     task.cancel()
     await asyncio.wait({task})
     if not task.cancelled():
@@ -371,7 +329,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 def pipeline_setup(profile: Profile) -> PipelineSetup:
-    """What the pipeline of a profile is made of."""
+    """Return the pipeline configuration of a profile."""
     path = profile.catalog.path
     return PipelineSetup(
         camera=profile.camera.values(),
@@ -387,7 +345,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
 
 
 def camera_constants(warm: Warm) -> dict[str, Value]:
-    """Parameters that say of the camera what its optics are: a calibrated unit."""
+    """Return the camera parameters of a calibrated unit: focal length, centre and distortion, in pixels."""
     camera = warm.camera
     k1, k2, p1, p2, _ = camera["distortion"]
     focal_x, focal_y = camera["focal_px"]
@@ -402,7 +360,7 @@ def camera_constants(warm: Warm) -> dict[str, Value]:
     }
 
 
-def _tell_of_first_start() -> None:
+def _warn_of_first_compilation() -> None:
     log.warning("a first start compiles its kernels, about a minute; the links answer already")
 
 

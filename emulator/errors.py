@@ -2,4 +2,4 @@
 
 
 class EmulatorError(Exception):
-    """A profile, file or port that the emulator refuses; one line says what, where and the remedy."""
+    """A profile, file or port that the emulator rejects; the message is one line with cause, location and remedy."""

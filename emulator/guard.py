@@ -1,11 +1,16 @@
-"""Callbacks that must not end whoever calls them."""
+"""Calls whose exceptions are logged instead of ending the caller."""
 
 from __future__ import annotations
 
+import inspect
 import logging
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
 from typing import Final, ParamSpec
+
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.errors import ProtocolError
 
 log: Final = logging.getLogger("starhil.internal")
 
@@ -13,7 +18,7 @@ Arguments = ParamSpec("Arguments")
 
 
 def one_line(error: BaseException) -> str:
-    """Describe an unexpected error in one line: its type, its text and where it was raised."""
+    """Return the type, text and origin of an unexpected error in one line."""
     text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:
@@ -22,12 +27,35 @@ def one_line(error: BaseException) -> str:
     return f"{text} ({module}:{frames[-1].lineno})"
 
 
+def log_internal_error(what: str, error: Exception) -> None:
+    """Log an unexpected error in one line, and its traceback at level debug."""
+    log.error("%s: internal error: %s", what, one_line(error))
+    log.debug("%s", what, exc_info=error)
+
+
 def call_guarded(
     what: str, callback: Callable[Arguments, object], *args: Arguments.args, **kwargs: Arguments.kwargs
 ) -> None:
-    """Call back; what that raises is logged as an internal error, and its traceback at level debug."""
+    """Call back; an exception is logged as an internal error and not raised."""
     try:
         callback(*args, **kwargs)
-    except Exception as error:  # whatever it is, the caller has more to do
-        log.error("%s: internal error: %s", what, one_line(error))  # noqa: TRY400 (one line; the traceback below)
-        log.debug("%s", what, exc_info=True)
+    except Exception as error:  # noqa: BLE001 (whatever it is, the caller has more to do)
+        log_internal_error(what, error)
+
+
+async def close_all(closers: Sequence[Callable[[], object]]) -> None:
+    """Call each closer in order and await it where needed; one that fails is logged, and keeps no other open."""
+    async with AsyncExitStack() as stack:
+        for close in reversed(closers):
+            stack.push_async_callback(_close_guarded, close)
+
+
+async def _close_guarded(close: Callable[[], object]) -> None:
+    try:
+        closing = close()
+        if inspect.isawaitable(closing):
+            await closing
+    except Exception as error:  # the others still need closing
+        text = str(error) if isinstance(error, (EmulatorError, ProtocolError)) else one_line(error)
+        log.error("closing: %s", text)  # noqa: TRY400 (one line; the traceback below)
+        log.debug("closing", exc_info=True)

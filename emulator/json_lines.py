@@ -1,4 +1,4 @@
-"""Objects that arrive as JSON, one a line: lines of bounded length, and no key given twice."""
+"""JSON objects, one per line: lines of limited length, without repeated keys."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class RepeatedKeyError(ValueError):
-    """An object gives a key twice, so that it is open which value counts."""
+    """An object has a key twice, so its value is ambiguous."""
 
 
 def parse_json(line: bytes | str) -> Any:
@@ -18,7 +18,7 @@ def parse_json(line: bytes | str) -> Any:
     Raises
     ------
     RepeatedKeyError
-        A key stands in an object twice; the text names it.
+        An object has a key twice; the message names it.
     ValueError, RecursionError
         The line is not JSON.
     """
@@ -29,13 +29,13 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, value in pairs:
         if key in values:
-            raise RepeatedKeyError(f"key {key!r} is given twice")
+            raise RepeatedKeyError(f"key {key!r} is repeated")
         values[key] = value
     return values
 
 
 async def read_lines(reader: asyncio.StreamReader) -> AsyncIterator[bytes | None]:
-    """Yield each line until the peer hangs up; None stands for a line longer than the reader's limit, which is dropped."""
+    """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped."""
     too_long = False
     while True:
         try:

@@ -1,4 +1,4 @@
-"""What makes run time pass for a device: with the wall clock, or step by step."""
+"""Pumps that run the device's events: with the wall clock, or step by step."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ log = logging.getLogger("starhil.run")
 MAX_STEP_S: Final = 86_400.0
 LONGEST_SLEEP_S: Final = 3600.0
 PEER_PATIENCE_S: Final = 1.0
-"""Wall time for which a step waits for a peer that takes nothing of what was sent to it, seconds."""
+"""Wall time for which a step waits for a peer that does not read, seconds."""
 
 
 class ClockPump:
-    """Does events when the clock reaches them, in the event loop."""
+    """Runs each event in the event loop when the clock reaches it."""
 
     def __init__(self, scheduler: Scheduler, clock: Clock) -> None:
         self._scheduler = scheduler
@@ -31,56 +31,57 @@ class ClockPump:
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
-        scheduler.on_change = self._changed
+        scheduler.on_add = self._event_added
 
     def start(self) -> None:
-        """Begin."""
+        """Start to run events."""
         self._running = True
-        self._plan()
+        self._schedule_next()
 
     def stop(self) -> None:
-        """Let time stand."""
+        """Stop running events."""
         self._running = False
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
-    def _changed(self) -> None:
-        """Look anew when the loop comes around: whoever entered the event has its own work to end first."""
+    def _event_added(self) -> None:
+        """Wake up earlier if the new event is due first."""
         if self._running and (self._timer is None or self._due_s() < self._timer.when()):
-            self._plan()
+            self._schedule_next()
 
     def _due_s(self) -> float:
-        """Time on the loop's clock of the next event."""
+        """Return the time of the next event on the loop's clock, seconds."""
         due_ns = self._scheduler.next_due_ns()
         if due_ns is None:
             return self._loop.time() + LONGEST_SLEEP_S
         wait_s = (due_ns - self._clock.now_ns()) / NANOSECONDS / self._clock.speed
         return self._loop.time() + min(max(wait_s, 0.0), LONGEST_SLEEP_S)
 
-    def _plan(self) -> None:
+    def _schedule_next(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self._loop.call_at(self._due_s(), self._run)
+        self._timer = self._loop.call_at(self._due_s(), self._run_due_event)
 
-    def _run(self) -> None:
+    def _run_due_event(self) -> None:
         self._timer = None
         event = self._scheduler.pop_due(self._clock.now_ns())
         try:
-            if event is not None:  # one at a time, so that the links get their turn between two
+            if event is not None:  # one at a time, so that the links run in between
                 call_guarded("event", event.action, event.due_ns)
         finally:
             if self._running:
-                self._plan()
+                self._schedule_next()
 
 
 class StepPump:
-    """Goes from event to event when it is told to, and waits before each for the pipeline and for what the links send.
+    """Runs events on request; before each, it waits for the pipeline and for the links to send.
 
     Parameters
     ----------
     transports
-        Where the links send; one whose peer takes nothing for `PEER_PATIENCE_S` is not waited for until the peer reads again.
+        Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, its transport is not
+        waited for until it reads again.
     """
 
     def __init__(
@@ -95,16 +96,16 @@ class StepPump:
         self._imager = imager
         self._transports = transports
         self._stalled: dict[Transport[Any], int] = {}
-        """Transports that are not waited for, with what they had sent when their peers stopped reading."""
+        """Transports that are not waited for, with the bytes or frames sent when the peer stopped reading."""
         self._lock = asyncio.Lock()
 
     async def step(self, seconds: float) -> None:
-        """Let run time pass; all events within it are done when this returns.
+        """Advance simulation time; all events within the step are done on return.
 
         Raises
         ------
         EmulatorError
-            The step is not a positive number of at most a day.
+            The step is not positive, or above `MAX_STEP_S`.
         """
         if not 0.0 < seconds <= MAX_STEP_S:
             raise EmulatorError(f"step: {seconds} given, seconds in (0, {MAX_STEP_S:g}] needed")
@@ -118,14 +119,14 @@ class StepPump:
             self._clock.set_ns(end_ns)
 
     async def _settle(self) -> None:
-        """Wait for the pipeline and the links, and give whatever else is in the loop its turn."""
+        """Wait for the pipeline and the links, and let other tasks of the loop run."""
         await self._imager.settle()
         await asyncio.sleep(0)
         for transport in self._transports:
             await self._drain(transport)
 
     async def _drain(self, transport: Transport[Any]) -> None:
-        """Wait until a transport has sent all, as long as its peer takes something."""
+        """Wait until a transport has sent everything, as long as its peer reads."""
         sent = transport.statistics.sent
         if self._stalled.get(transport) == sent:
             return
@@ -139,7 +140,7 @@ class StepPump:
                     continue
                 self._stalled[transport] = sent
                 log.warning(
-                    "step: the peer of %s does not read; what it leaves unread is dropped",
+                    "step: the peer of %s does not read; unread output is dropped",
                     transport.description,
                 )
             else:

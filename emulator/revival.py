@@ -1,7 +1,8 @@
-"""What happens when the picture pipeline has ended by itself: it is started again, a bounded number of times.
+"""Restarts of the image pipeline after it has ended unexpectedly.
 
-The pauses grow. A pipeline that has run for `STEADY_S` counts as sound, and a later loss begins with the first pause again.
-When no attempt is left, the device stays in its error mode with the error `pipeline_ended` until it is reset, which tries again.
+The number of attempts is limited, and the pauses before them grow. After `STEADY_S` without a failure
+the count starts again. When no attempt is left, the device stays in its error mode with the error
+`pipeline_ended` until it is reset, which starts the attempts again.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
 log = logging.getLogger("starhil.run")
 
 PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Pauses before the attempts to start the pipeline again, seconds."""
+"""Pauses before the attempts to restart the pipeline, seconds."""
 
 STEADY_S: Final = 60.0
 
 
 class PipelineRevival:
-    """Starts the pipeline of a device again.
+    """Restarts the pipeline of a device.
 
     Parameters
     ----------
@@ -52,14 +53,14 @@ class PipelineRevival:
             self._attempts = 0
         self._lost = True
         self._device.pipeline_lost()
-        self._begin()
+        self._start_attempts()
 
     def _device_reset(self) -> None:
         if self._lost and self._attempts == len(PAUSES_S):
             self._attempts = 0
-            self._begin()
+            self._start_attempts()
 
-    def _begin(self) -> None:
+    def _start_attempts(self) -> None:
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._revive())
 
@@ -68,7 +69,7 @@ class PipelineRevival:
             pause_s = PAUSES_S[self._attempts]
             self._attempts += 1
             log.warning(
-                "picture pipeline: starting it again in %g s (attempt %d of %d)",
+                "image pipeline: restarting in %g s (attempt %d of %d)",
                 pause_s,
                 self._attempts,
                 len(PAUSES_S),
@@ -77,7 +78,7 @@ class PipelineRevival:
             await self._restart()
         if self._lost:
             log.error(
-                "picture pipeline: ended %d times, not started again; error %s: "
+                "image pipeline: ended %d times, not restarted; error %s: "
                 "reset the device to try again, or restart the emulator",
                 len(PAUSES_S) + 1,
                 PIPELINE_ENDED,
@@ -91,16 +92,16 @@ class PipelineRevival:
         except Exception as error:  # noqa: BLE001 (whatever it is, the next attempt may succeed)
             self._lost = True
             what = str(error) if isinstance(error, EmulatorError) else one_line(error)
-            log.warning("picture pipeline: not started: %s", what)
+            log.warning("image pipeline: not started: %s", what)
             return
-        if self._lost:  # it has ended again already
+        if self._lost:  # it has already ended again
             return
         self._ready_at_s = asyncio.get_running_loop().time()
         log.info("pipeline ready again: %.2f s", warm.seconds)
         self._ready(warm)
 
     async def close(self) -> None:
-        """Give up an attempt under way."""
+        """Cancel an attempt in progress."""
         self._imager.on_failure = None
         if self._task is not None:
             self._task.cancel()

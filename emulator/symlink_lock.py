@@ -1,7 +1,7 @@
-"""A symlink, or any name, as the property of one running emulator.
+"""Locks on symlinks and other names, each held by one running emulator.
 
-An abstract socket named after it stands for the claim: it ends with its process, however that ends, and tells the
-number of the process to whoever asks for the same name.
+The lock is an abstract Unix socket named after it. The kernel releases it when the process ends, and
+reports the process ID to another process that connects to it.
 """
 
 from __future__ import annotations
@@ -19,21 +19,20 @@ _PEER: Final = struct.Struct("3i")
 """Process, user and group at the other end of a local socket."""
 
 
-def claim_symlink(path: Path) -> socket.socket:
-    """Claim a path for the symlink to a pseudo-terminal; the claim holds until the socket is closed.
+def lock_symlink(path: Path) -> socket.socket:
+    """Lock the path of a symlink to a pseudo-terminal until the socket is closed.
 
     Raises
     ------
     EmulatorError
-        Another emulator has it, or what is there was not made by one.
+        Another emulator uses it, or the existing symlink was not made by an emulator.
     """
     if path.is_symlink() and not str(path.readlink()).startswith("/dev/pts/"):
         raise EmulatorError(
-            f"symlink {path}: leads to {path.readlink()}, so no emulator made it; choose another name"
+            f"symlink {path}: points to {path.readlink()}, so no emulator made it; choose another name"
         )
-    place = path.parent.resolve() / path.name
     try:
-        return claim_name("symlink", os.fsencode(place))
+        return lock_name("symlink", os.fsencode(path.parent.resolve() / path.name))
     except NameTakenError as error:
         raise EmulatorError(
             f"symlink {path}: in use by another emulator, process {error.owner}; end that one, or choose another name"
@@ -41,38 +40,38 @@ def claim_symlink(path: Path) -> socket.socket:
 
 
 class NameTakenError(EmulatorError):
-    """Another emulator has the name; `owner` is its process."""
+    """Another emulator uses the name; `owner` is its process ID."""
 
     def __init__(self, owner: str) -> None:
         super().__init__(f"in use by another emulator, process {owner}")
         self.owner = owner
 
 
-def claim_name(kind: str, name: bytes) -> socket.socket:
-    """Claim a name of some kind on this machine; the claim holds until the socket is closed.
+def lock_name(kind: str, name: bytes) -> socket.socket:
+    """Lock a name of some kind on this machine until the socket is closed.
 
     Raises
     ------
     NameTakenError
-        Another emulator has it.
+        Another emulator uses it.
     """
     address = f"\0starhil-{kind}-{hashlib.sha256(name).hexdigest()}".encode()
-    claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        claim.bind(address)
-        claim.listen()
+        lock.bind(address)
+        lock.listen()
     except OSError:
-        claim.close()
+        lock.close()
         raise NameTakenError(_owner(address)) from None
-    return claim
+    return lock
 
 
 def _owner(name: bytes) -> str:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-        asking.setblocking(False)  # noqa: FBT003 (the call of the library)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)  # noqa: FBT003 (the call of the library)
         try:
-            asking.connect(name)
+            probe.connect(name)
         except OSError as error:
             return f"unknown ({error.strerror})"
-        peer = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
         return str(_PEER.unpack(peer)[0])

@@ -1,4 +1,4 @@
-"""The truth log: one CSV row a frame, with what the sensor looked at and what it measured."""
+"""The truth log: a CSV file with true and measured attitude, one row per exposure."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ COLUMNS: Final = (
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
 )  # fmt: skip
-"""Columns: time of exposure on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured attitude.
+"""Columns: Unix time on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured attitude.
 
-`latency_ms` is run time from mid-exposure to publication; `processing_ms` and the three after it are the machine's own time.
+`latency_ms` is simulation time from mid-exposure to publication; `processing_ms` and the three after
+it are wall time.
 """
 
 
 def compare(measurement: Measurement) -> dict[str, Any]:
-    """Return truth, measurement and error of a frame by the names of `COLUMNS`; errors are None where invalid."""
+    """Return truth, measurement and errors by the names of `COLUMNS`; None where invalid."""
     result = measurement.result
     truth = measurement.truth
     row: dict[str, Any] = {
@@ -80,31 +81,31 @@ def compare(measurement: Measurement) -> dict[str, Any]:
 
 
 class TruthLog:
-    """A CSV file that gets a row a frame, each in the file before the next, and never half a row.
+    """A CSV file with one row per exposure, written without buffering and never in part.
 
-    One emulator at a time writes to a file. When no more can be written, a full disk say, the log is told so once, the file ends with the last whole row and the
-    run goes on.
+    One emulator at a time writes to a file. When writing fails, as on a full disk, a warning is logged,
+    the file ends with the last complete row and the run goes on.
 
     Parameters
     ----------
     path
-        The file; made if it is not there.
+        The file; created if it does not exist.
     overwrite
-        Replace what a file of that name holds.
+        Replace an existing file.
 
     Raises
     ------
     EmulatorError
-        The file cannot be made, holds something, or another emulator writes to it; it is as it was.
+        The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._path = path
-        self._whole = 0
+        self._size = 0
         self._file: io.FileIO | None = None
         try:
             self._file = _open(path, overwrite=overwrite)
-            self._add(COLUMNS)
+            self._write_row(COLUMNS)
         except OSError as error:
             self.close()
             raise EmulatorError(
@@ -112,11 +113,11 @@ class TruthLog:
             ) from None
 
     def write(self, measurement: Measurement) -> None:
-        """Add a frame."""
+        """Write the row of a measurement."""
         if self._file is None:
             return
         try:
-            self._add([_cell(name, value) for name, value in compare(measurement).items()])
+            self._write_row([_format_cell(name, value) for name, value in compare(measurement).items()])
         except OSError as error:
             log.warning(
                 "truth log %s: cannot be written (%s); it ends before frame %d, the run goes on",
@@ -126,8 +127,8 @@ class TruthLog:
             )
             self.close()
 
-    def _add(self, cells: Iterable[str]) -> None:
-        """Write a row, or none of it."""
+    def _write_row(self, cells: Iterable[str]) -> None:
+        """Write a whole row, or nothing."""
         if self._file is None:
             return
         text = io.StringIO()
@@ -137,36 +138,36 @@ class TruthLog:
         try:
             while row:
                 written: int | None = self._file.write(row)
-                if written is None:  # a device that would make the writer wait
+                if written is None:  # a device that would block
                     raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
                 row = row[written:]
         except OSError:
             if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-                self._file.truncate(self._whole)
+                self._file.truncate(self._size)
             raise
-        self._whole += size
+        self._size += size
 
     def close(self) -> None:
-        """End the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
 
 def _open(path: Path, *, overwrite: bool) -> io.FileIO:
-    """Open a file for one writer, empty; a pipe, whose reader could hold up the writer, is rejected."""
+    """Open and empty a file for one writer; a pipe is rejected, as its reader could block the emulator."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
     file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
     try:
-        _claim(path, file, overwrite=overwrite)
+        _lock_and_empty(path, file, overwrite=overwrite)
     except (EmulatorError, OSError):
         file.close()
         raise
     return file
 
 
-def _claim(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
-    """Lock a file for this process and empty it; a character device such as /dev/null is everybody's."""
+def _lock_and_empty(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
+    """Lock a file for this process and empty it; a character device such as /dev/null is not locked."""
     mode = os.fstat(file.fileno()).st_mode
     if stat.S_ISCHR(mode):
         return
@@ -185,7 +186,7 @@ def _claim(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
     file.truncate()
 
 
-def _cell(name: str, value: Any) -> str:
+def _format_cell(name: str, value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.cache import write_atomically
+from starid.files import write_atomically
 
 Answer = Mapping[str, Any]
 

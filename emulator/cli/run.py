@@ -81,8 +81,8 @@ def command(
     import gc
     import logging
 
-    from starhil.emulator.emulation import Emulation, RunOptions
     from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.launch import Run, RunOptions
     from starhil.emulator.profile import load_profile
     from starhil.protocol.serial_framing import Dialect
 
@@ -125,17 +125,17 @@ def command(
     async def run() -> None:
         import signal
 
-        emulation = Emulation(loaded, options, worker=worker)
+        emulator = Run(loaded, options, worker)
         loop = asyncio.get_running_loop()
         ends = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
             ends.append(signal.SIGHUP)
         for number in ends:
-            loop.add_signal_handler(number, emulation.ended.set)
+            loop.add_signal_handler(number, emulator.ended.set)
         try:
-            await emulation.start()
-            line = asyncio.create_task(emulation.ready())
-            stop = asyncio.create_task(emulation.ended.wait())
+            await emulator.start()
+            line = asyncio.create_task(emulator.emulation.ready())
+            stop = asyncio.create_task(emulator.ended.wait())
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
                 gc.collect()
@@ -145,7 +145,7 @@ def command(
             else:
                 line.cancel()
         finally:
-            await emulation.close()
+            await emulator.close()
 
     asyncio.run(run())
 

@@ -1,1 +1,1 @@
-"""What acts on a run from outside: faults, scenarios and the control channel."""
+"""Control of a run from outside: faults, scenarios and the control channel."""

@@ -1,29 +1,33 @@
-"""The control channel: a way into a running emulator that is apart from the links to the OBC.
+"""The control channel: commands a running emulator, apart from the links to the OBC.
 
-One JSON object a line, one answer a line, in order. A request has `do` and what belongs to it; an `id`, if given, comes back in
-the answer. An answer has `ok`; where that is false, `error` says why in one line, and nothing was done.
+Requests and answers are JSON objects, one per line, answered in order. A request has `do` and its
+arguments; an optional `id` is returned in the answer. An answer has `ok`; if it is false, `error` gives
+the reason in one line, and nothing was changed.
 
-`--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open. HOST:PORT listens on TCP,
-which is open to every local user, and beyond loopback to the network: whoever connects can do all that follows. With a token
-(`--control-token`, or STARHIL_CONTROL_TOKEN) each request has to carry it as `token`.
+`--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open.
+HOST:PORT listens on TCP, which is open to every local user and, unless on loopback, to the network:
+every peer can send all requests below. With a token (`--control-token`, or STARHIL_CONTROL_TOKEN),
+each request must carry it as `token`.
 
 ========================  =======================================================================================
-`do`                      what, and what the answer carries
+`do`                      effect, and fields of the answer
 ========================  =======================================================================================
-``status``                mode, run and device time, seed, clock, frames, counters, faults, truth status
+``status``                mode, simulation and device time, seed, clock, frames, counters, faults, truth
 ``truth``                 truth at `run_time_s` or `unix_s` (default: now): `quaternion_xyzw`, `ra_deg`, `dec_deg`,
                           `roll_deg`, `rate_deg_s`, `status`
-``frames``                the last `count` (default 1) frames, newest last: rows with the columns of the truth log
-``set_truth``             `truth`: a table as `[truth]` of a profile; taken into use at once
-``step``                  `seconds`: let run time pass, on the stepped clock only; answered when all is done
+``frames``                the last `count` (default 1) measurements, newest last, as rows of the truth log
+``set_truth``             `truth`: a table as `[truth]` of a profile; used at once
+``step``                  `seconds`: advance simulation time (stepped clock only); answered when it is done
 ``fault``                 `optical`, `device`, `serial` or `can`: a table of the keys below; keys not given are off
-``clear_faults``          everything works again
+``clear_faults``          remove all faults
 ``quit``                  end the emulator as SIGTERM does
 ========================  =======================================================================================
 
-Faults: `optical` = fields of `starhil.emulator.sky.objects.SkyObjects` (false_stars, missing_stars, moon, …) or blocked_share; `device` = stuck (requests are
-neither taken nor answered), error (a name of the enumeration `device_error`: enter the error mode), reset (a name of `reset_cause`:
-restart now); `serial` and `can` (CANopen too) = drop, corrupt, junk (chances 0 … 1), delay_s, split (bytes a piece, serial only), gap_s.
+Faults: `optical` = fields of `starhil.emulator.sky.objects.SkyObjects` (false_stars, missing_stars,
+moon, …) or blocked_share; `device` = stuck (requests are neither counted nor answered), error (a name of
+the enumeration `device_error`: enter the error mode), reset (a name of `reset_cause`: restart now);
+`serial` and `can` (CANopen too) = drop, corrupt, junk (probabilities 0 … 1), delay_s, split (bytes per
+piece, serial only), gap_s.
 """
 
 from __future__ import annotations
@@ -35,15 +39,16 @@ import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.control.faults import FaultRequest
+from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.cycle import Measurement, as_quaternion
+from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from starhil.emulator.truth.config import FixedConfig, TruthConfig
@@ -53,9 +58,6 @@ from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError, reason
 from starid.errors import StaridError
-
-if TYPE_CHECKING:
-    from starhil.emulator.emulation import Emulation
 
 log = logging.getLogger("starhil.control")
 
@@ -71,15 +73,20 @@ class ControlServer:
     Parameters
     ----------
     emulation
-        What is controlled.
+        Emulation to control; it is open.
+    faults
+        Faults of the run.
     quit_run
-        Ends the run.
+        Called to end the run.
     token
-        What each request has to carry as `token`; empty: nothing.
+        Token that each request must carry; empty for none.
     """
 
-    def __init__(self, emulation: Emulation, quit_run: Callable[[], None], token: str = "") -> None:
+    def __init__(
+        self, emulation: Emulation, faults: Faults, quit_run: Callable[[], None], token: str = ""
+    ) -> None:
         self._emulation = emulation
+        self._faults = faults
         self._token = token
         self._socket: ControlSocket | None = None
         self._opening = asyncio.Lock()
@@ -87,7 +94,7 @@ class ControlServer:
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._frames: deque[Measurement] = deque(maxlen=KEPT_FRAMES)
-        self._doing: dict[str, Callable[[dict[str, Any]], Awaitable[Answer]]] = {
+        self._actions: dict[str, Callable[[dict[str, Any]], Awaitable[Answer]]] = {
             "status": self._status,
             "truth": self._truth,
             "frames": self._last_frames,
@@ -95,7 +102,7 @@ class ControlServer:
             "step": self._step,
             "fault": self._fault,
             "clear_faults": self._clear_faults,
-            "quit": self._end,
+            "quit": self._quit_run,
         }
         emulation.device.on_frame.append(self._frames.append)
 
@@ -105,7 +112,7 @@ class ControlServer:
         Raises
         ------
         EmulatorError
-            The path or port is taken, or `where` is no address.
+            The path or port is in use, or `where` is not an address.
         """
         if where == "auto" or where.startswith("unix:"):
             path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
@@ -119,7 +126,7 @@ class ControlServer:
             raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
         try:
             self._server = await asyncio.start_server(self._serve, host, int(port), limit=MAX_LINE)
-        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+        except (OSError, ValueError) as error:  # an invalid host name is a ValueError
             raise EmulatorError(
                 f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"
             ) from None
@@ -127,7 +134,7 @@ class ControlServer:
         return f"{address[0]}:{address[1]}"
 
     def close(self) -> None:
-        """Stop listening and hang up."""
+        """Stop listening and close all connections."""
         if self._server is not None:
             self._server.close()
         if self._socket is not None:
@@ -143,13 +150,13 @@ class ControlServer:
                     writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
                     await writer.drain()
         except ConnectionError as error:
-            log.info("control channel: peer gone (%s)", error)
+            log.info("control channel: connection lost (%s)", error)
         finally:
             self._writers.discard(writer)
             writer.close()
 
     async def answer(self, line: bytes | str | None) -> Answer:
-        """Do one request and return its answer; a bad request changes nothing. None is a line that was too long."""
+        """Execute one request and return its answer; None stands for a line that was too long."""
         if line is None:
             return {"ok": False, "error": f"line too long: at most {MAX_LINE} bytes"}
         try:
@@ -161,28 +168,32 @@ class ControlServer:
         if not isinstance(request, dict):
             return {"ok": False, "error": "not a JSON object on one line"}
         identity = {"id": request.pop("id")} if "id" in request else {}
-        if not self._admits(request.pop("token", None)):
-            return {**identity, "ok": False, "error": "token: missing or wrong; give that of --control-token"}
+        if not self._token_is_valid(request.pop("token", None)):
+            return {
+                **identity,
+                "ok": False,
+                "error": "token: missing or wrong; give the one of --control-token",
+            }
         wanted = str(request.pop("do", ""))
-        action = self._doing.get(wanted)
+        action = self._actions.get(wanted)
         if action is None:
-            return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._doing)}"}
+            return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
         try:
             return {**identity, "ok": True, **await action(request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {**identity, "ok": False, "error": str(error)}
-        except Exception as error:  # a fault of ours shall not end the run, nor the peer's connection
+        except Exception as error:  # an internal error ends neither the run nor the connection
             log.exception("control channel: %s", wanted)
             name = type(error).__name__
             return {**identity, "ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
-    def _admits(self, token: object) -> bool:
+    def _token_is_valid(self, token: object) -> bool:
         if not self._token:
             return True
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
     async def _status(self, request: dict[str, Any]) -> Answer:
-        _only(request)
+        _check_keys(request)
         emulation, device = self._emulation, self._emulation.device
         truth = self._state(device.clock.now_ns())
         feed = device.cycle.truth
@@ -197,20 +208,20 @@ class ControlServer:
             "algorithm": emulation.profile.run.algorithm,
             "frames": device.cycle.published,
             "frames_valid": device.frames_valid,
-            "frames_left_out": device.cycle.left_out,
+            "frames_left_out": device.cycle.skipped,
             "telecommands": device.counters.telecommands,
             "telemetry": device.counters.telemetry,
             "link_faults": {kind.value: count for kind, count in device.counters.faults.items()},
             "truth_kind": feed.kind,
             "truth_status": truth.status.value,
-            "faults": emulation.faults.describe(),
+            "faults": self._faults.describe(),
         }
         if isinstance(feed, LiveTruth):
             answer["feed"] = {
                 "accepted": feed.accepted,
                 "refused": feed.refused,
                 "last_fault": feed.last_fault,
-                "address": emulation.ready_words.get("truth", ""),
+                "address": emulation.ready_fields.get("truth", ""),
             }
         return answer
 
@@ -218,7 +229,7 @@ class ControlServer:
         return self._emulation.device.cycle.truth.state(run_ns / NANOSECONDS)
 
     async def _truth(self, request: dict[str, Any]) -> Answer:
-        _only(request, "run_time_s", "unix_s")
+        _check_keys(request, "run_time_s", "unix_s")
         device = self._emulation.device
         run_ns = device.clock.now_ns()
         if "run_time_s" in request:
@@ -238,24 +249,24 @@ class ControlServer:
         }
 
     async def _last_frames(self, request: dict[str, Any]) -> Answer:
-        _only(request, "count")
+        _check_keys(request, "count")
         count = int(_number(request, "count", 1.0))
         if not 1 <= count <= KEPT_FRAMES:
-            raise EmulatorError(f"count: {count} given, 1 … {KEPT_FRAMES} needed")
+            raise EmulatorError(f"count: {count} is outside 1 … {KEPT_FRAMES}")
         return {"frames": [compare(measurement) for measurement in list(self._frames)[-count:]]}
 
     async def _set_truth(self, request: dict[str, Any]) -> Answer:
-        _only(request, "truth")
+        _check_keys(request, "truth")
         if not isinstance(request.get("truth"), dict):
             raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
         device = self._emulation.device
-        async with self._opening:  # reading a file takes time: the last request shall hold
+        async with self._opening:  # reading a file takes time; the last request wins
             device.cycle.truth = await self._emulation.open_truth(config)
-        return {"kind": config.kind, "address": self._emulation.ready_words.get("truth", "")}
+        return {"kind": config.kind, "address": self._emulation.ready_fields.get("truth", "")}
 
     async def _step(self, request: dict[str, Any]) -> Answer:
-        _only(request, "seconds")
+        _check_keys(request, "seconds")
         stepper = self._emulation.stepper
         if stepper is None:
             raise EmulatorError(f"step: the clock is {self._emulation.clock.name}; run with --clock stepped")
@@ -263,22 +274,22 @@ class ControlServer:
         return {"run_time_s": self._emulation.clock.now_ns() / NANOSECONDS}
 
     async def _fault(self, request: dict[str, Any]) -> Answer:
-        self._emulation.faults.inject(_parse(_FAULT, FaultRequest, request))
-        return {"faults": self._emulation.faults.describe()}
+        self._faults.inject(_parse(_FAULT, FaultRequest, request))
+        return {"faults": self._faults.describe()}
 
     async def _clear_faults(self, request: dict[str, Any]) -> Answer:
-        _only(request)
-        self._emulation.faults.clear()
-        return {"faults": self._emulation.faults.describe()}
+        _check_keys(request)
+        self._faults.clear()
+        return {"faults": self._faults.describe()}
 
-    async def _end(self, request: dict[str, Any]) -> Answer:
-        _only(request)
+    async def _quit_run(self, request: dict[str, Any]) -> Answer:
+        _check_keys(request)
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
 
 
 class _Truth(BaseModel):
-    """Only for the names of keys in messages."""
+    """Names the keys in validation messages."""
 
     truth: TruthConfig = FixedConfig(kind="fixed")
 
@@ -288,14 +299,14 @@ _FAULT: Final[TypeAdapter[FaultRequest]] = TypeAdapter(FaultRequest)
 
 
 def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object, *under: str) -> Any:
-    """Validate a part of a request, or say in one line what is wrong with it."""
+    """Validate an argument of a request, or raise the reason in one line."""
     try:
         return adapter.validate_json(json.dumps(value))
     except ValidationError as error:
         raise EmulatorError(explain(error, model, under=under)) from None
 
 
-def _only(request: dict[str, Any], *known: str) -> None:
+def _check_keys(request: dict[str, Any], *known: str) -> None:
     for key in request:
         if key not in known:
             raise EmulatorError(f"unknown key {key!r}; known: {', '.join(known) or 'none'}")

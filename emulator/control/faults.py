@@ -1,28 +1,27 @@
-"""Fault injection at three levels: what the sensor sees, what the device does, what the wires carry."""
+"""Fault injection at three levels: optical, device and wire."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from collections.abc import Iterable
+from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
+from starhil.emulator.device.device import Device
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.links.base import Link
+from starhil.emulator.links.wire_faults import WireFaultSettings
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
 
-if TYPE_CHECKING:
-    from starhil.emulator.emulation import Emulation
-
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values if sky objects can be made of them.
+    """Return the values if they are valid fields of `SkyObjects`.
 
     Raises
     ------
     ValueError
-        Names the key and what is allowed.
+        A field is invalid; the message names it and the allowed values.
     """
     try:
         SkyObjects.from_dict(values)
@@ -32,36 +31,36 @@ def check_sky(values: dict[str, Any]) -> dict[str, Any]:
 
 
 SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
-"""Fields of `SkyObjects` as TOML and JSON hold them."""
+"""Fields of `SkyObjects` as decoded from TOML or JSON."""
 
-Chance = Annotated[float, Field(ge=0.0, le=1.0)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
 
 
 NO_ERROR: Final = 0
-"""Value in the enumeration `device_error` that no error mode has."""
+"""Value in `device_error` that means no error."""
 
 
 class DeviceFault(Strict):
-    """What goes wrong in the device."""
+    """A fault of the device."""
 
     stuck: bool = False
-    """Requests are neither taken nor answered; frames go on."""
+    """Unresponsive: requests are neither counted nor answered; exposures go on."""
     error: str | None = None
-    """Enter the error mode for this cause, a name of the enumeration `device_error` that is an error."""
+    """Enter the error mode with this error, a name of the enumeration `device_error`."""
     reset: str | None = None
     """Restart now for this cause, a name of the enumeration `reset_cause`."""
 
 
 class WireFault(Strict):
-    """What goes wrong on a wire; see `WireFaultSettings`."""
+    """Faults of a wire; see `WireFaultSettings`."""
 
-    drop: Chance = 0.0
-    """Chance that an outgoing serial reply or CAN frame is lost."""
-    corrupt: Chance = 0.0
-    """Chance that one of its bits is flipped."""
-    junk: Chance = 0.0
-    """Chance that random bytes, or a CAN frame with a random identifier, go before it."""
+    drop: Probability = 0.0
+    """Probability that an outgoing serial reply or CAN frame is lost."""
+    corrupt: Probability = 0.0
+    """Probability that one of its bits is flipped."""
+    junk: Probability = 0.0
+    """Probability that random bytes, or a CAN frame with a random CAN ID, go before it."""
     delay_s: Seconds = 0.0
     """Time by which everything sent is delayed."""
     split: Annotated[int, Field(ge=0, le=4096)] = 0
@@ -70,64 +69,73 @@ class WireFault(Strict):
     """Pause between these pieces."""
 
     def settings(self) -> WireFaultSettings:
-        """Make the settings of a link."""
+        """Return the settings for a link."""
         return WireFaultSettings(**self.model_dump())
 
 
 class FaultRequest(Strict):
-    """One `fault` request; what is not given stays as it is."""
+    """One `fault` request; levels that are left out keep their faults."""
 
     optical: SkyValues | None = None
-    """What the sensor sees besides the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
+    """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
     """What goes wrong in the device."""
     serial: WireFault | None = None
     """What goes wrong on the serial line."""
     can: WireFault | None = None
-    """What the device sends on the CAN bus, CANopen's frames too."""
+    """Faults of outgoing CAN frames, those of CANopen too."""
 
 
 class Faults:
-    """What is wrong with a run at present."""
+    """The faults that are injected at present.
 
-    def __init__(self, emulation: Emulation) -> None:
-        self._emulation = emulation
+    Parameters
+    ----------
+    device
+        Device that the faults affect.
+    links
+        Its open links.
+    """
+
+    def __init__(self, device: Device, links: Iterable[Link]) -> None:
+        self._device = device
+        self._wires = [(link.bus, link.wire) for link in links]
         self._optical: dict[str, Any] = {}
 
     def inject(self, request: FaultRequest) -> None:
-        """Bring faults about; all of the request, or nothing of it.
+        """Inject the faults of a request, all or none.
 
         Raises
         ------
         EmulatorError
-            A name is not known, or a link is not there.
+            A name is unknown, or the run has no such link.
         """
         self.check(request)
-        device = self._emulation.device
+        device = self._device
         if request.optical is not None:
             self._optical = dict(request.optical)
             device.cycle.faults = lambda _index: self._optical
         faults = {"serial": request.serial, "can": request.can}
-        for name, wire in self._wires():
+        for name, wire in self._wires:
             fault = faults[name]
             if fault is not None:
                 wire.settings = fault.settings()
         if request.device is not None:
-            device.deaf = request.device.stuck
+            device.unresponsive = request.device.stuck
             if request.device.reset is not None:
                 device.reset(request.device.reset)
             if request.device.error is not None:
                 device.modes.fail(request.device.error)
 
     def check(self, request: FaultRequest) -> None:
-        """Check that this run can bring faults about.
+        """Check that the faults of a request can be injected.
 
         Raises
         ------
         EmulatorError
-            A name is not known, or a link is not there.
+            A name is unknown, or the run has no such link.
         """
-        enums = self._emulation.device.icd.enums
+        enums = self._device.icd.enums
         if request.device is not None:
             errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
             for key, name, known in (
@@ -136,37 +144,30 @@ class Faults:
             ):
                 if name is not None and name not in known:
                     raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
-        there = {name for name, _ in self._wires()}
+        there = {name for name, _ in self._wires}
         for name, fault in (("serial", request.serial), ("can", request.can)):
             if fault is not None and name not in there:
                 raise EmulatorError(
                     f"{name}: this run has no such link; start it with --{name}, or leave this out"
                 )
 
-    def _wires(self) -> Iterator[tuple[str, WireFaults[Any]]]:
-        """Each wire of the run under the name of its faults: both users of the CAN bus have the same."""
-        emulation = self._emulation
-        for name, link in (("serial", emulation.serial), ("can", emulation.can), ("can", emulation.canopen)):
-            if link is not None:
-                yield name, link.wire
-
     def clear(self) -> None:
-        """Set everything right; the error mode is left by telecommand."""
+        """Remove all faults; the error mode is left by telecommand only."""
         self._optical = {}
-        device = self._emulation.device
+        device = self._device
         device.cycle.faults = lambda _index: {}
-        device.deaf = False
-        for _, wire in self._wires():
+        device.unresponsive = False
+        for _, wire in self._wires:
             wire.settings = WireFaultSettings()
 
     def describe(self) -> dict[str, Any]:
-        """Return what is wrong, by level."""
+        """Return the present faults by level."""
         found: dict[str, Any] = {}
         if self._optical:
             found["optical"] = dict(self._optical)
-        if self._emulation.device.deaf:
+        if self._device.unresponsive:
             found["device"] = {"stuck": True}
-        for name, wire in self._wires():
+        for name, wire in self._wires:
             if not wire.settings.none:
                 found[name] = vars(wire.settings)
         return found

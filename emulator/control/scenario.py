@@ -1,6 +1,6 @@
-"""Scenario files: what happens to a run at which run time, so that a hard day can be repeated to the byte.
+"""Scenario files: faults and truth changes at given simulation times, repeatable to the byte.
 
-TOML, one `[[at]]` table an event, in any order::
+TOML, one `[[at]]` table per event, in any order::
 
     name = "glare"
 
@@ -12,37 +12,36 @@ TOML, one `[[at]]` table an event, in any order::
     run_time_s = 40.0
     clear_faults = true
 
-`fault` and `truth` take what the control channel's `fault` and `set_truth` take. Events happen in run time, so that
-they come at the same frames whatever the clock. Names, links and truth files are checked when the run starts. A live feed
-cannot be set by a scenario: it needs a socket, which takes time.
+`fault` and `truth` have the keys of the control channel's `fault` and `set_truth`. Events occur in
+simulation time, at the same exposures whatever the clock. Names, links and truth files are checked
+when the run starts. A scenario cannot set a live feed, as opening its socket takes time.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.control.faults import FaultRequest
-from starhil.emulator.device.scheduler import Action
+from starhil.emulator.control.faults import FaultRequest, Faults
+from starhil.emulator.device.scheduler import Action, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import configs_folder
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import LiveConfig, Strict, TruthConfig
+from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.validation_messages import explain
 from starid.errors import StaridError
-
-if TYPE_CHECKING:
-    from starhil.emulator.emulation import Emulation
 
 log = logging.getLogger("starhil.scenario")
 
 
 class ScenarioEvent(Strict):
-    """What happens at a run time."""
+    """What changes at a simulation time."""
 
     run_time_s: Annotated[float, Field(ge=0.0, le=1e9)]
     """When: seconds of simulation time since the start."""
@@ -61,24 +60,22 @@ class ScenarioEvent(Strict):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
-    def prepare(self, emulation: Emulation) -> Action:
-        """Make what is to be done at the run time; whatever it needs is read and checked before."""
+    def prepare(self, faults: Faults, set_truth: Callable[[TruthSource], None], folder: Path) -> Action:
+        """Return the action of the event; what it needs is read and checked now."""
         if self.fault is not None:
-            emulation.faults.check(self.fault)
-        folder = emulation.profile.folder
+            faults.check(self.fault)
         truth = None if self.truth is None else self.truth.build(self.run_time_s, folder)
 
-        def happen(_due_ns: int) -> None:
+        def act(_due_ns: int) -> None:
             if self.clear_faults:
-                emulation.faults.clear()
+                faults.clear()
             if self.fault is not None:
-                emulation.faults.inject(self.fault)
+                faults.inject(self.fault)
             if truth is not None:
-                emulation.device.cycle.truth = truth
-                emulation.close_feed()
+                set_truth(truth)
             log.info("scenario at %g s", self.run_time_s)
 
-        return happen
+        return act
 
 
 class Scenario(Strict):
@@ -89,29 +86,46 @@ class Scenario(Strict):
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
     """Events, in any order."""
 
-    def enter(self, emulation: Emulation) -> None:
-        """Enter all events into a run whose links are open; what they need is read and checked now.
+    def enter(
+        self,
+        scheduler: Scheduler,
+        faults: Faults,
+        set_truth: Callable[[TruthSource], None],
+        folder: Path,
+    ) -> None:
+        """Schedule all events; files that they need are read and checked now.
+
+        Parameters
+        ----------
+        scheduler
+            Scheduler of the device.
+        faults
+            Faults of the run, whose links are open.
+        set_truth
+            Called with a new truth source.
+        folder
+            Folder that relative paths of truth files start from.
 
         Raises
         ------
         EmulatorError
-            An event asks for what this run does not have, or names a file that cannot be read.
+            An event names a link that this run does not have, or a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             try:
-                action = event.prepare(emulation)
+                action = event.prepare(faults, set_truth, folder)
             except (EmulatorError, StaridError) as error:
                 raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
-            emulation.device.scheduler.at(round(event.run_time_s * NANOSECONDS), action)
+            scheduler.at(round(event.run_time_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:
-    """Read a scenario by its path, or by its name among those of the product.
+    """Read a scenario from a path, or by the name of one in `configs/scenarios`.
 
     Raises
     ------
     EmulatorError
-        One line: file, key and remedy.
+        The file is missing or invalid; one line with file, key and remedy.
     """
     path = Path(name_or_path).expanduser()
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):

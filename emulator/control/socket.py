@@ -1,4 +1,4 @@
-"""The Unix socket of a control channel: for its user alone, in the place of one that was left behind, gone at the end."""
+"""The Unix socket of a control channel: private to its user, and removed at the end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.symlink_lock import NameTakenError, claim_name
+from starhil.emulator.symlink_lock import NameTakenError, lock_name
 from starhil.protocol.errors import reason
 
 PRIVATE_FOLDER: Final = 0o700
@@ -24,7 +24,7 @@ class ControlSocket:
     Raises
     ------
     EmulatorError
-        The file cannot be made, is none of a socket, or somebody listens there.
+        The file cannot be created, is not a socket, or another program listens on it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,7 +32,7 @@ class ControlSocket:
             raise EmulatorError(f"--control unix:{path}: must be an absolute path without spaces")
         self.path = path
         try:
-            self._claim = claim_name("control", os.fsencode(path.parent.resolve() / path.name))
+            self._lock = lock_name("control", os.fsencode(path.parent.resolve() / path.name))
         except NameTakenError as error:
             raise EmulatorError(f"control channel unix:{path}: {error}; choose another path") from None
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -53,22 +53,22 @@ class ControlSocket:
             raise
 
     def _remove_stale(self) -> None:
-        """Remove the socket of an emulator that was killed."""
+        """Remove the socket that a killed emulator left behind."""
         try:
             mode = self.path.lstat().st_mode
         except FileNotFoundError:
             return
         if not stat.S_ISSOCK(mode):
-            raise EmulatorError(f"control channel unix:{self.path}: is no socket; choose another path")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-            asking.setblocking(False)  # noqa: FBT003 (the call of the library)
+            raise EmulatorError(f"control channel unix:{self.path}: is not a socket; choose another path")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.setblocking(False)  # noqa: FBT003 (the call of the library)
             try:
-                asking.connect(str(self.path))
+                probe.connect(str(self.path))
             except ConnectionRefusedError:
                 self.path.unlink()
                 return
             except BlockingIOError:
-                pass  # somebody listens, and is busy
+                pass  # another program listens, and is busy
         raise EmulatorError(
             f"control channel unix:{self.path}: in use by another program; choose another path"
         )
@@ -76,7 +76,7 @@ class ControlSocket:
     def close(self) -> None:
         """Stop listening and remove the file, if it is still this socket's."""
         self.socket.close()
-        self._claim.close()
+        self._lock.close()
         if self._file is not None:
             with contextlib.suppress(OSError):
                 if os.path.samestat(self.path.lstat(), self._file):
@@ -85,12 +85,12 @@ class ControlSocket:
 
 
 def automatic_path() -> Path:
-    """Return where this process listens by default, in a folder that is open to its user alone.
+    """Return the default socket path of this process, in a folder private to its user.
 
     Raises
     ------
     EmulatorError
-        The folder cannot be made, or is somebody else's.
+        The folder cannot be created, or belongs to another user.
     """
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
     if _is_own_folder(base):
@@ -100,7 +100,9 @@ def automatic_path() -> Path:
     try:
         folder.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
         if not _is_own_folder(folder):
-            raise EmulatorError(f"control channel: {folder} is somebody else's; give --control unix:/PATH")
+            raise EmulatorError(
+                f"control channel: {folder} belongs to another user; give --control unix:/PATH"
+            )
         folder.chmod(PRIVATE_FOLDER)
     except OSError as error:
         raise EmulatorError(

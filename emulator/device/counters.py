@@ -1,4 +1,4 @@
-"""What communication_status and acknowledge tell: what came in over the links, and what became of it."""
+"""Counters, error flags and the acknowledge of the last telecommand."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class Counters:
     telecommands: int = 0
     telemetry: int = 0
     flags: set[str] = field(default_factory=set)
-    """Names of the bits of communication_status that are set."""
+    """Names of the communication_status flags that are set."""
     faults: dict[FaultKind, int] = field(default_factory=dict)
-    """How often each kind of fault was seen, for the log and the control channel."""
+    """Number of faults of each kind, for the log and the control channel."""
 
-    def fault(self, fault: LinkFault) -> None:
-        """Count input that made no message."""
+    def count_fault(self, fault: LinkFault) -> None:
+        """Count input that was not a valid message."""
         self.faults[fault.kind] = self.faults.get(fault.kind, 0) + 1
         self.flags.add(_FLAG_OF_FAULT[fault.kind])
 
     def overrun(self) -> None:
-        """Note a telecommand that came before the last one was done."""
+        """Flag a telecommand that arrived before the last one was done."""
         self.flags.add("telecommand_overrun")
 
     def clear(self) -> None:
@@ -49,24 +49,17 @@ class Counters:
 
 @dataclass
 class Acknowledge:
-    """What became of the last telecommand."""
+    """Outcome of the last telecommand."""
 
     last_telecommand: int = 0
     processed: bool = True
     error: ErrorCode = ErrorCode.OK
     parameter_index: int = 0
     on_end: Callable[[ErrorCode], None] | None = None
-    """Sends the answer, of a telecommand that is answered only when it is done."""
-
-    def begin(self, identifier: int) -> None:
-        """Note that a telecommand came in."""
-        self.last_telecommand = identifier
-        self.processed = False
-        self.error = ErrorCode.OK
-        self.parameter_index = 0
+    """Called with the outcome of a telecommand that is answered only once it is done."""
 
     def end(self, error: ErrorCode = ErrorCode.OK, parameter_index: int = 0) -> None:
-        """Note that it is done, and how."""
+        """Record the outcome."""
         self.processed = True
         self.error = error
         self.parameter_index = parameter_index

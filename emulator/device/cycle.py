@@ -1,10 +1,11 @@
-"""The frame cycle: when the sensor exposes, what it asks of the pipeline, and when a result becomes known.
+"""The exposure cycle: when the sensor exposes, what it requests from the pipeline, and when a result is published.
 
-A frame begins on a grid of the update period, exposes, is read out, detected and identified; the times of these steps are
-those of the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On the other clocks a
-result that the machine has not ready in time is published when it comes, and flagged. Where the machine falls behind by
-`MAX_PENDING` frames, or at high rates by the modelled time of a frame's steps, exposures are left out: what the machine
-could not look at says nothing about the sky, so the last attitude stands until it is too old, and tracking goes on from it.
+Exposures start on a grid of the update period. Read-out, detection and identification take the times
+in the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On other
+clocks, a result that the machine delivers later is published when it arrives, and flagged as late.
+When the machine falls behind by `MAX_PENDING` requests, or at high rates by the modelled time of the
+steps, exposures are skipped: the last attitude stays valid until it is too old, and tracking goes on
+from it.
 """
 
 from __future__ import annotations
@@ -39,37 +40,37 @@ from starid.attitude import Attitude, propagate
 log = logging.getLogger("starhil.device")
 
 MAX_PENDING: Final = 2
-"""Requests in the pipeline at which the next exposure is left out; more, where more fit into the time modelled for them."""
+"""Pending requests at which the next exposure is skipped; more if more fit into the modelled time."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A frame as published.
+    """The published result of an exposure.
 
     Attributes
     ----------
     counter
-        Frames published since start-up, this one included.
+        Number of published measurements since start-up, this one included.
     mid_ns
-        Run time of the middle of the exposure, nanoseconds.
+        Simulation time of mid-exposure, nanoseconds.
     mid_unix_ns
-        The same on the device's clock as it stood when the frame was published.
+        Unix time of mid-exposure on the device's clock at publication, nanoseconds.
     published_ns
-        Run time at which it was published, nanoseconds.
+        Simulation time of publication, nanoseconds.
     mode
-        Mode of the device when the frame was exposed.
+        Mode of the device at the exposure.
     truth
-        What the sensor looked at in the middle of the exposure.
+        True attitude and rate at mid-exposure.
     result
-        What the pipeline made of it.
+        Result of the pipeline.
     valid, reason
-        As the device reports it, after its own checks.
+        Validity after the checks of the device, and the reason if not valid.
     rate_rad_s, rate_valid
-        Body rate estimated from the stars, sensor frame, radians a second.
+        Estimated body rate in the sensor frame, rad/s, and its validity.
     capture_s, detect_s, identify_s
-        Modelled times of the steps.
+        Modelled times of the steps, seconds.
     late
-        The machine took longer than the model.
+        The machine took longer than the modelled time.
     """
 
     counter: int
@@ -91,13 +92,13 @@ class Measurement:
 
     @property
     def latency_s(self) -> float:
-        """From the middle of the exposure to the result being known, seconds of run time."""
+        """Time from mid-exposure to publication, seconds of simulation time."""
         return (self.published_ns - self.mid_ns) / NANOSECONDS
 
 
 @dataclass
 class _Frame:
-    """A frame on its way."""
+    """An exposure that is not published yet."""
 
     index: int
     start_ns: int
@@ -109,20 +110,20 @@ class _Frame:
     tracking: bool
     result: FrameResult | None = None
     waiting_since_ns: int | None = None
-    """When a result without stars would have been known, if none had come by then."""
+    """Modelled time of a result without stars, if the result is not there by then; else None."""
     late: bool = False
-    """The machine took longer than the model."""
+    """The machine took longer than the modelled time."""
     finished_ns: int | None = None
-    """When its result became known."""
+    """Time at which its result is complete; None before."""
 
 
 class FrameCycle:
-    """Exposes frame after frame while it runs.
+    """Makes one exposure after another while it runs.
 
     Parameters
     ----------
     publish
-        Called with each measurement in its turn.
+        Called with each measurement, in the order of the exposures.
     """
 
     def __init__(
@@ -149,31 +150,31 @@ class FrameCycle:
         self._in_flight: deque[_Frame] = deque()
         self._grid_ns = 0
         self._failure = ""
-        """What the pipeline said of the last frame if it could not do it."""
+        """Error text of the last request if the pipeline failed, so that it is logged once."""
         self.truth: TruthSource = FixedTruth(Attitude.identity())
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
         self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
         self.after_exposure: Callable[[], None] | None = None
-        """Called once when the next frame has gone to the pipeline."""
+        """Called once, when the next exposure has been sent to the pipeline."""
         self.index = 0
-        """Number of the next frame of the run; never goes back, so that no two frames share their noise."""
+        """Index of the next exposure; never reset, so that no two exposures share their noise."""
         self.published = 0
-        self.left_out = 0
-        """Exposures since start-up for which the machine had no time."""
+        self.skipped = 0
+        """Exposures skipped since start-up because the machine fell behind."""
 
     @property
     def running(self) -> bool:
-        """Whether frames are being exposed."""
+        """Whether the sensor is exposing."""
         return self._next is not None
 
     def start(self) -> None:
-        """Begin to expose, now."""
+        """Start to expose now."""
         if not self.running:
             self._grid_ns = self._now_ns()
-            self._next = self._scheduler.at(self._grid_ns, self._begin)
+            self._next = self._scheduler.at(self._grid_ns, self._start_exposure)
 
     def stop(self) -> None:
-        """Stop; frames on their way are dropped."""
+        """Stop; exposures not yet published are dropped."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
@@ -181,20 +182,20 @@ class FrameCycle:
         self._in_flight.clear()
 
     def reset(self) -> None:
-        """Stop and forget all attitudes, as a restart of the device does."""
+        """Stop and discard all attitudes, as the device restarts."""
         self.stop()
         self._rates.clear()
-        self.published = self.left_out = 0
+        self.published = self.skipped = 0
 
     def retime(self) -> None:
-        """Take a new update rate into use at once."""
+        """Apply a new update rate at once."""
         if self._next is not None:
             self._next.cancel()
             start_ns = max(self._now_ns(), min(self._next.due_ns, self._grid_ns + self._period_ns()))
-            self._next = self._scheduler.at(start_ns, self._begin)
+            self._next = self._scheduler.at(start_ns, self._start_exposure)
 
     def has_fix(self, within_s: float) -> bool:
-        """Whether there is an attitude to track from that is not older than `within_s`."""
+        """Return whether there is an attitude not older than `within_s`."""
         last = self._rates.last
         return last is not None and self._now_ns() - last[0] <= within_s * NANOSECONDS
 
@@ -202,7 +203,7 @@ class FrameCycle:
         return float(self._parameters["exposure"]) / 1000.0
 
     def _period_ns(self) -> int:
-        """Time from exposure to exposure; a rate rounded to single precision does not make exposures overlap."""
+        """Return the time between exposures; a rate rounded to single precision does not make them overlap."""
         period_s = 1.0 / float(self._parameters["update_rate"])
         return round(max(period_s, exposure_period_s(self._parameters)) * NANOSECONDS)
 
@@ -210,21 +211,21 @@ class FrameCycle:
         return self._timing.identify_tracking_s if tracking else self._timing.identify_lost_s
 
     def _processing_ns(self, *, tracking: bool) -> int:
-        """Modelled time from the end of an exposure to a result without stars."""
+        """Return the modelled time from the end of an exposure to a result without stars."""
         timing = self._timing
         seconds = timing.readout_s + timing.detect_s + self._identify_s(tracking=tracking)
         return round(seconds * NANOSECONDS)
 
-    def _begin(self, due_ns: int) -> None:
-        """Open the shutter, and plan the next opening on the grid."""
+    def _start_exposure(self, due_ns: int) -> None:
+        """Start an exposure, and schedule the next one on the grid."""
         self._grid_ns = due_ns
         period_ns = self._period_ns()
         now_ns = self._now_ns()
         missed = max(0, (now_ns - due_ns) // period_ns)
-        self.left_out += missed
-        self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._begin)
+        self.skipped += missed
+        self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._start_exposure)
         if self._imager.pending >= max(MAX_PENDING, self._processing_ns(tracking=True) / period_ns):
-            self.left_out += 1
+            self.skipped += 1
             return
         exposure_s = self._exposure_s()
         start_ns = due_ns + int(self._parameters["delay_time"]) * 1_000_000
@@ -234,14 +235,14 @@ class FrameCycle:
 
         def close(close_ns: int) -> None:
             if generation == self._generation:
-                self._end(close_ns, start_ns, mid_ns, mode, exposure_s, period_ns / NANOSECONDS)
+                self._end_exposure(close_ns, start_ns, mid_ns, mode, exposure_s, period_ns / NANOSECONDS)
 
         self._scheduler.at(end_ns, close)
 
-    def _end(
+    def _end_exposure(
         self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
     ) -> None:
-        """Close the shutter: what was seen goes to the pipeline."""
+        """End an exposure and request its result from the pipeline."""
         truth = self.truth.state(mid_ns / NANOSECONDS)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
@@ -252,11 +253,11 @@ class FrameCycle:
 
         def arrived(answer: Answer) -> None:
             if generation == self._generation:
-                self._arrived(frame, answer)
+                self._result_arrived(frame, answer)
 
         def ready(due_ns: int) -> None:
             if generation == self._generation:
-                self._ready(frame, due_ns)
+                self._schedule_publication(frame, due_ns)
 
         self._imager.submit(request, arrived)
         self._scheduler.at(ready_ns, ready)
@@ -267,7 +268,7 @@ class FrameCycle:
     def request(
         self, truth: TruthState, exposure_s: float, predicted: Attitude | None, *, solve: bool = True
     ) -> FrameRequest:
-        """Make the request for the next frame of the run."""
+        """Return the pipeline request for the next exposure."""
         index = self.index
         self.index += 1
         parameters = self._parameters
@@ -287,7 +288,7 @@ class FrameCycle:
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:
-        """Where the sensor is expected to look; None until a rate is known, which takes two fixes."""
+        """Return the predicted attitude; None until a rate is known, which takes two attitudes."""
         last = self._rates.last
         rate = self._rates.rate(self._rate_window)
         if last is None or rate is None:
@@ -296,20 +297,20 @@ class FrameCycle:
             return last[1]
         return propagate(last[1], np.array(rate), (mid_ns - last[0]) / NANOSECONDS)
 
-    def _arrived(self, frame: _Frame, answer: Answer) -> None:
+    def _result_arrived(self, frame: _Frame, answer: Answer) -> None:
         if isinstance(answer, FrameResult):
             frame.result, self._failure = answer, ""
         else:
             text = answer.text if isinstance(answer, Failure) else "unexpected answer"
-            if text != self._failure:  # once, not with every frame
+            if text != self._failure:  # once, not for every exposure
                 log.warning("frame %d: %s", frame.index, text)
             self._failure = text
             frame.result = FrameResult(frame.index, reason="processing_error")
         if frame.waiting_since_ns is not None:
-            self._ready(frame, frame.waiting_since_ns)
+            self._schedule_publication(frame, frame.waiting_since_ns)
 
-    def _ready(self, frame: _Frame, due_ns: int) -> None:
-        """Publish when the modelled detection of all stars is done, or as soon as the result comes after that."""
+    def _schedule_publication(self, frame: _Frame, due_ns: int) -> None:
+        """Publish at the modelled end of detection, or as soon as a late result arrives."""
         if frame.result is None:
             frame.waiting_since_ns = due_ns
             return
@@ -320,17 +321,17 @@ class FrameCycle:
 
             def finish(finish_ns: int) -> None:
                 if generation == self._generation:
-                    self._finish(frame, finish_ns)
+                    self._publish_in_order(frame, finish_ns)
 
             self._scheduler.at(known_ns, finish)
             return
         if frame.waiting_since_ns is not None:
             frame.late = True
             known_ns = now_ns
-        self._finish(frame, known_ns)
+        self._publish_in_order(frame, known_ns)
 
-    def _finish(self, frame: _Frame, known_ns: int) -> None:
-        """Publish a frame, after those that were exposed before it."""
+    def _publish_in_order(self, frame: _Frame, known_ns: int) -> None:
+        """Publish a result, after those of all earlier exposures."""
         frame.finished_ns = known_ns
         while self._in_flight and self._in_flight[0].finished_ns is not None:
             first = self._in_flight.popleft()
@@ -341,7 +342,7 @@ class FrameCycle:
         timing = self._timing
         detect_s = timing.detect_s + timing.detect_per_star_s * result.detected
         identify_s = self._identify_s(tracking=frame.tracking)
-        valid, reason, rate = self._judge(frame, result, detect_s + identify_s)
+        valid, reason, rate = self._assess(frame, result, detect_s + identify_s)
         self.published += 1
         self._publish(
             Measurement(
@@ -364,10 +365,10 @@ class FrameCycle:
             )
         )
 
-    def _judge(
+    def _assess(
         self, frame: _Frame, result: FrameResult, processing_s: float
     ) -> tuple[bool, str, Triple | None]:
-        """Return whether the device stands by a result, why not, and the rate."""
+        """Return the validity of a result after the checks of the device, the reason, and the rate."""
         if not result.valid:
             return False, result.reason, None
         self._rates.add(frame.mid_ns, Attitude(np.array(result.quaternion_xyzw)), frame.period_s)
@@ -383,6 +384,6 @@ _SETTINGS: Final = tuple(SolverSettings.__dataclass_fields__)
 
 
 def as_quaternion(attitude: Attitude) -> Quaternion:
-    """Return the quaternion of an attitude as plain numbers."""
+    """Return the quaternion of an attitude as Python floats, scalar last."""
     x, y, z, w = attitude.quaternion_xyzw.tolist()
     return (x, y, z, w)

@@ -1,4 +1,4 @@
-"""The device: modes, parameters, time and frames, and the one door through which requests from any link come in."""
+"""The device: its modes, parameters, time and frames, without the requests that reach it over links."""
 
 from __future__ import annotations
 
@@ -13,53 +13,49 @@ from starhil.emulator.device.file_download import FileDownload
 from starhil.emulator.device.images import ImageStore
 from starhil.emulator.device.modes import Mode, Modes, Transition
 from starhil.emulator.device.parameters import Parameters, ParameterValue
-from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.state_store import StateStore
-from starhil.emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
-from starhil.emulator.device.telemetry import TELEMETRY
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.guard import call_guarded, one_line
+from starhil.emulator.guard import call_guarded, log_internal_error, one_line
 from starhil.emulator.pipeline.frames import FrameRequest
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.values import MessageError, Value
+from starhil.protocol.values import Value
 
 log = logging.getLogger("starhil.device")
 
 Background: TypeAlias = Callable[[Callable[[], None], Callable[[EmulatorError | None], None]], None]
-"""Does slow work (the first argument) somewhere and then calls back with what it raised, or None."""
+"""Runs slow work (the first argument), then calls the second one with the error, or None."""
 
 PREDICTION_LIMIT_S: Final = 30.0
-"""Age of an attitude up to which tracking can be commanded from it, seconds."""
+"""Maximum age of an attitude from which tracking can be commanded, seconds."""
 
 STALE_PERIODS: Final = 3
-"""Update periods without a publication after which the last attitude no longer counts as valid."""
+"""Update periods without a new measurement after which the last attitude is no longer valid."""
 
 PROCESSING_ALLOWANCE_S: Final = 2.0
 
 PIPELINE_ENDED: Final = "pipeline_ended"
-"""Error of a device whose picture pipeline has ended and is not started again, a name of the enumeration `device_error`."""
+"""Name in `device_error` of the error when the pipeline has ended and is not restarted."""
 
 
 def outcome(work: Callable[[], None]) -> EmulatorError | None:
-    """Do some work and return what went wrong, whatever it was, or None."""
+    """Do some work and return its error, whatever it was, or None."""
     try:
         work()
     except EmulatorError as error:
         return error
-    except Exception as error:  # noqa: BLE001 (whoever waits for the work has to hear of its end)
-        log.error("background: internal error: %s", one_line(error))  # noqa: TRY400 (one line)
+    except Exception as error:  # noqa: BLE001 (the caller must learn of any error)
+        log_internal_error("background", error)
         return EmulatorError(f"internal error: {one_line(error)}")
     return None
 
 
-def do_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
-    """Background that is none: for the stepped clock, where nothing may depend on how fast a disk is."""
+def run_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
+    """Run the work in the foreground: on the stepped clock nothing may depend on the speed of a disk."""
     done(outcome(work))
 
 
@@ -69,24 +65,24 @@ class Device:
     Parameters
     ----------
     profile
-        What it is.
+        Profile of the unit.
     icd
-        Rows that it serves; each has a handler by its name.
+        Interface definition.
     clock
-        Run time.
+        Clock of the simulation time.
     imager
-        Where frames are made and solved.
+        Renders and solves the images.
     store
-        What survives a restart.
+        Keeps the state that survives a restart.
     truth
-        Where it looks.
+        Source of the true attitude.
     background
-        Where slow writes are done.
+        Runs slow writes.
 
     Raises
     ------
     EmulatorError
-        The profile's parameters are not allowed, or the definition has a row without a handler.
+        A parameter in the profile is unknown or out of its limits.
     """
 
     def __init__(
@@ -97,7 +93,7 @@ class Device:
         imager: Imager,
         store: StateStore,
         truth: TruthSource,
-        background: Background = do_at_once,
+        background: Background = run_at_once,
     ) -> None:
         self.profile = profile
         self.icd = icd
@@ -118,7 +114,7 @@ class Device:
             self.parameters,
             profile.timing,
             self.time,
-            self._published,
+            self._frame_published,
             profile.device.rate_window,
         )
         self.cycle.truth = truth
@@ -128,7 +124,7 @@ class Device:
             imager,
             self.cycle,
             clock.now_ns,
-            self._single_frame,
+            self._request_single_frame,
             lambda: float(self.parameters["exposure"]) / 1000.0,
         )
         self.files = FileDownload(self.images)
@@ -140,39 +136,33 @@ class Device:
         self.frames_valid = 0
         self.started_ns = clock.now_ns()
         self.warm = False
-        """The pipeline has told that it is ready."""
-        self.outlets: list[Callable[[Reply], None]] = []
-        """Links that take what the device sends by itself."""
+        """Whether the pipeline is ready."""
         self.on_frame: list[Callable[[Measurement], None]] = []
         self.on_mode: list[Callable[[Transition], None]] = []
+        self.on_start: list[Callable[[], None]] = []
+        """Called at power-on and at each reset, when parameters and time are set for the new start."""
         self.on_reset: list[Callable[[], None]] = []
-        self.deaf = False
-        """A fault: requests are neither taken nor answered."""
+        self.unresponsive = False
+        """A fault: requests are neither counted nor answered."""
         self._background = background
-        self._boot_over: Event | None = None
-        self._unsolicited: Event | None = None
+        self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
         self.parameters.observe(self._parameters_changed)
-        missing = missing_handlers(icd)
-        if missing:
-            raise EmulatorError(
-                f"interface definition {icd.name}: the device has no handler for {missing[0]}"
-            )
 
     # --- power, boot and reset ---
 
     def power_on(self) -> None:
-        """Start: load what is stored, count the start, boot."""
+        """Load the stored state, count the start and boot."""
         self._start("power_on", self.store.load())
 
-    def start_refused(self) -> None:
-        """Take back the count of a start that came to nothing, as a port or a file could not be had."""
+    def withdraw_start(self) -> None:
+        """Do not count the last start: it failed because a port or file is not available."""
         self.boot_count = (self.boot_count - 1) & 0xFFFF
         self._persist(lambda error: log.error("%s", error) if error else None)
 
     def reset(self, cause: str) -> None:
-        """Restart, for a cause by its name in the interface definition."""
-        self._start(cause, self._content())
+        """Restart, for a cause named in the enumeration `reset_cause`."""
+        self._start(cause, self._persistent_state())
         for observer in self.on_reset:
             call_guarded("reset", observer)
 
@@ -194,35 +184,36 @@ class Device:
         self.modes.reset()
         self.mode_changes = self.frames_valid = 0
         for name in self.parameters.restore(self._stored_parameters):
-            log.warning("stored parameter %s: unknown or out of its limits; its default is used", name)
-        self._plan_unsolicited()
+            log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
+        for observer in self.on_start:
+            call_guarded("start", observer)
         self._persist(lambda error: log.error("%s", error) if error else None)
         if self.store.corrupt:
-            log.warning("the stored state was not whole: it is set aside, defaults are used")
-        if self._boot_over is not None:
-            self._boot_over.cancel()
+            log.warning("the stored state is corrupt and was set aside; using the defaults")
+        if self._boot_end is not None:
+            self._boot_end.cancel()
         boot_ns = round(self.profile.device.boot_s * NANOSECONDS)
-        self._boot_over = self.scheduler.at(self.started_ns + boot_ns, self._boot_ends)
+        self._boot_end = self.scheduler.at(self.started_ns + boot_ns, self._boot_time_over)
 
     def pipeline_ready(self, camera_constants: dict[str, Value]) -> None:
-        """Take note that frames can be made; the camera's constants become defaults where the profile gives none."""
+        """Note that the pipeline is ready; camera constants become defaults unless the profile sets them."""
         self.warm = True
-        own = self.profile.parameters  # a device may hold another idea of its camera than what the camera is
-        self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in own})
-        if self._boot_over is None and self.modes.mode is Mode.BOOT:
+        configured = self.profile.parameters  # a device may be miscalibrated on purpose
+        self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in configured})
+        if self._boot_end is None and self.modes.mode is Mode.BOOT:
             self._end_boot()
 
     def pipeline_lost(self) -> None:
-        """Take note that the pipeline has ended: the error mode, until it is back and a mode is commanded."""
+        """Enter the error mode, as the pipeline has ended; a mode can be commanded once it is ready again."""
         self.warm = False
         self.modes.fail("processing")
 
     def pipeline_given_up(self) -> None:
-        """Take note that the pipeline does not come back by itself: the error mode, until a reset."""
+        """Enter the error mode until a reset, as the pipeline is not restarted again."""
         self.modes.fail(PIPELINE_ENDED)
 
-    def _boot_ends(self, _due_ns: int) -> None:
-        self._boot_over = None
+    def _boot_time_over(self, _due_ns: int) -> None:
+        self._boot_end = None
         if self.warm:
             self._end_boot()
 
@@ -231,14 +222,14 @@ class Device:
         if self.parameters["start_mode"] == "lost_in_space" and self.modes.mode is Mode.STANDBY:
             self.modes.command(Mode.LOST_IN_SPACE, has_attitude=False)
 
-    # --- state that survives ---
+    # --- persistent state ---
 
     def save_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
-        """Store all parameters; `done` is called when they are on the disk, or with what went wrong."""
+        """Store all parameters; `done` is called with None when they are on disk, or with the error."""
         self._store_parameters(dict(self.parameters), done)
 
     def forget_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
-        """Store none: present values stay, and the defaults hold from the next restart on."""
+        """Delete the stored parameters: present values stay until the next restart, then defaults apply."""
         self._store_parameters({}, done)
 
     def _store_parameters(
@@ -252,29 +243,29 @@ class Device:
                 self.parameters.mark_stored(content)
             else:
                 log.error("%s", error)
-                if self._stored_parameters is stored:  # neither another save nor a restart has followed
+                if self._stored_parameters is stored:  # no other save or restart has followed
                     self._stored_parameters = before
             done(error)
 
         self._persist(finish)
 
     def restore_parameters(self) -> None:
-        """Set all parameters to what is stored, or to their defaults where nothing is."""
+        """Set all parameters to their stored values, or to their defaults where none is stored."""
         self.parameters.restore(self._stored_parameters)
 
     def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
-        content = self._content()
+        content = self._persistent_state()
         self._background(lambda: self.store.save(content), done)
 
-    def _content(self) -> dict[str, object]:
-        """What the store holds when all that is being saved has been: what a restart begins with."""
+    def _persistent_state(self) -> dict[str, object]:
+        """Return the state that survives a restart, with writes still in progress included."""
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---
 
     @property
     def fresh(self) -> Measurement | None:
-        """The last measurement if the device is at work and it is not out of date, else None."""
+        """The last measurement, or None if it is out of date or the mode makes no images."""
         last = self.latest
         if last is None or not self.modes.mode.makes_frames:
             return None
@@ -282,12 +273,12 @@ class Device:
         age_ns = self.clock.now_ns() - last.published_ns
         return last if age_ns <= limit_s * NANOSECONDS else None
 
-    def _single_frame(self, mid_ns: int) -> FrameRequest:
+    def _request_single_frame(self, mid_ns: int) -> FrameRequest:
         truth = self.cycle.truth.state(mid_ns / NANOSECONDS)
         exposure_s = float(self.parameters["exposure"]) / 1000.0
         return self.cycle.request(truth, exposure_s, None, solve=False)
 
-    def _published(self, measurement: Measurement) -> None:
+    def _frame_published(self, measurement: Measurement) -> None:
         self.latest = measurement
         self.frames_valid += measurement.valid
         self.modes.solved(
@@ -311,7 +302,7 @@ class Device:
             call_guarded("mode", observer, transition)
 
     def command_mode(self, wanted: Mode) -> bool:
-        """Command a mode; False if it is refused."""
+        """Command a mode; return False if it is refused."""
         if self.modes.mode is Mode.ERROR and not self.warm:
             return False
         return self.modes.command(wanted, has_attitude=self.cycle.has_fix(PREDICTION_LIMIT_S))
@@ -321,155 +312,15 @@ class Device:
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if names & {"update_rate", "exposure", "delay_time"}:
             self.cycle.retime()
-        if names & {"unsolicited_rate", "unsolicited_selection"}:
-            self._plan_unsolicited()
-
-    def _plan_unsolicited(self) -> None:
-        if self._unsolicited is not None:
-            self._unsolicited.cancel()
-            self._unsolicited = None
-        rate = float(self.parameters["unsolicited_rate"])
-        if rate > 0.0:
-            self._unsolicited = self.scheduler.at(self.clock.now_ns(), self._send_unsolicited)
-
-    def _send_unsolicited(self, due_ns: int) -> None:
-        period_ns = max(1, round(NANOSECONDS / float(self.parameters["unsolicited_rate"])))
-        missed = max(0, (self.clock.now_ns() - due_ns) // period_ns)
-        self._unsolicited = self.scheduler.at(due_ns + (missed + 1) * period_ns, self._send_unsolicited)
-        row = self.icd.telemetry_by_id.get(int(self.parameters["unsolicited_selection"]))
-        if row is None or self.deaf:
-            return
-        try:
-            data = self.telemetry(row.name)
-        except Refused:  # an image is being opened: nothing to tell this time
-            return
-        destination = int(self.parameters["host_address"])
-        reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=destination)
-        for outlet in self.outlets:
-            call_guarded("unsolicited telemetry", outlet, reply)
-
-    # --- requests ---
-
-    def handle(self, request: Request, later: Callable[[Reply], None] | None = None) -> list[Reply] | None:
-        """Take a request from a link; return what goes back over the same link, in order.
-
-        Parameters
-        ----------
-        request
-            What arrived.
-        later
-            Takes the answer to a telecommand that is answered only when it is done; None is returned then.
-        """
-        if self.deaf:
-            return []
-        if request.kind is RequestKind.TELEMETRY:
-            self.counters.telemetry = (self.counters.telemetry + 1) & 0xFFFF
-            return [self._answer_telemetry(request)]
-        self.counters.telecommands = (self.counters.telecommands + 1) & 0xFFFF
-        code, replies = self._execute(request)
-        if code is None:
-            if later is not None:
-                self.acknowledge.on_end = lambda code: later(_answer(request, code))
-            return None
-        return [_answer(request, code), *replies]
-
-    def fault(self, fault: LinkFault) -> None:
-        """Count input on a link that made no request."""
-        if not self.deaf:
-            log.debug("%s: %s", fault.kind.value, fault.detail)
-            self.counters.fault(fault)
-
-    def telemetry(self, name: str) -> bytes:
-        """Return the data of a telemetry row."""
-        return self.icd.telemetry[name].encode(TELEMETRY[name](self), saturate=True)
-
-    def telemetry_values(self, name: str) -> dict[str, Value]:
-        """Return a telemetry row in physical units, as it stands before encoding."""
-        return TELEMETRY[name](self)
-
-    def telecommand(self, name: str, values: dict[str, Value]) -> tuple[ErrorCode, int]:
-        """Do a telecommand whose values are checked; return its error code so far and the field it is about."""
-        code, index, _ = self._do(name, values, 0)
-        return code or ErrorCode.OK, index
-
-    def _answer_telemetry(self, request: Request) -> Reply:
-        row = self.icd.telemetry_by_id.get(request.id)
-        code = ErrorCode.OK
-        if row is None:
-            code = ErrorCode.INVALID_ID
-        elif request.data:
-            code = ErrorCode.INVALID_LENGTH
-        if row is None or code is not ErrorCode.OK:
-            return Reply(ReplyKind.NACK, request.id, code=code, destination=request.source)
-        try:
-            data = self.telemetry(row.name)
-        except Refused as refused:
-            return Reply(ReplyKind.NACK, request.id, code=refused.code, destination=request.source)
-        return Reply(ReplyKind.TELEMETRY, request.id, data, destination=request.source)
-
-    def _execute(self, request: Request) -> tuple[ErrorCode | None, list[Reply]]:
-        row = self.icd.telecommands_by_id.get(request.id)
-        if row is None:
-            self._note(request.id, ErrorCode.INVALID_ID, 0)
-            return ErrorCode.INVALID_ID, []
-        try:
-            values = row.decode(request.data)
-        except MessageError as error:
-            self._note(request.id, error.code, error.index)
-            return error.code, []
-        code, _, replies = self._do(row.name, values, request.source)
-        return code, replies
-
-    def _do(
-        self, name: str, values: dict[str, Value], source: int
-    ) -> tuple[ErrorCode | None, int, list[Reply]]:
-        """Do a decoded telecommand, and note in the acknowledge what became of it; no code where that is still open."""
-        if not self.acknowledge.processed:
-            self.counters.overrun()
-        acknowledge = Acknowledge(self.icd.telecommands[name].id, processed=False)
-        self.acknowledge = acknowledge
-        try:
-            replies = TELECOMMANDS[name](self, values, acknowledge)
-        except Refused as refused:
-            acknowledge.end(refused.code, refused.index)
-            return refused.code, refused.index, []
-        except MessageError as error:
-            acknowledge.end(error.code, error.index)
-            return error.code, error.index, []
-        if replies is None:  # the handler ends the acknowledge
-            if name not in ANSWERED_WHEN_DONE:
-                return ErrorCode.OK, 0, []
-            return acknowledge.error if acknowledge.processed else None, 0, []
-        acknowledge.end()
-        return (
-            ErrorCode.OK,
-            0,
-            [Reply(reply.kind, reply.id, reply.data, reply.code, destination=source) for reply in replies],
-        )
-
-    def _note(self, identifier: int, code: ErrorCode, index: int) -> None:
-        if not self.acknowledge.processed:
-            self.counters.overrun()
-        self.acknowledge = Acknowledge(identifier, processed=True, error=code, parameter_index=index)
-
-
-def _answer(request: Request, code: ErrorCode) -> Reply:
-    kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-    return Reply(kind, request.id, code=code, destination=request.source)
-
-
-def missing_handlers(icd: InterfaceDefinition) -> list[str]:
-    """Names of the rows of a definition that the device has no handler for."""
-    return sorted((set(icd.telemetry) - set(TELEMETRY)) | (set(icd.telecommands) - set(TELECOMMANDS)))
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
-    """Defaults of the parameters in a profile: its own table, and what its links section says.
+    """Return the parameter defaults of a profile: its `[parameters]` and the settings of its `[links]`.
 
     Raises
     ------
     EmulatorError
-        The table names a parameter that there is none of.
+        The table names an unknown parameter.
     """
     links = profile.links
     of_links: dict[str, Value] = {

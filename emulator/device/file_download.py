@@ -1,36 +1,31 @@
-"""Download of files in blocks: loading, bursts of numbered packets, and the hole map of what has arrived.
+"""Download of files in blocks: loading, bursts of numbered packets, and the hole map of received packets.
 
-Files are the stored image as `bmp` and an `index`: one entry of 12 bytes a file, `<type u8, counter u8, edge u16, size u32,
-frame u32>`. The layout of the index is ours.
+Files are the stored image as `bmp` and an `index` with 12 bytes per file: `<type u8, counter u8,
+edge u16, size u32, frame u32>`. The layout of the index is not published; it is our own definition.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from starhil.emulator.device.images import ImageStore
 from starhil.protocol.image_transfer import HoleMap, block_checksum, burst_packet, packet_count
 from starhil.protocol.messages import BURST_ID, Reply, ReplyKind
-from starhil.protocol.values import Value
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
 
 BMP_TYPE: Final = 4
 INDEX_ENTRY: Final = struct.Struct("<BBHII")
 
 
 class FileDownload:
-    """The block that is loaded, and which of its packets have arrived."""
+    """The loaded block, and which of its packets have arrived."""
 
     def __init__(self, images: ImageStore) -> None:
         self._images = images
         self.clear()
 
     def clear(self) -> None:
-        """Forget the block and the hole map."""
+        """Discard the block and the hole map."""
         self.data = b""
         self.ready = False
         self.parameter_error = False
@@ -38,11 +33,11 @@ class FileDownload:
 
     @property
     def checksum(self) -> int:
-        """Checksum of the block; 0 where none is loaded."""
+        """Checksum of the block; 0 if none is loaded."""
         return block_checksum(self.data) if self.ready else 0
 
     def load(self, file_type: str, counter: int, offset: int, length: int) -> bool:
-        """Load a block of a file; False, with an empty block, if there is no such file or range."""
+        """Load a block of a file; return False, with an empty block, if the file or range does not exist."""
         file = self._file(file_type, counter)
         self.clear()
         self.ready = file is not None and length > 0 and offset + length <= len(file)
@@ -63,16 +58,7 @@ class FileDownload:
         return None
 
     def burst(self, *, ignore_hole_map: bool) -> list[Reply]:
-        """Return the packets of the block, by default only those that the hole map lacks."""
+        """Return the packets of the block, by default only those missing in the hole map."""
         count = packet_count(len(self.data))
         numbers = range(count) if ignore_hole_map else self.arrived.missing(count)
         return [Reply(ReplyKind.BURST, BURST_ID, burst_packet(self.data, number)) for number in numbers]
-
-
-def hole_map_values(part: int) -> Callable[[Device], dict[str, Value]]:
-    """Telemetry of one part of the hole map."""
-
-    def hole_map(device: Device) -> dict[str, Value]:
-        return {"map": device.files.arrived.part(part)}
-
-    return hole_map

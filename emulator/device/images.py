@@ -1,7 +1,6 @@
-"""Images that the device keeps for download: capture, storage, and the frame and file that are being sent.
+"""Images for download: capture, storage, and the image that is being sent.
 
-An image is stored whole or not at all: the one before it stays until the new one is complete, and a download holds the image
-with which it began.
+A stored image stays until the next one is complete, and a download keeps the image that it opened.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from starhil.emulator.pipeline.imager import Answer, Imager
 from starhil.protocol.image_transfer import FRAME_SIZE
 
 STORE_S: Final = 0.1
-"""Time that the device takes to store an image, seconds."""
+"""Modelled time to store an image, seconds."""
 
 PALETTE: Final = b"".join(bytes((n, n, n, 0)) for n in range(256))
 BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
@@ -30,16 +29,16 @@ BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A square 8-bit image: its edge in pixels, its rows from the top, and the frame that it shows."""
+    """A square 8-bit image: edge in pixels, pixels row by row from the top, index of its exposure."""
 
     edge: int
     pixels: bytes
     frame: int
     number: int
-    """Number of the image since start-up, modulo 256: the file's counter."""
+    """Number of the image since start-up, modulo 256; the counter of its file."""
 
     def binned(self, edge: int) -> StoredImage:
-        """Return the image made smaller by averaging squares of pixels."""
+        """Return the image reduced to `edge` by averaging squares of pixels."""
         if edge == self.edge:
             return self
         image = np.frombuffer(self.pixels, dtype=np.uint8).reshape(self.edge, self.edge)
@@ -72,12 +71,12 @@ class StoredImage:
 
 
 class ImageStore:
-    """What is being captured, what is stored and what is being downloaded.
+    """Captures images, stores one and serves one for download.
 
     Parameters
     ----------
     single_frame
-        Makes the request for one frame that is not solved, at a run time of mid-exposure.
+        Returns the request for one unsolved exposure, for a simulation time of mid-exposure.
     """
 
     def __init__(
@@ -99,7 +98,7 @@ class ImageStore:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all, as a restart of the device does."""
+        """Discard everything, as the device restarts."""
         self._generation += 1
         self._count = 0
         self._cycle.after_exposure = None
@@ -111,13 +110,13 @@ class ImageStore:
         self.frame = 0
 
     def save(self, edge: int) -> None:
-        """Capture the next frame and store it; in standby one frame is exposed for it."""
+        """Capture and store the next exposure; in standby, make one."""
         self.percent = 0
         self.status = "waiting_sensor"
 
         def fetch() -> None:
             self.percent, self.status = 50, "waiting_frame"
-            self._ask(edge, store)
+            self._fetch_image(edge, store)
 
         def store(answer: ImageResult | None) -> None:
             self.busy = False
@@ -129,17 +128,17 @@ class ImageStore:
 
         self._capture(fetch)
 
-    def take_full(self, done: Callable[[ImageResult | None], None]) -> None:
-        """Capture the next frame in its own size, beside what is stored; `done` gets it, or None if it failed."""
+    def capture_full(self, done: Callable[[ImageResult | None], None]) -> None:
+        """Capture the next exposure in full size without storing it; `done` gets it, or None on failure."""
 
         def finish(answer: ImageResult | None) -> None:
             self.busy = False
             done(answer)
 
-        self._capture(lambda: self._ask(0, finish))
+        self._capture(lambda: self._fetch_image(0, finish))
 
     def _capture(self, then: Callable[[], None]) -> None:
-        """Call `then` when the next frame has gone to the pipeline; in standby one is exposed for it."""
+        """Call `then` when the next exposure has been sent to the pipeline; in standby, make one."""
         self.busy = True
         if self._cycle.running:
             self._cycle.after_exposure = then
@@ -155,7 +154,7 @@ class ImageStore:
         self._scheduler.at(start_ns + exposure_ns, expose)
 
     def cycle_stopped(self) -> None:
-        """Expose one frame for a capture that waits for the next one, as none comes by itself now."""
+        """Make one exposure for a pending capture, as the cycle makes no more."""
         then, self._cycle.after_exposure = self._cycle.after_exposure, None
         if then is not None:
             self._capture(then)
@@ -165,7 +164,7 @@ class ImageStore:
         return StoredImage(answer.width, answer.pixels, answer.frame, self._count)
 
     def open_stored(self, edge: int) -> bool:
-        """Open the stored image for download in a size not above its own; False if there is none such."""
+        """Open the stored image for download, reduced to `edge`; return False if it is not large enough."""
         if self.stored is None or edge > self.stored.edge:
             return False
         self.download = self.stored.binned(edge)
@@ -173,7 +172,7 @@ class ImageStore:
         return True
 
     def open_last(self, edge: int, done: Callable[[bool], None]) -> None:
-        """Open the last frame that the sensor made; `done` tells whether there was one."""
+        """Open the last exposure for download; `done` gets whether there was one."""
         self.busy = True
         self.download = None
 
@@ -185,10 +184,10 @@ class ImageStore:
             )
             done(answer is not None)
 
-        self._ask(edge, take)
+        self._fetch_image(edge, take)
 
-    def _ask(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
-        """Fetch an image from the pipeline; it is taken in after the storing time, however fast it came."""
+    def _fetch_image(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
+        """Fetch an image from the pipeline; `take` gets it after `STORE_S`, or None on failure."""
         generation = self._generation
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
         answers: list[Answer] = []
@@ -216,11 +215,11 @@ class ImageStore:
 
     @property
     def frames(self) -> int:
-        """Number of frames of the open download; 0 if none is open."""
+        """Number of image frames of the open download; 0 if none is open."""
         return 0 if self.download is None else len(self.download.pixels) // FRAME_SIZE
 
     def frame_bytes(self) -> bytes:
-        """Return the loaded frame of the open download."""
+        """Return the loaded image frame of the open download."""
         if self.download is None:
             return bytes(FRAME_SIZE)
         start = self.frame * FRAME_SIZE
@@ -228,8 +227,8 @@ class ImageStore:
 
 
 def edge_of(size_name: str) -> int:
-    """Edge in pixels of a size by its name in the interface definition, e.g. `size_512`."""
+    """Return the edge in pixels of a size named in the interface definition, such as `size_512`."""
     edge = int(size_name.removeprefix("size_"))
     if edge not in IMAGE_EDGES:
-        raise ValueError(f"{size_name} is no image size")
+        raise ValueError(f"{size_name} is not an image size")
     return edge

@@ -1,4 +1,4 @@
-"""The mode machine: which modes there are, what leads from one to the other, and what is refused.
+"""The mode machine: modes, the transitions between them, and the commands that it refuses.
 
 ::
 
@@ -10,8 +10,9 @@
                            ▲                               │
                            └───(tracking lost, command)────┘
 
-A telecommand may ask for standby, lost_in_space and tracking. Tracking needs an attitude to start from: one that was found
-in this run and is not older than `device.PREDICTION_LIMIT_S`. Boot is entered by a reset and error by a fault only.
+Standby, lost_in_space and tracking can be commanded. Tracking needs an attitude to start from, found
+since the last start and not older than `device.PREDICTION_LIMIT_S`. Boot is entered by a reset only,
+and error by a fault only.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Final
 
 
 class Mode(StrEnum):
-    """Modes of the device, by the names of the interface definition."""
+    """Modes of the device, by their names in the interface definition."""
 
     BOOT = "boot"
     STANDBY = "standby"
@@ -44,7 +45,7 @@ COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
     Mode.TRACKING: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
     Mode.ERROR: frozenset({Mode.STANDBY}),
 }
-"""Mode → modes that a telecommand may ask for from there."""
+"""Mode → modes that can be commanded from it."""
 
 
 class Cause(StrEnum):
@@ -61,7 +62,7 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class Transition:
-    """One change of mode; from error to error where only the cause of the error changes."""
+    """A change of mode; from error to error if only the cause of the error changes."""
 
     before: Mode
     after: Mode
@@ -80,34 +81,34 @@ class Modes:
     def __init__(self, on_change: Callable[[Transition], None] | None = None) -> None:
         self.mode = Mode.BOOT
         self.error = ""
-        """Why the device is in error; empty in any other mode."""
+        """Name in `device_error` of the error; empty in any other mode."""
         self._on_change = on_change
 
     def allows(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Whether a telecommand may ask for a mode now.
+        """Return whether a mode can be commanded now.
 
         Parameters
         ----------
         wanted
-            The mode asked for.
+            The commanded mode.
         has_attitude
-            An attitude stands ready from which tracking can start.
+            Whether there is an attitude from which tracking can start.
         """
         return wanted in COMMANDED[self.mode] and (wanted is not Mode.TRACKING or has_attitude)
 
     def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Change the mode by telecommand; return False, and change nothing, where that is not allowed."""
+        """Change the mode by telecommand; return False if that is not allowed."""
         if not self.allows(wanted, has_attitude=has_attitude):
             return False
         self._enter(wanted, Cause.COMMAND)
         return True
 
     def reset(self) -> None:
-        """Begin to boot."""
+        """Enter the boot mode."""
         self._enter(Mode.BOOT, Cause.RESET)
 
     def booted(self) -> None:
-        """End booting, unless a fault came first."""
+        """Leave the boot mode, unless a fault came first."""
         if self.mode is Mode.BOOT:
             self._enter(Mode.STANDBY, Cause.BOOTED)
 
@@ -116,16 +117,16 @@ class Modes:
         self._enter(Mode.ERROR, Cause.FAULT, why)
 
     def solved(self, *, valid: bool, tracked: bool, tracking_enabled: bool) -> None:
-        """Change the mode by the result of a frame.
+        """Change the mode by the result of an exposure.
 
         Parameters
         ----------
         valid
-            The frame gave an attitude.
+            Whether the attitude is valid.
         tracked
-            The frame was solved from a prediction, not lost in space.
+            Whether it was solved from a prediction, not lost in space.
         tracking_enabled
-            The configuration lets the device track.
+            Whether the configuration enables tracking.
         """
         if self.mode is Mode.LOST_IN_SPACE and valid and tracking_enabled:
             self._enter(Mode.TRACKING, Cause.ATTITUDE_FOUND)

@@ -1,4 +1,4 @@
-"""The device's parameters: values by the names of the interface definition, checked, saved and restored."""
+"""The device's parameters: values checked against the interface definition, stored and restored."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from starhil.protocol.values import FieldError, MessageError, Parameter, Value
 ParameterValue = bool | int | float | str
 
 ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
-"""Pairs of which the first must not exceed the second."""
+"""Pairs whose first parameter must not exceed the second."""
 
 PERIOD_ROUNDING: Final = 1e-6
-"""Part of a period by which single precision may shorten it."""
+"""Fraction of a period by which rounding to single precision may shorten it."""
 
 
 def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
-    """Least time from exposure to exposure, seconds: the delay before one and the exposure itself.
+    """Return the minimum time from exposure to exposure, seconds: delay plus exposure time.
 
-    Read-out and processing go on while the next frame is exposed, and do not count.
+    Read-out and processing overlap with the next exposure and do not count.
     """
     return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
 
 
 def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...], str] | None:
-    """Names of parameters that contradict each other, with the reason; None if none do."""
+    """Return the names of parameters that contradict each other, with the reason, or None."""
     for low, high in ORDERED:
         if float(values[low]) > float(values[high]):
             return (low, high), f"{low} {values[low]} is above {high} {values[high]}"
     rate, needed_s = float(values["update_rate"]), exposure_period_s(values)
     if needed_s * rate > 1.0 + PERIOD_ROUNDING:
         return ("update_rate", "exposure", "delay_time"), (
-            f"{rate:g} Hz leaves {1000.0 / rate:.4g} ms a frame, exposure {values['exposure']} ms and delay_time "
+            f"{rate:g} Hz leaves {1000.0 / rate:.4g} ms per frame, exposure {values['exposure']} ms and delay_time "
             f"{values['delay_time']} ms take {1000.0 * needed_s:g} ms; "
             f"set update_rate to {1.0 / needed_s:.4g} Hz or less, or shorten them"
         )
@@ -43,19 +43,19 @@ def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...
 
 
 class Parameters(Mapping[str, ParameterValue]):
-    """All parameters, always each within its limits.
+    """All parameters, each always within its limits.
 
     Parameters
     ----------
     icd
-        Where names, types and limits come from.
+        Interface definition, with names, types and limits.
     defaults
-        Defaults of this device where they differ from the definition's.
+        Defaults of this device that differ from those of the definition.
 
     Raises
     ------
     EmulatorError
-        A default names no parameter or is outside its limits.
+        A default is unknown or outside its limits.
     """
 
     def __init__(self, icd: InterfaceDefinition, defaults: Mapping[str, Value] | None = None) -> None:
@@ -79,7 +79,7 @@ class Parameters(Mapping[str, ParameterValue]):
         return len(self._values)
 
     def number(self, name: str) -> float:
-        """Return a parameter as the number that the bus carries."""
+        """Return a parameter as the number sent on the bus."""
         return self._definitions[name].to_number(self._values[name])
 
     def definition(self, name: str) -> Parameter:
@@ -91,61 +91,61 @@ class Parameters(Mapping[str, ParameterValue]):
         return self._defaults[name]
 
     def observe(self, observer: Callable[[frozenset[str]], None]) -> None:
-        """Call `observer` with the names of what changed, after each change."""
+        """Call `observer` after each change, with the names of the changed parameters."""
         self._observers.append(observer)
 
     def set(self, changes: Mapping[str, Value]) -> None:
-        """Set some parameters: all of them, or none.
+        """Set some parameters, all or none.
 
         Raises
         ------
         MessageError
-            A value is outside its limits, or two contradict each other; nothing is changed.
+            A value is outside its limits, or two values contradict each other.
         """
-        self._take(self._checked(self._values, changes))
+        self._assign(self._checked(self._values, changes))
 
     def set_defaults(self) -> None:
         """Set all parameters to their defaults."""
-        self._take(self._defaults)
+        self._assign(self._defaults)
 
     def adopt_defaults(self, defaults: Mapping[str, Value]) -> None:
-        """Make values the defaults that come from elsewhere (the camera's constants), where none was set before."""
+        """Replace some defaults, and the values that are still at their default."""
         checked = self._checked(self._defaults, defaults)
         follow = {
             name: value for name, value in checked.items() if self._values[name] == self._defaults[name]
         }
         self._defaults.update(checked)
-        self._take(follow)
+        self._assign(follow)
 
     def restore(self, stored: Mapping[str, object]) -> list[str]:
-        """Set all parameters to what a store has, or to their defaults; return the names that are passed over.
+        """Set all parameters to stored values, or to their defaults; return the stored names that were ignored.
 
-        Passed over is what is unknown or no longer allowed. What the store holds need be free of contradictions only as
-        a whole, and observers are told once, of what is another value than before.
+        Unknown parameters and invalid values are ignored. Contradictions are checked for the stored
+        values as a whole, and observers are called once.
         """
         allowed: dict[str, Value] = {}
         for name, value in stored.items():
             if name in self._definitions and isinstance(value, (bool, int, float, str)):
                 with contextlib.suppress(MessageError):
                     allowed[name] = self._definitions[name].check(value)
-        taken: dict[str, ParameterValue] = {}
+        accepted: dict[str, ParameterValue] = {}
         try:
-            taken = self._checked(self._defaults, allowed)
-        except MessageError:  # two contradict each other: the later one is passed over
+            accepted = self._checked(self._defaults, allowed)
+        except MessageError:  # two values contradict each other: the later one is ignored
             for name, value in allowed.items():
                 with contextlib.suppress(MessageError):
-                    taken |= self._checked({**self._defaults, **taken}, {name: value})
-        self._stored = taken
-        self._take({**self._defaults, **taken})
-        return [name for name in stored if name not in taken]
+                    accepted |= self._checked({**self._defaults, **accepted}, {name: value})
+        self._stored = accepted
+        self._assign({**self._defaults, **accepted})
+        return [name for name in stored if name not in accepted]
 
     def mark_stored(self, stored: Mapping[str, ParameterValue]) -> None:
-        """Remember what a restart would bring."""
+        """Remember the values that are stored."""
         self._stored = dict(stored)
 
     @property
     def differ_from_store(self) -> bool:
-        """Whether a restart would bring other values."""
+        """Whether a restart would change any value."""
         return {**self._defaults, **self._stored} != self._values
 
     def _checked(
@@ -156,11 +156,11 @@ class Parameters(Mapping[str, ParameterValue]):
         found = _contradiction(result)
         if found is not None:
             names, why = found
-            to_blame = next((name for name in names if base[name] != result[name]), names[0])
-            raise FieldError(f"{to_blame}: {why}")
+            culprit = next((name for name in names if base[name] != result[name]), names[0])
+            raise FieldError(f"{culprit}: {why}")
         return checked
 
-    def _take(self, values: Mapping[str, ParameterValue]) -> None:
+    def _assign(self, values: Mapping[str, ParameterValue]) -> None:
         changed = frozenset(name for name, value in values.items() if self._values[name] != value)
         self._values.update(values)
         if changed:

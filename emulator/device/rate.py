@@ -1,4 +1,4 @@
-"""The body rate, from the attitudes of the last frames."""
+"""Estimation of the body rate from the last attitudes."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from starid.attitude import Attitude
 HISTORY: Final = 10
 RATE_GAP_PERIODS: Final = 2.5
 RATE_SPAN_S: Final = 2.0
-"""Time back to which attitudes count for the rate, seconds; the last two always count."""
+"""Age up to which attitudes are used for the rate, seconds; the last two are always used."""
 
 
 class RateEstimator:
-    """Body rate from the attitudes of the last valid frames."""
+    """Estimates the body rate from the last valid attitudes."""
 
     def __init__(self) -> None:
         self._fixes: deque[tuple[int, Attitude]] = deque(maxlen=HISTORY)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Discard all attitudes."""
         self._fixes.clear()
 
     @property
     def last(self) -> tuple[int, Attitude] | None:
-        """The last valid attitude and its time, or None."""
+        """Time (simulation time, nanoseconds) and value of the last attitude, or None."""
         return self._fixes[-1] if self._fixes else None
 
     def add(self, mid_ns: int, attitude: Attitude, period_s: float) -> None:
-        """Take in a valid attitude; after a gap of more than `RATE_GAP_PERIODS` the ones before it say nothing."""
+        """Add a valid attitude; after a gap of more than `RATE_GAP_PERIODS`, older ones are discarded."""
         if self._fixes and mid_ns - self._fixes[-1][0] > RATE_GAP_PERIODS * period_s * NANOSECONDS:
             self._fixes.clear()
         self._fixes.append((mid_ns, attitude))
 
     def rate(self, window: int) -> Triple | None:
-        """Least-squares rate, radians a second, over the last `window` fixes; None from fewer than two."""
+        """Return the least-squares rate over the last `window` attitudes, rad/s; None from fewer than two."""
         if len(self._fixes) < 2:
             return None
         newest_ns, newest = self._fixes[-1]

@@ -1,4 +1,4 @@
-"""How a handler refuses a request."""
+"""The exception by which a handler refuses a request."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class Refused(Exception):  # noqa: N818 (an answer on the bus, not an error of t
     Attributes
     ----------
     code
-        The published code.
+        The published error code.
     index
-        The field of the telecommand that it is about, for the acknowledge telemetry.
+        Index of the telecommand field at fault, for the acknowledge telemetry.
     """
 
     def __init__(self, code: ErrorCode, index: int = 0) -> None:

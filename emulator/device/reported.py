@@ -1,37 +1,34 @@
-"""The attitude as the device reports it: in the frame of its mounting, with validity and time."""
+"""The attitude as the device reports it: in the mounting frame, with validity and time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.frames import ZERO, Quaternion, Triple
 from starid.attitude import Attitude
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
-    from starhil.emulator.device.parameters import Parameters
 
 
 @dataclass(frozen=True)
 class Reported:
-    """What goes out.
+    """Attitude and rate as reported.
 
     Attributes
     ----------
     valid, reason
-        Whether the attitude holds, and why not.
+        Whether the attitude is valid, and the reason if not.
     quaternion_xyzw
-        ICRS → reported frame, scalar not negative; all zeros where invalid.
+        ICRS → reported frame, scalar last and not negative; zeros where invalid.
     rate_rad_s
-        Body rate in the reported frame; zeros where not known.
+        Body rate in the reported frame, rad/s; zeros where unknown.
     mid_unix_s
-        Middle of the exposure on the device's clock, seconds.
+        Unix time of mid-exposure on the device's clock, seconds.
     """
 
     valid: bool
@@ -42,7 +39,7 @@ class Reported:
 
 
 def reported(device: Device) -> Reported:
-    """Return what the device reports now."""
+    """Return the attitude that the device reports now."""
     last = device.fresh
     if last is None:
         running = device.modes.mode.makes_frames
@@ -62,7 +59,7 @@ def reported(device: Device) -> Reported:
 
 
 def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
-    """Rotation vectors that lead from the sensor frame to the reported one; none where all angles are zero.
+    """Return the rotation vectors from the sensor frame to the reported frame, radians; zero angles are left out.
 
     The reported frame is the sensor frame turned by alpha about x, then by beta about its new y, then by gamma about
     its new z.

@@ -1,7 +1,7 @@
-"""The order of events in run time: what happens next, and what is due.
+"""A queue of events in simulation time.
 
-The real clock's loop sleeps until the next event; the stepped clock goes from event to event. Both call the same actions in
-the same order.
+The real clock sleeps until the next event; the stepped clock jumps from event to event. Both run the
+same actions in the same order.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 Action: TypeAlias = Callable[[int], None]
-"""Called with the run time at which the event was due, nanoseconds."""
+"""Called with the simulation time at which the event was due, nanoseconds."""
 
 
 @dataclass(order=True)
 class Event:
-    """An action at a run time; equal times keep the order of their entry."""
+    """An action at a simulation time; events of equal time run in the order in which they were added."""
 
     due_ns: int
     order: int
@@ -26,44 +26,36 @@ class Event:
     cancelled: bool = field(default=False, compare=False)
 
     def cancel(self) -> None:
-        """Take the event out; nothing happens if it has passed."""
+        """Cancel the event; a past event is not affected."""
         self.cancelled = True
 
 
 class Scheduler:
-    """A queue of events in run time."""
+    """A queue of events, ordered by simulation time."""
 
     def __init__(self) -> None:
         self._queue: list[Event] = []
         self._order = itertools.count()
-        self.on_change: Callable[[], None] | None = None
-        """Called when an event was entered, so that a sleeping loop looks anew."""
+        self.on_add: Callable[[], None] | None = None
+        """Called when an event was added, so that a sleeping loop can wake up earlier."""
 
     def at(self, due_ns: int, action: Action) -> Event:
-        """Enter an action at a run time."""
+        """Schedule an action at a simulation time, nanoseconds."""
         event = Event(due_ns, next(self._order), action)
         heapq.heappush(self._queue, event)
-        if self.on_change is not None:
-            self.on_change()
+        if self.on_add is not None:
+            self.on_add()
         return event
 
     def next_due_ns(self) -> int | None:
-        """Run time of the next event, or None if there is none."""
+        """Return the time of the next event, nanoseconds, or None."""
         while self._queue and self._queue[0].cancelled:
             heapq.heappop(self._queue)
         return self._queue[0].due_ns if self._queue else None
 
     def pop_due(self, now_ns: int) -> Event | None:
-        """Take out the next event that is due at `now_ns`, or None."""
+        """Remove and return the next event that is due at `now_ns`, or None."""
         due_ns = self.next_due_ns()
         if due_ns is None or due_ns > now_ns:
             return None
         return heapq.heappop(self._queue)
-
-    def run_due(self, now_ns: int) -> int:
-        """Do all that is due at `now_ns`, in order, with what these events enter; return how many."""
-        done = 0
-        while (event := self.pop_due(now_ns)) is not None:
-            event.action(event.due_ns)
-            done += 1
-        return done

@@ -1,8 +1,8 @@
-"""What the device keeps across a restart: parameters, boot count, reset cause; never half-written.
+"""The state that survives a restart (parameters and boot count), written atomically.
 
-The file is JSON with a checksum over its content. It is written to a temporary name, flushed to the disk and renamed over the
-old one, so that a reader finds the old state or the new one, whenever the writer is killed. A file that cannot be read
-as such is set aside under another name, reported, and the device starts from its defaults.
+The file is JSON with a checksum over its content. It is written under a temporary name, flushed to
+disk and renamed over the old file, so that a reader finds the old state or the new one even if the
+writer is killed. A corrupt file is set aside under another name, and the device uses its defaults.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ MAX_BYTES: Final = 1_000_000
 
 
 class StateStore(Protocol):
-    """Where the device keeps what survives a restart."""
+    """Stores the state that survives a restart."""
 
     corrupt: bool
     """The stored state could not be read and was set aside."""
 
     def load(self) -> dict[str, Any]:
-        """What was saved last; empty if nothing was, or if it is corrupt."""
+        """Return the last saved state; empty if there is none or it is corrupt."""
 
     def save(self, content: dict[str, Any]) -> None:
-        """Save all of the content, or nothing of it."""
+        """Save the whole content, or none of it."""
 
     def close(self) -> None:
-        """Give the store free for another process."""
+        """Release the store for another process."""
 
 
 class MemoryStore:
-    """State that survives a reset of the device, and ends with the process."""
+    """State that survives a reset of the device, but not the end of the process."""
 
     def __init__(self) -> None:
         self.corrupt = False
         self._text = "{}"
 
     def load(self) -> dict[str, Any]:
-        """What was saved last."""
+        """Return the last saved state."""
         content: dict[str, Any] = json.loads(self._text)
         return content
 
@@ -57,16 +57,16 @@ class MemoryStore:
         self._text = json.dumps(content)
 
     def close(self) -> None:
-        """Nothing is to be given free."""
+        """Do nothing: no other process uses the store."""
 
 
 class FileStore:
-    """State in a folder of its own, used by one process at a time.
+    """State in a folder that one process uses at a time.
 
     Raises
     ------
     EmulatorError
-        The folder cannot be made or written, or another emulator uses it.
+        The folder cannot be created or written, or another emulator uses it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -88,7 +88,7 @@ class FileStore:
             ) from None
 
     def load(self) -> dict[str, Any]:
-        """What was saved last; a corrupt file is set aside as `device.json.corrupt`."""
+        """Return the last saved state; a corrupt file is set aside as `device.json.corrupt`."""
         try:
             content = _decode(read_user_file(self.path, MAX_BYTES))
         except FileNotFoundError:
@@ -107,7 +107,7 @@ class FileStore:
         return content
 
     def save(self, content: dict[str, Any]) -> None:
-        """Save all of the content, or nothing of it."""
+        """Save the whole content, or none of it."""
         temporary = self.path.with_name(STATE_FILE + ".new")
         try:
             with temporary.open("wb") as file:
@@ -124,11 +124,11 @@ class FileStore:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise EmulatorError(
-                f"state file {self.path}: cannot be written ({error.strerror}); the state before it is kept"
+                f"state file {self.path}: cannot be written ({error.strerror}); the previous state is kept"
             ) from None
 
     def close(self) -> None:
-        """Give the folder free."""
+        """Release the folder."""
         os.close(self._lock)
 
 
@@ -141,14 +141,14 @@ def _encode(content: dict[str, Any]) -> bytes:
 
 
 def _decode(data: bytes) -> dict[str, Any] | None:
-    """Return the content of a state file, or None if it is not whole."""
+    """Return the content of a state file, or None if it is corrupt."""
     try:
         document = json.loads(data)
         content = document["state"]
         body = json.dumps(content, sort_keys=True, allow_nan=False)
-        whole = (
+        intact = (
             document["format"] == FORMAT and document["sha256"] == hashlib.sha256(body.encode()).hexdigest()
         )
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    return content if whole and isinstance(content, dict) else None
+    return content if intact and isinstance(content, dict) else None

@@ -1,17 +1,19 @@
-"""Telecommands: for each row of the interface definition, by its name, what it does.
+"""Telecommands: a handler for each row of the interface definition, by its name.
 
-A handler gets the decoded, range-checked values. It returns messages that follow the acknowledge (mostly none), or None if it
-goes on and ends the acknowledge itself, and raises `Refused` to answer with an error code. What goes on is answered at once,
-except for the rows in `ANSWERED_WHEN_DONE`.
+A handler gets the decoded, range-checked values. It returns the messages that follow the acknowledge
+(mostly none), or None if it continues in the background and ends the acknowledge itself. It raises
+`Refused` to answer with an error code. A telecommand that continues is answered at once, unless it
+is in `ANSWERED_WHEN_DONE`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.counters import Acknowledge
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.images import edge_of
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.refusal import Refused
@@ -19,18 +21,15 @@ from starhil.emulator.errors import EmulatorError
 from starhil.protocol.messages import FIRST_TELEMETRY_ID, ErrorCode, Reply
 from starhil.protocol.values import MessageError, Value
 
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
-
 Values: TypeAlias = dict[str, Value]
-Handler: TypeAlias = "Callable[[Device, Values, Acknowledge], list[Reply] | None]"
+Handler: TypeAlias = Callable[[Device, Values, Acknowledge], list[Reply] | None]
 
 SRAM_STORED: Final = 0
-"""Bank of the image that save_image stored; the other one holds the last frame."""
+"""Bank of the image that save_image stored; the other bank holds the last exposure."""
 
 
 def reset(device: Device, _values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """1: restart, after the acknowledge has gone."""
+    """1: restart once the acknowledge is sent."""
     device.scheduler.at(device.clock.now_ns(), lambda _due_ns: device.reset("command"))
     return []
 
@@ -43,7 +42,7 @@ def set_unix_time(device: Device, values: Values, _acknowledge: Acknowledge) -> 
 
 
 def set_star_config(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """37: set the configuration, all or nothing."""
+    """37: set the whole configuration, or none of it."""
     fields = device.icd.telecommands["set_star_config"].named_fields
     changes = {field.parameter: values[name] for name, field in fields.items() if field.parameter}
     try:
@@ -56,7 +55,7 @@ def set_star_config(device: Device, values: Values, _acknowledge: Acknowledge) -
 
 
 def init_image_download(device: Device, values: Values, acknowledge: Acknowledge) -> list[Reply] | None:
-    """64: open an image for download by frames."""
+    """64: open an image for download in numbered pieces (image frames)."""
     images = device.images
     if images.busy:
         raise Refused(ErrorCode.BUSY)
@@ -76,7 +75,7 @@ def init_image_download(device: Device, values: Values, acknowledge: Acknowledge
 
 
 def advance_image_download(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """65: load a frame of the open image."""
+    """65: load an image frame of the open image."""
     images = device.images
     if images.busy and images.download is None:
         raise Refused(ErrorCode.BUSY)
@@ -109,13 +108,13 @@ def set_mode(device: Device, values: Values, _acknowledge: Acknowledge) -> list[
 
 
 def set_update_rate(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """97: set the rate of frames."""
+    """97: set the update rate."""
     device.parameters.set({"update_rate": values["rate"]})
     return []
 
 
 def set_parameter(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """98: set one parameter, which telemetry `parameter` reports from then on."""
+    """98: set one parameter and select it for telemetry `parameter`."""
     chosen = device.icd.parameters_by_id.get(_int(values, "parameter"))
     if chosen is None:
         raise Refused(ErrorCode.INVALID_PARAMETER)
@@ -128,7 +127,7 @@ def set_parameter(device: Device, values: Values, _acknowledge: Acknowledge) -> 
 
 
 def select_parameter(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """99: choose the parameter that telemetry `parameter` reports."""
+    """99: select the parameter that telemetry `parameter` reports."""
     chosen = _int(values, "parameter")
     if chosen not in device.icd.parameters_by_id:
         raise Refused(ErrorCode.INVALID_PARAMETER)
@@ -137,7 +136,7 @@ def select_parameter(device: Device, values: Values, _acknowledge: Acknowledge) 
 
 
 def save_parameters(device: Device, _values: Values, acknowledge: Acknowledge) -> None:
-    """100: store all parameters; answered when they are on the disk, or when they could not be stored."""
+    """100: store all parameters; answered once they are on disk or storing has failed."""
 
     def done(error: EmulatorError | None) -> None:
         acknowledge.end(ErrorCode.OK if error is None else ErrorCode.INTERNAL)
@@ -158,13 +157,13 @@ def default_parameters(device: Device, _values: Values, _acknowledge: Acknowledg
 
 
 def clear_counters(device: Device, _values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """103: set the counters and flags of communication_status to zero."""
+    """103: clear the counters and flags of communication_status."""
     device.counters.clear()
     return []
 
 
 def set_unsolicited(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-    """104: send a row at a rate without being asked."""
+    """104: send a telemetry row unsolicited at a rate."""
     row = _int(values, "telemetry")
     if row < FIRST_TELEMETRY_ID or row not in device.icd.telemetry_by_id:
         raise Refused(ErrorCode.INVALID_PARAMETER)
@@ -187,18 +186,18 @@ def start_burst(device: Device, values: Values, _acknowledge: Acknowledge) -> li
     return device.files.burst(ignore_hole_map=bool(values["ignore_hole_map"]))
 
 
-def _set_hole_map(part: int) -> Handler:
+def _set_hole_map(section: int) -> Handler:
     def set_hole_map(device: Device, values: Values, _acknowledge: Acknowledge) -> list[Reply]:
-        """120 to 127: tell which packets have arrived."""
+        """120 to 127: report which packets have arrived."""
         data = values["map"]
-        device.files.arrived.set_part(part, data if isinstance(data, bytes) else b"")
+        device.files.arrived.set_part(section, data if isinstance(data, bytes) else b"")
         return []
 
     return set_hole_map
 
 
 def _int(values: Values, name: str) -> int:
-    """Return a value that its row declares as a whole number."""
+    """Return the value of an integer field."""
     return int(values[name])
 
 
@@ -220,9 +219,9 @@ TELECOMMANDS: Final[dict[str, Handler]] = {
     "set_unsolicited": set_unsolicited,
     "load_file_block": load_file_block,
     "start_burst": start_burst,
-    **{f"set_hole_map_{part}": _set_hole_map(part) for part in range(1, 9)},
+    **{f"set_hole_map_{n}": _set_hole_map(n) for n in range(1, 9)},
 }
-"""Row name → what it does."""
+"""Row name → handler."""
 
 ANSWERED_WHEN_DONE: Final = frozenset({"save_parameters"})
-"""Rows whose answer says what became of them, not only that they were accepted."""
+"""Rows answered with their outcome instead of their acceptance."""

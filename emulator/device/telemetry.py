@@ -1,13 +1,13 @@
-"""Telemetry: for each row of the interface definition, by its name, where its values come from."""
+"""Telemetry: a function for each row of the interface definition, by its name, that returns its values."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, split_unix
-from starhil.emulator.device.file_download import hole_map_values
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import Reported, reported
 from starhil.emulator.pipeline.frames import MatchedStar
@@ -15,20 +15,17 @@ from starhil.protocol.image_transfer import frame_checksum
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
 
-if TYPE_CHECKING:
-    from starhil.emulator.device.device import Device
-
 Values: TypeAlias = dict[str, Value]
 
 REPORTED_STARS: Final = 3
 MAGNITUDE_OF_NONE: Final = 63.535
-"""Magnitude reported where there is no star: the largest that the row carries."""
+"""Magnitude reported where there is no star: the maximum of the field."""
 
 IDENTIFIED_STARS: Final = 8
 
 
 def identification(device: Device) -> Values:
-    """128: who answers, and for how long it has been running."""
+    """128: type, version and uptime of the device."""
     run_ms = (device.clock.now_ns() - device.started_ns) // 1_000_000
     unit = device.profile.device
     return {
@@ -42,7 +39,7 @@ def identification(device: Device) -> Values:
 
 
 def boot_status(device: Device) -> Values:
-    """129: how and how often the device started."""
+    """129: causes and number of starts."""
     unit = device.profile.device
     return {
         "reset_cause": device.reset_cause,
@@ -68,7 +65,7 @@ def communication_status(device: Device) -> Values:
 
 
 def acknowledge(device: Device) -> Values:
-    """240: what became of the last telecommand."""
+    """240: outcome of the last telecommand."""
     last = device.acknowledge
     return {
         "last_telecommand": last.last_telecommand,
@@ -91,7 +88,7 @@ def star_magnitudes(device: Device) -> Values:
 
 
 def star_performance_1(device: Device) -> Values:
-    """188: counts of the last frame."""
+    """188: star counts and image statistics of the last exposure."""
     last = device.fresh
     if last is None:
         return {"identification_mode": "lost_in_space"}
@@ -107,7 +104,7 @@ def star_performance_1(device: Device) -> Values:
 
 
 def star_timing(device: Device) -> Values:
-    """189: duration of the steps of the last frame."""
+    """189: duration of the processing steps of the last exposure."""
     last = device.fresh
     if last is None:
         return {}
@@ -120,7 +117,7 @@ def star_timing(device: Device) -> Values:
 
 def _star_raw(number: int) -> Callable[[Device], Values]:
     def star_raw(device: Device) -> Values:
-        """212 to 214: catalogue number and place of an identified star."""
+        """212 to 214: catalogue number and image position of an identified star."""
         stars = _brightest(device, number)
         if len(stars) < number:
             return {}
@@ -149,7 +146,7 @@ def quaternion(device: Device) -> Values:
 
 
 def star_performance_2(device: Device) -> Values:
-    """231: flags of the last frame and confidence in the three reported stars."""
+    """231: flags of the last exposure and confidence in the three reported stars."""
     parameters = device.parameters
     values: Values = {
         "tracking_module_on": bool(parameters["tracking_enable"]),
@@ -175,7 +172,7 @@ def star_performance_2(device: Device) -> Values:
 
 
 def star_tracker(device: Device) -> Values:
-    """211: all star tracker telemetry of one frame in one message."""
+    """211: all star tracker telemetry of one exposure."""
     values: Values = {}
     for name in _STAR_TRACKER:
         values |= TELEMETRY[name](device)
@@ -183,13 +180,13 @@ def star_tracker(device: Device) -> Values:
 
 
 def star_config(device: Device) -> Values:
-    """202: the configuration, as set_star_config lays it out."""
+    """202: the configuration, with the fields of set_star_config."""
     fields = device.icd.telemetry["star_config"].named_fields.values()
     return {field.name: device.parameters[field.parameter] for field in fields if field.parameter}
 
 
 def precise_attitude(device: Device) -> Values:
-    """160: precise attitude of one frame with its time, validity and uncertainty."""
+    """160: attitude of one exposure with time, validity and uncertainty."""
     last = device.fresh
     answer: Reported = reported(device)
     mode = device.modes.mode if last is None else last.mode
@@ -245,14 +242,14 @@ def device_status(device: Device) -> Values:
 
 
 def parameter(device: Device) -> Values:
-    """162: the chosen parameter with its limits."""
-    chosen = device.icd.parameters_by_id[device.selected_parameter]
-    default = chosen.to_number(device.parameters.default(chosen.name))
+    """162: the selected parameter with its limits."""
+    selected = device.icd.parameters_by_id[device.selected_parameter]
+    default = selected.to_number(device.parameters.default(selected.name))
     return {
-        "parameter": chosen.id,
-        "value": device.parameters.number(chosen.name),
-        "minimum": chosen.minimum,
-        "maximum": chosen.maximum,
+        "parameter": selected.id,
+        "value": device.parameters.number(selected.name),
+        "minimum": selected.minimum,
+        "maximum": selected.maximum,
         "default": default,
     }
 
@@ -270,14 +267,14 @@ def identified_stars(device: Device) -> Values:
 
 
 def image_frame(device: Device) -> Values:
-    """192: the loaded frame of the image."""
+    """192: the loaded image frame."""
     if device.images.busy and device.images.download is None:
         raise Refused(ErrorCode.BUSY)
     return {"data": device.images.frame_bytes()}
 
 
 def image_frame_info(device: Device) -> Values:
-    """193: number and checksum of the loaded frame."""
+    """193: number and checksum of the loaded image frame."""
     data = device.images.frame_bytes()
     return {"frame": device.images.frame, "checksum": frame_checksum(data)}
 
@@ -288,7 +285,7 @@ def image_status(device: Device) -> Values:
 
 
 def file_block(device: Device) -> Values:
-    """242: state of the block asked for by load_file_block."""
+    """242: state of the block requested by load_file_block."""
     block = device.files
     return {
         "ready": block.ready,
@@ -296,6 +293,14 @@ def file_block(device: Device) -> Values:
         "checksum": block.checksum,
         "length": len(block.data),
     }
+
+
+def _hole_map(section: int) -> Callable[[Device], Values]:
+    def hole_map(device: Device) -> Values:
+        """120 to 127: one eighth of the hole map."""
+        return {"map": device.files.arrived.part(section)}
+
+    return hole_map
 
 
 _STAR_TRACKER: Final = (
@@ -335,6 +340,6 @@ TELEMETRY: Final[dict[str, Callable[[Device], Values]]] = {
     "star_performance_2": star_performance_2,
     "image_status": image_status,
     "file_block": file_block,
-    **{f"hole_map_{part}": hole_map_values(part) for part in range(1, 9)},
+    **{f"hole_map_{n}": _hole_map(n) for n in range(1, 9)},
 }
-"""Row name → its values in physical units; what is left out is sent as zero."""
+"""Row name → function that returns its values in physical units; fields left out are sent as zero."""

@@ -1,1 +1,1 @@
-"""The links that bind the device to a wire: serial and CAN."""
+"""Links that connect the device to a bus: serial, CAN and CANopen."""

@@ -1,16 +1,16 @@
-"""What every link does: requests from a transport to the device, replies back, messages given up that do not end."""
+"""The base of the links: passes requests from a transport to the device, and replies back."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from abc import ABC, abstractmethod
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
-from starhil.emulator.links.wire_faults import Pieces, WireFaults
+from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, Request
 from starhil.protocol.transports.base import Transport
@@ -22,101 +22,123 @@ Style = TypeVar("Style")
 log = logging.getLogger("starhil.link")
 
 FLUSH_S: Final = 0.51
-"""Time after which a message that has begun is looked at: a little more than the receivers' time-out of 0.5 s."""
+"""Delay after which an incomplete message is dropped, seconds: just above the receivers' timeout of 0.5 s."""
 
 
 class Receiver(Protocol[Arriving_contra]):
-    """The device's end of a framing."""
+    """The receiving side of a framing."""
 
     @property
     def busy(self) -> bool:
-        """Whether a message has begun and not ended."""
+        """Whether a message is incomplete."""
         ...
 
     def feed(self, item: Arriving_contra, now: float, /) -> list[Request | LinkFault]:
-        """Take what arrived and return what it completes."""
+        """Decode received input; return the requests and faults that it completes."""
         ...
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Give up what has been silent for too long."""
+        """Drop an incomplete message that has timed out; return the faults."""
         ...
 
 
+class Link(Protocol):
+    """An open link of any kind."""
+
+    bus: ClassVar[str]
+    """Name of the bus, `serial` or `can`: a wire fault affects every link on its bus."""
+
+    @property
+    def transport(self) -> Transport[Any]:
+        """Transport of the link."""
+
+    @property
+    def wire(self) -> WireFaults[Any]:
+        """Outgoing side of the wire, with its faults."""
+
+    async def close(self) -> None:
+        """Close the transport."""
+
+
 class DeviceLink(ABC, Generic[Item, Style]):
-    """Binds a device to a transport.
+    """Connects a device to a transport.
 
     Parameters
     ----------
-    device
-        What answers.
+    requests
+        The device's handling of requests.
     transport
-        Where items (bytes, frames) come from and go to.
-    pieces
-        How items are damaged by wire faults.
+        Transport of bytes or CAN frames.
+    damage
+        Damages items for wire faults.
     seed
-        Seed of wire faults.
+        Seed of the wire faults.
     """
 
-    def __init__(self, device: Device, transport: Transport[Item], pieces: Pieces[Item], seed: int) -> None:
+    def __init__(
+        self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int
+    ) -> None:
+        device = requests.device
+        self._requests = requests
         self._device = device
         self._loop = asyncio.get_running_loop()
         self.transport: Final = transport
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
-        self.wire: WireFaults[Item] = WireFaults(transport.send, pieces, device.clock, device.scheduler, seed)
-        device.outlets.append(self._unsolicited)
-        device.on_reset.append(self._forget)
+        self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
+        requests.unsolicited_receivers.append(self._send_unsolicited)
+        device.on_reset.append(self._reset_receiver)
 
     @abstractmethod
     def _new_receiver(self) -> Receiver[Item]:
-        """Make the framing's receiver."""
+        """Return a new receiver for the framing."""
 
     @abstractmethod
-    def _style(self) -> Style:
-        """Return what replies look like at present (dialect, own address)."""
+    def _reply_style(self) -> Style:
+        """Return the present format of replies: dialect or source address."""
 
     @abstractmethod
     def _send(self, reply: Reply, style: Style) -> None:
         """Send a reply."""
 
-    def _unsolicited(self, reply: Reply) -> None:
-        """Send what the device says by itself."""
-        self._send(reply, self._style())
+    def _send_unsolicited(self, reply: Reply) -> None:
+        """Send unsolicited telemetry."""
+        self._send(reply, self._reply_style())
 
     async def start(self) -> str:
-        """Open the transport; return what was taken."""
-        await self.transport.start(self._receive, self._complain)
+        """Open the transport; return its description."""
+        await self.transport.start(self._receive, self._log_transport_error)
         return self.transport.description
 
     async def close(self) -> None:
-        """Give the transport back."""
+        """Close the transport."""
         if self._timer is not None:
             self._timer.cancel()
         await self.transport.close()
 
     def _now(self) -> float:
-        """Run time, s: a message that does not end is given up in the device's own time."""
+        """Return the simulation time, seconds; incomplete messages time out in it."""
         return self._device.clock.now_ns() / NANOSECONDS
 
     def _receive(self, item: Item) -> None:
         for event in self._receiver.feed(item, self._now()):
-            self._take(event)
-        self._watch()
+            self._dispatch(event)
+        self._schedule_flush()
 
-    def _take(self, event: Request | LinkFault) -> None:
+    def _dispatch(self, event: Request | LinkFault) -> None:
         if isinstance(event, LinkFault):
-            self._device.fault(event)
+            self._requests.count_fault(event)
             return
-        style = self._style()  # the answer to a change of style still goes out in the old one
+        style = self._reply_style()  # the answer to a change of format is still sent in the old one
 
         def answer(reply: Reply) -> None:
             self._send(reply, style)
 
-        for reply in self._device.handle(event, answer) or ():
+        for reply in self._requests.handle(event, answer) or ():
             answer(reply)
 
-    def _watch(self) -> None:
-        """Look again at a message that was begun."""
+    def _schedule_flush(self) -> None:
+        """Schedule a flush while a message is incomplete."""
         if self._timer is None and self._receiver.busy:
             due_ns = self._device.clock.now_ns() + round(FLUSH_S * NANOSECONDS)
             self._timer = self._device.scheduler.at(due_ns, self._flush)
@@ -124,12 +146,12 @@ class DeviceLink(ABC, Generic[Item, Style]):
     def _flush(self, _due_ns: int) -> None:
         self._timer = None
         for fault in self._receiver.flush(self._now()):
-            self._device.fault(fault)
-        self._watch()
+            self._requests.count_fault(fault)
+        self._schedule_flush()
 
-    def _forget(self) -> None:
-        """Begin anew, as the device has restarted."""
+    def _reset_receiver(self) -> None:
+        """Discard incomplete input, as the device has restarted."""
         self._receiver = self._new_receiver()
 
-    def _complain(self, error: ProtocolError) -> None:
+    def _log_transport_error(self, error: ProtocolError) -> None:
         log.warning("%s", error)

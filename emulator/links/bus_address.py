@@ -1,4 +1,4 @@
-"""The address of a node on a bus: two nodes of one address answer at once, and neither is understood."""
+"""The address of a node on a CAN bus, and a warning if another node uses it too."""
 
 from __future__ import annotations
 
@@ -6,60 +6,60 @@ import logging
 import socket
 from typing import Final
 
-from starhil.emulator.symlink_lock import NameTakenError, claim_name
+from starhil.emulator.symlink_lock import NameTakenError, lock_name
 
 log = logging.getLogger("starhil.link")
 
 OWN_PROCESS: Final = "virtual:"
-"""Beginning of the buses that no other process can join."""
+"""Prefix of buses that no other process can join."""
 
 
 HIGHEST: Final = 126
-"""Highest number that is suggested: a node of either protocol may have it or the next."""
+"""Highest address that a warning suggests; valid for both CAN protocols."""
 
 
 class BusAddress:
-    """Reports when an address is in use on the bus already, by another emulator of this machine or by any node.
+    """Warns when another emulator on this machine, or any node on the bus, uses the same address.
 
     Parameters
     ----------
     what
-        What the address is called: `address`, `node`.
+        Name of the address in warnings: `address` or `node`.
     setting
-        Key of the profile that sets it.
+        Profile key that sets it.
     """
 
     def __init__(self, what: str, setting: str) -> None:
         self._what = what
         self._setting = setting
-        self._claim: socket.socket | None = None
+        self._lock: socket.socket | None = None
         self._bus = ""
         self.number = 0
         self.seen_elsewhere = False
-        """Whether a frame of another node with this address was reported."""
+        """Whether a CAN frame from another node with this address was reported."""
 
     def take(self, bus: str, number: int) -> None:
-        """Use an address of a bus, instead of the one before; warn if another emulator has it."""
+        """Use an address on a bus instead of the previous one; warn if another emulator uses it."""
         self.release()
         self._bus, self.number, self.seen_elsewhere = bus, number, False
         if not number or bus.startswith(OWN_PROCESS):
             return
         try:
-            self._claim = claim_name(self._what, f"{bus} {number}".encode())
+            self._lock = lock_name(self._what, f"{bus} {number}".encode())
         except NameTakenError as error:
             self._warn(f"is in use by another emulator, process {error.owner}")
 
     def report_elsewhere(self) -> None:
-        """Warn, once an address, that a frame came from another node that has it."""
+        """Warn, once per address, that a CAN frame came from another node with this address."""
         if not self.seen_elsewhere:
             self.seen_elsewhere = True
             self._warn("is also that of another node, whose frames arrive here")
 
     def release(self) -> None:
-        """Leave the address to others."""
-        if self._claim is not None:
-            self._claim.close()
-            self._claim = None
+        """Release the address."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _warn(self, why: str) -> None:
         other = self.number % HIGHEST + 1

@@ -1,4 +1,4 @@
-"""The CAN link: frames in from a transport, requests to the device, replies out in segments."""
+"""The CAN link: passes requests from CAN frames to the device and sends replies in segments."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import asyncio
 import random
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
 
-from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.protocol.can_framing import (
     MAX_EXTENDED_ID,
     MAX_FRAME_DATA,
+    MAX_STANDARD_ID,
     CanDeviceReceiver,
     CanFrame,
     CanIdentifier,
@@ -22,51 +25,63 @@ from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport
 
 
-class CanPieces:
-    """How frames on a bus are damaged (what a bus with a checksum lets through: another frame)."""
+class CanDamage:
+    """Damages CAN frames: a corrupted frame is another valid frame, as the CRC of the bus rejects all others.
+
+    Parameters
+    ----------
+    extended
+        Frames have 29-bit CAN IDs (CAN 2.0B); otherwise 11-bit.
+    """
+
+    def __init__(self, *, extended: bool) -> None:
+        self._extended = extended
+        self._max_id = MAX_EXTENDED_ID if extended else MAX_STANDARD_ID
 
     def corrupt(self, item: CanFrame, rng: random.Random) -> CanFrame:
-        """Turn one bit of the data, or of the identifier where there is no data."""
+        """Flip one bit of the data, or of the CAN ID where there is no data."""
         if not item.data:
-            return CanFrame(item.id ^ 1 << rng.randrange(29), b"")
+            return replace(item, id=item.id ^ 1 << rng.randrange(self._max_id.bit_length()))
         damaged = bytearray(item.data)
         damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
-        return CanFrame(item.id, bytes(damaged))
+        return replace(item, data=bytes(damaged))
 
     def junk(self, rng: random.Random) -> CanFrame:
-        """Make a frame with a random identifier."""
-        return CanFrame(rng.randint(0, MAX_EXTENDED_ID), rng.randbytes(rng.randint(0, MAX_FRAME_DATA)))
+        """Make a frame with a random CAN ID and random data."""
+        can_id = rng.randint(0, self._max_id)
+        return CanFrame(can_id, rng.randbytes(rng.randint(0, MAX_FRAME_DATA)), extended=self._extended)
 
-    def split(self, item: CanFrame, size: int) -> Sequence[CanFrame]:
-        """Leave a frame whole: a frame is never split."""
-        _ = size
+    def split(self, item: CanFrame, _size: int) -> Sequence[CanFrame]:
+        """Return the frame whole: CAN frames are not split."""
         return [item]
 
 
 class CanLink(DeviceLink[CanFrame, int]):
-    """Binds a device to a CAN transport, under the address of its parameter `can_address`.
+    """Connects a device to a CAN transport, at the address in its parameter `can_address`.
 
     Parameters
     ----------
     frame_gap_s
-        Least time between two frames that the device sends, seconds.
+        Minimum time between two frames that the device sends, seconds.
     """
 
+    bus: ClassVar[str] = "can"
+
     def __init__(
-        self, device: Device, transport: Transport[CanFrame], frame_gap_s: float = 0.0, seed: int = 0
+        self, requests: Requests, transport: Transport[CanFrame], frame_gap_s: float = 0.0, seed: int = 0
     ) -> None:
-        super().__init__(device, transport, CanPieces(), seed)
+        super().__init__(requests, transport, CanDamage(extended=True), seed)
         self._gap_s = frame_gap_s
         self._waiting: deque[CanFrame] = deque()
         self._next: asyncio.TimerHandle | None = None
         self._address = BusAddress("address", "links.can.address")
-        device.parameters.observe(self._parameters_changed)
+        self._device.parameters.observe(self._parameters_changed)
 
     async def start(self) -> str:
-        """Join the bus; return what was taken."""
-        taken = await super().start()
-        self._address.take(taken, self._style())
-        return taken
+        """Join the bus; return its description."""
+        bus = await super().start()
+        self._address.take(bus, self._reply_style())
+        return bus
 
     async def close(self) -> None:
         """Leave the bus."""
@@ -81,9 +96,9 @@ class CanLink(DeviceLink[CanFrame, int]):
         super()._receive(item)
 
     def _new_receiver(self) -> CanDeviceReceiver:
-        return CanDeviceReceiver(self._style())
+        return CanDeviceReceiver(self._reply_style())
 
-    def _style(self) -> int:
+    def _reply_style(self) -> int:
         return int(self._device.parameters["can_address"])
 
     def _send(self, reply: Reply, style: int) -> None:
@@ -105,4 +120,4 @@ class CanLink(DeviceLink[CanFrame, int]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:
             self._receiver = self._new_receiver()
-            self._address.take(self.transport.description, self._style())
+            self._address.take(self.transport.description, self._reply_style())

@@ -1,25 +1,25 @@
-"""The CANopen link: binds the slave of `starhil.protocol.canopen` to a device, its clock and a CAN transport."""
+"""The CANopen link: connects the slave of `starhil.protocol.canopen` to a device, its clock and a CAN transport."""
 
 from __future__ import annotations
 
 import logging
-import random
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import ClassVar, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import Measurement
-from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.requests import Requests
+from starhil.emulator.device.scheduler import Event
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.bus_address import BusAddress
+from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.wire_faults import WireFaults
-from starhil.protocol.can_framing import MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
+from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import Picture, abort_of, check_status
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
@@ -29,20 +29,17 @@ from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Reply, Request, RequestKind
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.values import MessageError, Value
-
-if TYPE_CHECKING:
-    from starhil.emulator.device.scheduler import Event
-    from starhil.protocol.errors import ProtocolError
 
 log = logging.getLogger("starhil.canopen")
 
 MILLISECOND_NS: Final = NANOSECONDS // 1000
 STORAGE_FILE: Final = "canopen.json"
 DEVICE_ERROR: Final = 0xFF00
-"""EMCY error code of the device's error mode: plus the number of `device_error`."""
+"""Base of the EMCY error codes of the error mode; the number of `device_error` is added."""
 STATUS_ROW: Final = "device_status"
 FRAME_ROWS: Final = (
     "precise_attitude",
@@ -54,72 +51,51 @@ FRAME_ROWS: Final = (
     "quaternion",
     "rates",
 )
-"""Telemetry that is new with each frame: TPDOs with any of it have an event then."""
+"""Telemetry that changes with each exposure: TPDOs that map any of it are triggered then."""
 
 Action: TypeAlias = Callable[[float], list[CanFrame]]
 
 
 def not_before(deadline: float) -> int:
-    """First nanosecond at which a deadline in seconds has come, exactly.
+    """Return the first whole nanosecond that is not before a deadline in seconds.
 
-    One nanosecond less, and on the stepped clock the slave would be called again and again before its time.
+    Exact arithmetic: on the stepped clock, a wake-up one nanosecond early would repeat without end.
     """
     numerator, denominator = deadline.as_integer_ratio()
     return -(-numerator * NANOSECONDS // denominator)
 
 
-class BaseFramePieces:
-    """How frames of the base format are damaged: what a bus with a checksum lets through is another frame."""
-
-    def corrupt(self, item: CanFrame, rng: random.Random) -> CanFrame:
-        """Turn one bit of the data, or of the identifier where there is no data."""
-        if not item.data:
-            return replace(item, id=item.id ^ 1 << rng.randrange(11))
-        damaged = bytearray(item.data)
-        damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
-        return replace(item, data=bytes(damaged))
-
-    def junk(self, rng: random.Random) -> CanFrame:
-        """Make a frame with a random identifier."""
-        data = rng.randbytes(rng.randint(0, MAX_FRAME_DATA))
-        return CanFrame(rng.randint(0, MAX_STANDARD_ID), data, extended=False)
-
-    def split(self, item: CanFrame, size: int) -> Sequence[CanFrame]:
-        """Leave a frame whole: a frame is never split."""
-        _ = size
-        return [item]
-
-
 class DeviceApplication:
-    """The device as its object dictionary sees it.
+    """The device behind the object dictionary: implements `starhil.protocol.canopen.application.Application`.
 
     Parameters
     ----------
-    device
-        What answers.
+    requests
+        The device's handling of requests.
     finish
-        Tells the result of a write that was deferred.
+        Called with the result of a deferred write.
     """
 
-    def __init__(self, device: Device, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
-        self._device = device
-        self._finish = finish
-        self._frame: Picture | None = None
+    def __init__(self, requests: Requests, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
+        self._requests = requests
+        self._device = requests.device
+        self._finish_write = finish
+        self._last_image: Picture | None = None
 
-    def forget(self) -> None:
-        """Forget the frame that was taken: the device has restarted."""
-        self._frame = None
+    def clear(self) -> None:
+        """Discard the captured image, as the device has restarted."""
+        self._last_image = None
 
     def telemetry(self, row: Row) -> bytes:
         """Return the present bytes of a telemetry row."""
         try:
-            return self._device.telemetry(row.name)
+            return self._requests.telemetry(row.name)
         except Refused as refused:
             check_status(refused.code, row.name)
             raise
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
-        """Execute a telecommand; it counts and is acknowledged as on the other links."""
+        """Execute a telecommand; it is counted and acknowledged as on the other links."""
         deferred = Deferred()
 
         def done(reply: Reply) -> None:
@@ -128,9 +104,9 @@ class DeviceApplication:
                 check_status(reply.code, row.name)
             except SdoAbortError as abort:
                 refusal = abort
-            self._finish(deferred, refusal)
+            self._finish_write(deferred, refusal)
 
-        replies = self._device.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
+        replies = self._requests.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
         if replies is None:
             return deferred
         for reply in replies[:1]:
@@ -142,36 +118,36 @@ class DeviceApplication:
         return self._device.parameters[name]
 
     def set_parameter(self, name: str, value: Value) -> None:
-        """Set a parameter; what contradicts another one is refused."""
+        """Set a parameter; a value that contradicts another parameter is refused."""
         try:
             self._device.parameters.set({name: value})
         except MessageError as error:
             raise abort_of(error) from None
 
     def image(self, name: str) -> Picture:
-        """Return the frame that was taken, or the image that save_image stored."""
+        """Return the image that `take_image` captured, or the one that save_image stored."""
         if name == "stored":
             stored = self._device.images.stored
             if stored is not None:
                 return Picture(stored.edge, stored.edge, stored.frame, stored.pixels)
-        elif self._frame is not None:
-            return self._frame
+        elif self._last_image is not None:
+            return self._last_image
         raise SdoAbortError(AbortCode.NO_DATA, f"{name} image")
 
     def take_image(self, name: str) -> Deferred:
-        """Take a whole frame; the write is answered when it has come."""
+        """Capture a full image; the write is answered when it is complete."""
         if self._device.images.busy:
-            raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being taken")
+            raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being captured")
         deferred = Deferred()
 
         def done(picture: Picture | None) -> None:
             if picture is None:
-                self._finish(deferred, SdoAbortError(AbortCode.HARDWARE, "no frame"))
+                self._finish_write(deferred, SdoAbortError(AbortCode.HARDWARE, "no frame"))
             else:
-                self._frame = picture
-                self._finish(deferred, None)
+                self._last_image = picture
+                self._finish_write(deferred, None)
 
-        self._device.images.take_full(
+        self._device.images.capture_full(
             lambda full: done(
                 None if full is None else Picture(full.width, full.height, full.frame, full.pixels)
             )
@@ -179,51 +155,55 @@ class DeviceApplication:
         return deferred
 
     def save(self) -> Deferred:
-        """Store the device's parameters (1010h); the write is answered when they are on the disk."""
-        return self._later(self._device.save_parameters)
+        """Save the device's parameters (1010h); the write is answered when they are on disk."""
+        return self._deferred(self._device.save_parameters)
 
     def restore(self) -> Deferred:
-        """Let the defaults hold from the next restart on (1011h)."""
-        return self._later(self._device.forget_parameters)
+        """Restore the defaults at the next restart (1011h)."""
+        return self._deferred(self._device.forget_parameters)
 
-    def _later(self, work: Callable[[Callable[[EmulatorError | None], None]], None]) -> Deferred:
+    def _deferred(self, work: Callable[[Callable[[EmulatorError | None], None]], None]) -> Deferred:
         deferred = Deferred()
 
         def done(error: EmulatorError | None) -> None:
-            self._finish(deferred, None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error)))
+            self._finish_write(
+                deferred, None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error))
+            )
 
         work(done)
         return deferred
 
 
 class CanopenLink:
-    """A node on the bus.
+    """Connects a device to a CAN bus as a CANopen slave.
 
     Parameters
     ----------
-    device
-        What it is.
+    requests
+        The device's handling of requests.
     transport
-        Where frames come from and go to.
+        Transport of the bus.
     storage
-        Where communication parameters survive a restart.
+        Storage of the communication parameters across restarts.
     seed
-        Seed of wire faults.
+        Seed of the wire faults.
 
-    The node-ID is the device's parameter `canopen_node`, unless LSS has stored another.
+    The node-ID is the device's parameter `canopen_node`, unless LSS has stored another one.
     """
+
+    bus: ClassVar[str] = "can"
 
     def __init__(
         self,
-        device: Device,
+        requests: Requests,
         transport: Transport[CanFrame],
         storage: ParameterStorage | None = None,
         seed: int = 0,
     ) -> None:
-        self._device = device
+        device = self._device = requests.device
         self.transport: Final = transport
         dictionary = build_dictionary(device.icd)
-        self.application = DeviceApplication(device, self._finish)
+        self.application = DeviceApplication(requests, self._finish_write)
         dictionary.application = self.application
         bit_rates = frozenset(dictionary.layout.bit_rates)
         self.slave = CanopenSlave(dictionary, self._wanted_node, storage=storage, bit_rates=bit_rates)
@@ -239,19 +219,19 @@ class CanopenLink:
         self._reconnects = 0
         self._node = BusAddress("node", "links.canopen.node")
         self.wire: WireFaults[CanFrame] = WireFaults(
-            transport.send, BaseFramePieces(), device.clock, device.scheduler, seed
+            transport.send, CanDamage(extended=False), device.clock, device.scheduler, seed
         )
-        device.on_frame.append(self._frame_made)
+        device.on_frame.append(self._frame_published)
         device.on_mode.append(self._mode_changed)
         device.on_reset.append(self._device_reset)
         device.parameters.observe(self._parameters_changed)
 
     async def start(self) -> str:
-        """Join the bus and boot up; return what was taken."""
-        await self.transport.start(self._receive, self._complain)
+        """Join the bus and send the boot-up message; return the description of the bus."""
+        await self.transport.start(self._receive, self._log_transport_error)
         node = self.slave.node_id
         self._node.take(self.transport.description, 0 if node == UNCONFIGURED else node)
-        self._do(self.slave.start)
+        self._run_action(self.slave.start)
         return self.transport.description
 
     async def close(self) -> None:
@@ -269,11 +249,11 @@ class CanopenLink:
         return self._device.clock.now_ns() / NANOSECONDS
 
     def _receive(self, frame: CanFrame) -> None:
-        if not frame.extended and not self._device.deaf:
-            self._do(lambda now: self.slave.receive(frame, now))
+        if not frame.extended and not self._device.unresponsive:
+            self._run_action(lambda now: self.slave.receive(frame, now))
 
-    def _do(self, action: Action) -> None:
-        """Let the slave do something and send what it says; what that causes in the device comes after it."""
+    def _run_action(self, action: Action) -> None:
+        """Run an action of the slave, send its frames and handle its events; nested actions run after it."""
         self._actions.append(action)
         if self._busy:
             return
@@ -281,17 +261,17 @@ class CanopenLink:
         try:
             while self._actions:
                 frames = self._actions.popleft()(self._now())
-                if not self._device.deaf:
+                if not self._device.unresponsive:
                     for frame in frames:
                         self.wire.send(frame)
                 for event in self.slave.take_events():
-                    self._take(event)
+                    self._handle_event(event)
         finally:
             self._busy = False
-        self._plan()
+        self._schedule_tick()
 
-    def _plan(self) -> None:
-        """Wake up when the slave wants to; a wake-up that was entered for an earlier time does no harm and stays."""
+    def _schedule_tick(self) -> None:
+        """Schedule the slave's next deadline; an earlier tick that is already scheduled stays."""
         deadline = self.slave.next_deadline()
         if deadline is None:
             return
@@ -307,18 +287,20 @@ class CanopenLink:
         reconnects = self.transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
-            self._do(partial(self._raise, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION))
-            self._do(partial(self._clear, ErrorCode.BUS_OFF_RECOVERED))
-        self._do(self.slave.tick)
+            self._run_action(
+                partial(self._raise_emergency, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION)
+            )
+            self._run_action(partial(self._clear_emergency, ErrorCode.BUS_OFF_RECOVERED))
+        self._run_action(self.slave.tick)
 
-    def _raise(self, code: int, bits: int, now: float) -> list[CanFrame]:
+    def _raise_emergency(self, code: int, bits: int, now: float) -> list[CanFrame]:
         return self.slave.raise_emergency(code, bits, now=now)
 
-    def _clear(self, code: int, now: float) -> list[CanFrame]:
+    def _clear_emergency(self, code: int, now: float) -> list[CanFrame]:
         return self.slave.clear_emergency(code, now=now)
 
-    def _take(self, event: SlaveEvent) -> None:
-        """Act on what the slave reports."""
+    def _handle_event(self, event: SlaveEvent) -> None:
+        """Handle an event that the slave reports."""
         match event.kind:
             case EventKind.TIME:
                 self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)
@@ -328,7 +310,7 @@ class CanopenLink:
                 log.debug("%s %g %s", event.kind, event.value, event.detail)
 
     def _reset_device(self) -> int:
-        """Restart the device because NMT resets the node."""
+        """Reset the device because NMT reset the node; return the node-ID to start with."""
         self._resetting = True
         try:
             self._device.reset("command")
@@ -336,36 +318,36 @@ class CanopenLink:
             self._resetting = False
         return self._wanted_node
 
-    def _finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> None:
-        self._do(lambda now: self.slave.finish_write(deferred, now, refusal))
+    def _finish_write(self, deferred: Deferred, refusal: SdoAbortError | None) -> None:
+        self._run_action(lambda now: self.slave.finish_write(deferred, now, refusal))
 
-    def _notify(self, rows: Sequence[str]) -> None:
+    def _notify_rows(self, rows: Sequence[str]) -> None:
         keys = frozenset(key for row in rows for key in self._dictionary.sources.get(row, ()))
-        self._do(lambda now: self.slave.notify(keys, now))
+        self._run_action(lambda now: self.slave.notify(keys, now))
 
-    def _frame_made(self, measurement: Measurement) -> None:
+    def _frame_published(self, measurement: Measurement) -> None:
         rows: tuple[str, ...] = FRAME_ROWS
         if measurement.valid != self._attitude_valid:
             self._attitude_valid = measurement.valid
             rows = (*rows, STATUS_ROW)
-        self._notify(rows)
+        self._notify_rows(rows)
 
     def _mode_changed(self, transition: Transition) -> None:
         if transition.after is Mode.ERROR:
-            # The cause of the error stands only when the change is done.
+            # The cause of the error is set only after the mode has changed.
             self._device.scheduler.at(self._device.clock.now_ns(), self._device_failed)
             return
         if transition.before is Mode.ERROR:
             for number in self._device.icd.enums["device_error"].names:
-                self._do(partial(self._clear, DEVICE_ERROR + number))
-        self._notify([STATUS_ROW])
+                self._run_action(partial(self._clear_emergency, DEVICE_ERROR + number))
+        self._notify_rows([STATUS_ROW])
 
     def _device_failed(self, _due_ns: int) -> None:
         numbers = self._device.icd.enums["device_error"].values
         code = DEVICE_ERROR + numbers.get(self._device.modes.error, 0)
         if self._device.modes.mode is Mode.ERROR:
-            self._do(partial(self._raise, code, ErrorRegister.MANUFACTURER))
-            self._notify([STATUS_ROW])
+            self._run_action(partial(self._raise_emergency, code, ErrorRegister.MANUFACTURER))
+            self._notify_rows([STATUS_ROW])
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:
@@ -374,22 +356,22 @@ class CanopenLink:
             except StorageError as error:
                 log.warning("%s", error)
         keys = frozenset(self._dictionary.parameters[name] for name in names)
-        self._do(lambda now: self.slave.notify(keys, now))
+        self._run_action(lambda now: self.slave.notify(keys, now))
 
     def _device_reset(self) -> None:
-        """Restart with the device, unless the restart came over this bus and is done already."""
+        """Restart the node with the device, unless an NMT reset of the node caused the restart."""
         self._attitude_valid = False
-        self.application.forget()
+        self.application.clear()
         if not self._resetting:
-            self._do(lambda now: self.slave.reset_node(now, self._wanted_node))
+            self._run_action(lambda now: self.slave.reset_node(now, self._wanted_node))
 
-    def _complain(self, error: ProtocolError) -> None:
+    def _log_transport_error(self, error: ProtocolError) -> None:
         log.warning("%s", error)
 
 
 def open_canopen(
-    device: Device, transport: Transport[CanFrame], state_dir: Path | None, seed: int
+    requests: Requests, transport: Transport[CanFrame], state_dir: Path | None, seed: int
 ) -> CanopenLink:
-    """Make the link with its parameters in `state_dir`, or in memory until the process ends."""
+    """Make a link that stores its parameters in `state_dir`, or in memory if that is None."""
     storage = MemoryStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
-    return CanopenLink(device, transport, storage, seed)
+    return CanopenLink(requests, transport, storage, seed)

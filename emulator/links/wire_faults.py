@@ -1,4 +1,4 @@
-"""Faults of the wire, laid between a link and its transport: delayed, dropped, corrupted, split replies, and junk."""
+"""Wire faults between a link and its transport: delay, loss, corruption, splitting and junk."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class WireFaultSettings:
-    """What goes wrong on a wire.
+    """Faults of a wire.
 
     Attributes
     ----------
     drop, corrupt
-        Chance that an outgoing piece (a serial reply, a CAN frame) is lost, or has one bit turned.
+        Probability that an outgoing item (a serial reply or a CAN frame) is lost, or has one bit flipped.
     delay_s
-        Time that every outgoing piece is held back, seconds.
+        Delay of every outgoing item, seconds.
     split
-        A serial reply leaves in pieces of this many bytes with `gap_s` between them; 0: whole.
+        Size of the pieces, in bytes, in which a serial reply is sent; 0 sends it whole.
     gap_s
         Pause between the pieces of a split reply, seconds.
     junk
-        Chance that random bytes (serial) or a frame with a random identifier (CAN) go before a piece.
+        Probability that random bytes (serial) or a random frame (CAN) are sent before an item.
     """
 
     drop: float = 0.0
@@ -41,42 +41,42 @@ class WireFaultSettings:
 
     @property
     def none(self) -> bool:
-        """Whether nothing goes wrong."""
+        """Whether no fault is set."""
         return not (self.drop or self.corrupt or self.delay_s or self.split or self.junk)
 
 
-class Pieces(Protocol[Item]):
-    """How pieces of one kind of wire are damaged."""
+class Damage(Protocol[Item]):
+    """Damages items of one kind of wire."""
 
     def corrupt(self, item: Item, rng: random.Random) -> Item:
-        """Turn one bit."""
+        """Return the item with one bit flipped."""
 
     def junk(self, rng: random.Random) -> Item:
-        """Make something that nobody sent."""
+        """Return a random item."""
 
-    def split(self, item: Item, size: int) -> Sequence[Item]:
-        """Cut into pieces."""
+    def split(self, item: Item, size: int, /) -> Sequence[Item]:
+        """Split into pieces of `size` bytes, where the wire allows it."""
 
 
 class WireFaults(Generic[Item]):
-    """The outgoing side of a wire, as bad as it is told to be. What is held back leaves in the order in which it came.
+    """The outgoing side of a wire, with its faults. Items never overtake each other.
 
     Parameters
     ----------
     send
-        Where undamaged pieces go.
-    pieces
-        How pieces of this wire are damaged.
+        Sends an item on the transport.
+    damage
+        Damages items of this wire.
     clock, scheduler
-        The device's: what is held back leaves in run time, so that it does at the same frames whatever the clock.
+        Clock and scheduler of the device: delays pass in simulation time.
     seed
-        Seed of what goes wrong.
+        Seed of the random faults.
     """
 
     def __init__(
         self,
         send: Callable[[Item], object],
-        pieces: Pieces[Item],
+        damage: Damage[Item],
         clock: Clock,
         scheduler: Scheduler,
         seed: int,
@@ -84,56 +84,56 @@ class WireFaults(Generic[Item]):
         self.settings = WireFaultSettings()
         self.dropped = self.corrupted = 0
         self._send = send
-        self._pieces = pieces
+        self._damage = damage
         self._clock = clock
         self._scheduler = scheduler
         self._rng = random.Random(seed)  # noqa: S311 (faults, not secrets)
-        self._waiting: deque[tuple[int, Item]] = deque()
-        """What is held back, with the run time at which it leaves, nanoseconds."""
+        self._held: deque[tuple[int, Item]] = deque()
+        """Delayed items, each with the simulation time at which it is sent, nanoseconds."""
         self._free_ns = 0
-        self._awaited = False
+        self._release_scheduled = False
 
     def send(self, item: Item) -> None:
-        """Send a piece, or what becomes of it."""
+        """Send an item, subject to the faults that are set."""
         settings, rng = self.settings, self._rng
         if settings.none:
-            if self._waiting:
-                self._leave([item], settings)
+            if self._held:
+                self._send_or_hold([item], settings)
             else:
                 self._send(item)
             return
         if rng.random() < settings.junk:
-            self._leave([self._pieces.junk(rng)], settings)
+            self._send_or_hold([self._damage.junk(rng)], settings)
         if rng.random() < settings.drop:
             self.dropped += 1
             return
         if rng.random() < settings.corrupt:
             self.corrupted += 1
-            item = self._pieces.corrupt(item, rng)
-        self._leave(self._pieces.split(item, settings.split) if settings.split else [item], settings)
+            item = self._damage.corrupt(item, rng)
+        self._send_or_hold(self._damage.split(item, settings.split) if settings.split else [item], settings)
 
-    def _leave(self, parts: Sequence[Item], settings: WireFaultSettings) -> None:
-        """Let the parts of one piece go, behind all that was sent before."""
+    def _send_or_hold(self, pieces: Sequence[Item], settings: WireFaultSettings) -> None:
+        """Send the pieces of one item, now or later, after all that was sent before."""
         now_ns = self._clock.now_ns()
         at_ns = max(now_ns + round(settings.delay_s * NANOSECONDS), self._free_ns)
-        gap_ns = round(settings.gap_s * NANOSECONDS) if len(parts) > 1 else 0
-        for part in parts:
-            if at_ns > now_ns or self._waiting:
-                self._waiting.append((at_ns, part))
+        gap_ns = round(settings.gap_s * NANOSECONDS) if len(pieces) > 1 else 0
+        for piece in pieces:
+            if at_ns > now_ns or self._held:
+                self._held.append((at_ns, piece))
             else:
-                self._send(part)
+                self._send(piece)
             at_ns += gap_ns
         self._free_ns = at_ns
-        self._await()
+        self._schedule_release()
 
-    def _await(self) -> None:
-        if self._waiting and not self._awaited:
-            self._awaited = True
-            self._scheduler.at(self._waiting[0][0], self._send_due)
+    def _schedule_release(self) -> None:
+        if self._held and not self._release_scheduled:
+            self._release_scheduled = True
+            self._scheduler.at(self._held[0][0], self._release_due)
 
-    def _send_due(self, _due_ns: int) -> None:
-        self._awaited = False
+    def _release_due(self, _due_ns: int) -> None:
+        self._release_scheduled = False
         now_ns = self._clock.now_ns()
-        while self._waiting and self._waiting[0][0] <= now_ns:
-            self._send(self._waiting.popleft()[1])
-        self._await()
+        while self._held and self._held[0][0] <= now_ns:
+            self._send(self._held.popleft()[1])
+        self._schedule_release()

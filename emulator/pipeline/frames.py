@@ -212,7 +212,6 @@ class Warm:
 
 @dataclass(frozen=True)
 class Failure:
-    """The pipeline could not do what was asked; `fatal` if it cannot go on."""
+    """The pipeline could not do what was asked."""
 
     text: str
-    fatal: bool

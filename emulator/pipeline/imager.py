@@ -54,22 +54,6 @@ class Imager(Protocol):
         ...
 
 
-class DirectImager:
-    """Does each request where it is asked for: for tests, and for runs without an event loop."""
-
-    pending = 0
-
-    def __init__(self, handle: Callable[[Asked], Answer]) -> None:
-        self._handle = handle
-
-    def submit(self, request: Asked, done: Done) -> None:
-        """Do the request and call back."""
-        done(self._handle(request))
-
-    async def settle(self) -> None:
-        """Nothing is ever pending."""
-
-
 class _Queue:
     """Callbacks that wait for their answers, in order, and the start that they need."""
 
@@ -113,7 +97,7 @@ class _Queue:
         was_ready = warm.done() and not warm.cancelled() and warm.exception() is None
         self._start_failed(text)
         while self._waiting:
-            self._answer(Failure(text, fatal=True))
+            self._answer(Failure(text))
         if was_ready:
             log.error("%s", text)
             if self.on_failure is not None:
@@ -176,7 +160,7 @@ class ProcessImager(_Queue):
     def submit(self, request: Asked, done: Done) -> None:
         """Send a request to the worker."""
         if not self._worker.running or self._writer is None:
-            done(Failure("picture worker: not running", fatal=True))
+            done(Failure("picture worker: not running"))
             return
         data = _packed(request)
         self._enqueue(done)
@@ -260,7 +244,7 @@ class ThreadImager(_Queue):
     def submit(self, request: Asked, done: Done) -> None:
         """Hand a request to the thread."""
         if self._thread is None:
-            done(Failure("picture thread: not running", fatal=True))
+            done(Failure("picture thread: not running"))
             return
         self._enqueue(done)
         self._requests.put(request)

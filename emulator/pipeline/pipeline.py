@@ -68,9 +68,9 @@ def make_picture(setup: PipelineSetup) -> tuple[Picture, Warm] | Failure:
         picture = Picture(setup)
         picture.warm_up()
     except (EmulatorError, StaridError) as error:
-        return Failure(str(error), fatal=True)
+        return Failure(str(error))
     except Exception as error:  # noqa: BLE001 (in one line, instead of a traceback of a process that is gone)
-        return Failure(f"picture pipeline: internal error: {one_line(error)}", fatal=True)
+        return Failure(f"picture pipeline: internal error: {one_line(error)}")
     warm = Warm(picture.camera.to_dict(), len(picture.catalog), time.perf_counter() - begin)
     return picture, warm
 
@@ -130,9 +130,9 @@ class Picture:
                 return self._image(request)
             return self._frame(request)
         except (EmulatorError, StaridError) as error:
-            return Failure(str(error), fatal=False)
+            return Failure(str(error))
         except Exception as error:  # noqa: BLE001 (one frame that fails must not end those after it)
-            return Failure(f"picture pipeline: internal error: {one_line(error)}", fatal=False)
+            return Failure(f"picture pipeline: internal error: {one_line(error)}")
 
     def _frame(self, request: FrameRequest) -> FrameResult:
         begin = time.perf_counter()

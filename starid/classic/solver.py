@@ -35,8 +35,8 @@ from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.index_choice import pixels_per_radian
 from starid.geometric.pattern_index import field_solid_angle, seen_stars
-from starid.geometric.validation import checked_detections
 from starid.solution import Reason, Solution
+from starid.solver_input import checked_detections
 from starid.wahba import covariance, solve_wahba
 
 Array = NDArray[np.float64]

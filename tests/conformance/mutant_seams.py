@@ -75,8 +75,8 @@ def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]
     """Come between the links and the device: the change gets device, request and the healthy handler."""
 
     def damage(unit: SimulatedUnit) -> None:
-        device, handle = unit.device, unit.device.handle
-        device.handle = lambda request, later=None: change(device, request, lambda r: handle(r, later))
+        device, requests, handle = unit.device, unit.requests, unit.requests.handle
+        requests.handle = lambda request, later=None: change(device, request, lambda r: handle(r, later))
 
     return damage
 
@@ -86,13 +86,13 @@ def events(change: Callable[[Any], list[Any]]) -> Damage:
 
     def damage(unit: SimulatedUnit) -> None:
         link = unit.link
-        take = link._take
+        take = link._dispatch
 
         def changed(event: Any) -> None:
             for other in change(event):
                 take(other)
 
-        link._take = changed
+        link._dispatch = changed
 
     return damage
 
@@ -106,7 +106,7 @@ def without_faults(*kinds: FaultKind) -> Damage:
     """Let the device not hear of some kinds of fault."""
 
     def damage(unit: SimulatedUnit) -> None:
-        device, fault = unit.device, unit.device.fault
-        device.fault = lambda event: None if event.kind in kinds else fault(event)
+        requests, count_fault = unit.requests, unit.requests.count_fault
+        requests.count_fault = lambda event: None if event.kind in kinds else count_fault(event)
 
     return damage

@@ -17,12 +17,12 @@ from tests.conformance.simulated import SimulatedUnit
 
 @mutant("boots are not counted", "both", "reset.acknowledged")
 def boots_not_counted(unit: SimulatedUnit) -> None:
-    unit.store.save = lambda _content: None
+    unit.device.on_start.append(lambda: setattr(unit.device, "boot_count", 1))
 
 
 @mutant("attitudes stay valid in standby", "both", "modes.standby")
 def stale_attitude(unit: SimulatedUnit) -> None:
-    original = unit.device.telemetry
+    original = unit.requests.telemetry
 
     def changed(name: str) -> bytes:
         data = bytearray(original(name))
@@ -31,7 +31,7 @@ def stale_attitude(unit: SimulatedUnit) -> None:
             data[field.offset] |= 1 << field.shift
         return bytes(data)
 
-    unit.device.telemetry = changed
+    unit.requests.telemetry = changed
 
 
 def _reversed_tail(replies: list[Reply]) -> list[Reply]:
@@ -43,7 +43,7 @@ def _telemetry_bytes(name: str, field: str, change: Callable[[bytes], bytes]) ->
     """Change the bytes of one field of a row."""
 
     def damage(unit: SimulatedUnit) -> None:
-        original = unit.device.telemetry
+        original = unit.requests.telemetry
         item = unit.device.icd.telemetry[name].named_fields[field]
 
         def changed(asked: str) -> bytes:
@@ -53,7 +53,7 @@ def _telemetry_bytes(name: str, field: str, change: Callable[[bytes], bytes]) ->
             end = item.offset + item.size
             return data[: item.offset] + change(data[item.offset : end]) + data[end:]
 
-        unit.device.telemetry = changed
+        unit.requests.telemetry = changed
 
     return damage
 

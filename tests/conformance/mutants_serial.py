@@ -120,7 +120,7 @@ def talkative(unit: SimulatedUnit) -> None:
     def say(reply: Reply) -> None:
         unit.link._send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY), Dialect.B)
 
-    unit.device.outlets[:] = [say]
+    unit.requests.unsolicited_receivers[:] = [say]
 
 
 @mutant("replies leave faster than the line", "serial", "timing.pace")

@@ -10,11 +10,12 @@ from typing import Any, Self
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
-from starhil.emulator.pipeline.imager import Answer, Asked, DirectImager
+from starhil.emulator.pipeline.imager import Answer, Asked
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.truth.source import FixedTruth
@@ -26,6 +27,7 @@ from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced_writer import PacedWriter
 from starid.attitude import Attitude
+from tests.emulator.runs import DirectImager
 
 BAUD = 115200
 BOUND_S = 0.0005
@@ -204,9 +206,10 @@ class SimulatedUnit:
         self.device = Device(
             profile, load_icd(), LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
         )
+        self.requests = Requests(self.device)
         self.transport = MemoryTransport(self.loop, paced=self.kind == "serial")
         self.link: SerialLink | CanLink
-        self.link = (SerialLink if self.kind == "serial" else CanLink)(self.device, self.transport)
+        self.link = (SerialLink if self.kind == "serial" else CanLink)(self.requests, self.transport)
         if self._damage is not None:
             self._damage(self)
         self.device.power_on()

@@ -11,18 +11,20 @@ import pytest
 
 from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore, StateStore
-from starhil.emulator.emulation import Emulation, RunOptions
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.launch import Run, RunOptions
 from starhil.emulator.pipeline import worker_process
 from starhil.emulator.pipeline.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
-from starhil.emulator.pipeline.imager import Answer, Asked, DirectImager
+from starhil.emulator.pipeline.imager import Answer, Asked
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth, TruthSource
 from starhil.protocol.icd import load_icd
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starid.attitude import Attitude
-from tests.emulator.runs import FakeImager
+from tests.emulator.runs import DirectImager, FakeImager
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 STARS = (
@@ -105,6 +107,7 @@ class Bench:
             self.store,
             truth or FixedTruth(ORION),
         )
+        self.requests = Requests(self.device)
 
     def start(self) -> Bench:
         """Power on and boot."""
@@ -125,7 +128,7 @@ class Bench:
         """Send a telecommand; return all replies."""
         row = self.icd.telecommands[name]
         request = Request.of(row.id, row.encode(values) if data is None else data)
-        return self.device.handle(request, self.later.append) or []
+        return self.requests.handle(request, self.later.append) or []
 
     def command(self, name: str, **values: object) -> ErrorCode:
         """Send a telecommand; return what it was answered with."""
@@ -136,7 +139,7 @@ class Bench:
     def read(self, name: str) -> dict:
         """Read telemetry in physical units."""
         row = self.icd.telemetry[name]
-        (reply,) = self.device.handle(Request.of(row.id))
+        (reply,) = self.requests.handle(Request.of(row.id))
         assert reply.kind is ReplyKind.TELEMETRY, reply
         return row.decode(reply.data)
 
@@ -174,13 +177,13 @@ def run(monkeypatch, make_bench):
         )
 
         async def whole():
-            emulation = Emulation(profile, options or RunOptions(control="auto"))
+            run.launched = Run(profile, options or RunOptions(control="auto"))
             try:
-                await emulation.start()
-                line = await emulation.ready()
-                return await scenario(emulation, line)
+                await run.launched.start()
+                line = await run.launched.emulation.ready()
+                return await scenario(run.launched.emulation, line)
             finally:
-                await emulation.close()
+                await run.launched.close()
 
         return asyncio.run(whole())
 

@@ -2,11 +2,29 @@
 
 import asyncio
 import json
+from collections.abc import Callable
 
 from starhil.emulator.pipeline.frames import Warm
-from starhil.emulator.pipeline.imager import DirectImager
+from starhil.emulator.pipeline.imager import Answer, Asked, Done
+from starhil.protocol.messages import ErrorCode, Request
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
+
+
+class DirectImager:
+    """Answers each request at once, in the call that submits it."""
+
+    pending = 0
+
+    def __init__(self, handle: Callable[[Asked], Answer]) -> None:
+        self._handle = handle
+
+    def submit(self, request: Asked, done: Done) -> None:
+        """Do the request and call back."""
+        done(self._handle(request))
+
+    async def settle(self) -> None:
+        """Nothing is ever pending."""
 
 
 class FakeImager(DirectImager):
@@ -21,11 +39,23 @@ class FakeImager(DirectImager):
         return
 
 
+def command(emulation, name, **values) -> ErrorCode | None:
+    """Send a telecommand past the links; return its error code, or None while its outcome is open."""
+    row = emulation.device.icd.telecommands[name]
+    replies = emulation.requests.handle(Request.of(row.id, row.encode(values)))
+    return ErrorCode(replies[0].code) if replies else None
+
+
+def read(emulation, name) -> dict:
+    """Read telemetry past the links, in physical units."""
+    return emulation.device.icd.telemetry[name].decode(emulation.requests.telemetry(name))
+
+
 class Control:
     """A peer on the control channel."""
 
     def __init__(self, emulation) -> None:
-        self.address = emulation.ready_words["control"]
+        self.address = emulation.ready_fields["control"]
 
     async def __aenter__(self):
         path = self.address.removeprefix("unix:")

@@ -9,15 +9,17 @@ import pytest
 from starhil.emulator.clock import SteppedClock
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.emulation import Emulation, RunOptions
+from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.frames import Warm
 from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.profile import Profile, RunConfig, configs_folder
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.protocol.errors import ProtocolError
-from tests.emulator.runs import CAMERA, Control, FakeImager
+from starhil.protocol.messages import ErrorCode
+from tests.emulator.runs import CAMERA, Control, FakeImager, command, read
 
 
 def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
@@ -54,7 +56,7 @@ def test_the_real_clock_goes_by_itself(run):
     async def scenario(emulation, _line):
         device = emulation.device
         assert device.modes.mode.value == "standby"
-        device.telecommand("set_mode", {"mode": "lost_in_space"})
+        command(emulation, "set_mode", mode="lost_in_space")
         while device.cycle.published < 5:
             await asyncio.sleep(0.01)
         assert device.latest.valid
@@ -70,7 +72,7 @@ def test_the_truth_log_has_a_row_a_frame(run, tmp_path):
 
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
-        emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+        command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(2.5)
         run.picture.fail = "no_match"
         await emulation.stepper.step(1.0)
@@ -91,7 +93,7 @@ def test_a_truth_log_on_a_full_disk_ends_with_a_whole_row_and_the_run_goes_on(ru
 
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
-        emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+        command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(6.0)
         return emulation.device.cycle.published
 
@@ -117,7 +119,7 @@ def test_a_truth_log_can_be_replayed(run, tmp_path):
 
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
-        emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+        command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(5.0)
         wanted.append(emulation.device.cycle.truth.state(2.4))
 
@@ -143,11 +145,11 @@ def test_a_scenario_happens_at_its_run_times(run, tmp_path):
 
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.99)
-        assert not emulation.device.deaf
+        assert not emulation.device.unresponsive
         await emulation.stepper.step(0.02)
-        assert emulation.faults.describe() == {"optical": {"false_stars": 3}, "device": {"stuck": True}}
+        assert run.launched.faults.describe() == {"optical": {"false_stars": 3}, "device": {"stuck": True}}
         await emulation.stepper.step(1.0)
-        assert emulation.faults.describe() == {}
+        assert run.launched.faults.describe() == {}
         assert emulation.device.cycle.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
 
     run(scenario, options=RunOptions(scenario=str(path)))
@@ -315,7 +317,7 @@ def test_a_symlink_in_use_is_refused_and_stays(run, tmp_path):
         first = link.readlink()
         second = Emulation(Profile.model_validate({"run": {"clock": "stepped"}, "links": links}))
         with pytest.raises(EmulatorError, match="in use by another emulator"):
-            await second.start()
+            await second.open()
         await second.close()
         assert link.readlink() == first
 
@@ -343,21 +345,22 @@ def test_a_pipeline_that_dies_is_told_and_comes_back():
         assert isinstance(emulation.imager, ProcessImager)
         assert isinstance(emulation.clock, SteppedClock)
         try:
-            await emulation.start()
+            await emulation.open()
+            emulation.begin()
             await emulation.ready()
             await emulation.stepper.step(1.0)
-            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+            command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)
             assert emulation.device.latest.valid
             emulation.imager._worker.process.kill()
             while emulation.device.modes.mode.value != "error":
                 await asyncio.sleep(0.01)
             assert emulation.device.modes.error == "processing"
-            assert emulation.device.telemetry_values("precise_attitude")["reason"] == "processing_error"
+            assert read(emulation, "precise_attitude")["reason"] == "processing_error"
             while not emulation.device.warm:  # another one comes up by itself
                 await asyncio.sleep(0.05)
-            emulation.device.telecommand("set_mode", {"mode": "standby"})
-            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+            command(emulation, "set_mode", mode="standby")
+            command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)
             assert emulation.device.latest.valid
         finally:
@@ -386,7 +389,7 @@ def test_a_part_that_fails_to_close_keeps_no_other_open(run, tmp_path, caplog):
 
     async def scenario(emulation, _line):
         closed = []
-        emulation.control = Unclosable(emulation.control)
+        run.launched.control = Unclosable(run.launched.control)
         emulation.imager.close = lambda: closed.append("imager") or 1 / 0
         emulation._closers.append(lambda: 1 / 0)
         return closed
@@ -403,10 +406,11 @@ def test_a_save_that_fails_in_an_unforeseen_way_ends_the_acknowledge(run, monkey
     async def scenario(emulation, _line):
         device = emulation.device
         monkeypatch.setattr(device.store, "save", lambda _content: {}["no such key"])
-        device.telecommand("save_parameters", {})
+        command(emulation, "save_parameters")
         while not device.acknowledge.processed:
             await asyncio.sleep(0.01)
         assert device.acknowledge.error.name == "INTERNAL"
+        assert device.parameters.differ_from_store is False
 
     run(scenario, clock="real", device={"boot_s": 0.1})
 
@@ -422,7 +426,7 @@ def test_a_scenario_that_replaces_a_live_truth_closes_its_port(run, tmp_path):
     )
 
     async def scenario(emulation, _line):
-        protocol, host, port = emulation.ready_words["truth"].split(":")
+        protocol, host, port = emulation.ready_fields["truth"].split(":")
         assert protocol == "tcp"
         _, writer = await asyncio.open_connection(host, int(port))
         writer.close()
@@ -444,8 +448,7 @@ def test_an_observer_that_fails_stops_neither_the_frames_nor_the_other_observers
         device.on_frame.append(seen.append)
         if emulation.stepper:
             await emulation.stepper.step(1.0)  # the boot
-        code, _ = device.telecommand("set_mode", {"mode": "lost_in_space"})
-        assert code.name == "OK"
+        assert command(emulation, "set_mode", mode="lost_in_space") is ErrorCode.OK
         while len(seen) < 3:
             await (emulation.stepper.step(1.0) if emulation.stepper else asyncio.sleep(0.01))
 

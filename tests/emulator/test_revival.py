@@ -6,13 +6,13 @@ import pytest
 
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.profile import Profile
-from tests.emulator.runs import CAMERA
+from tests.emulator.runs import CAMERA, command, read
 from tests.emulator.workers import ANSWERING, WORKER
 
 WITHIN_S = 20.0
 ENDS_AT_ONCE = ""
 ENDS_WHEN_READY = WORKER + f"send(Warm({CAMERA}, 5, 0.0))\n"
-REJECTS = WORKER + "send(Failure('no catalogue', fatal=True))\n"
+REJECTS = WORKER + "send(Failure('no catalogue'))\n"
 ATTEMPTS = 3
 
 
@@ -39,7 +39,8 @@ def run(worker):
             process = worker(*programs)
             emulation = Emulation(profile, worker=process)
             try:
-                await emulation.start()
+                await emulation.open()
+                emulation.begin()
                 await asyncio.wait_for(emulation.ready(), WITHIN_S)
                 await asyncio.wait_for(scenario(emulation, process.started), WITHIN_S)
             finally:
@@ -55,9 +56,8 @@ async def until(condition):
         await asyncio.sleep(0.01)
 
 
-def command(emulation, mode):
-    code, _ = emulation.device.telecommand("set_mode", {"mode": mode})
-    return code.name
+def set_mode(emulation, mode):
+    return command(emulation, "set_mode", mode=mode).name
 
 
 async def lose_the_pipeline(emulation, started):
@@ -69,10 +69,10 @@ async def lose_the_pipeline(emulation, started):
 def test_modes_can_be_commanded_again_when_the_pipeline_is_back(run, others):
     async def scenario(emulation, started):
         await lose_the_pipeline(emulation, started)
-        assert command(emulation, "standby") == "SEQUENCE"
+        assert set_mode(emulation, "standby") == "SEQUENCE"
         await until(lambda: emulation.device.warm and len(started) == 2 + len(others))
-        assert command(emulation, "standby") == "OK"
-        assert command(emulation, "lost_in_space") == "OK"
+        assert set_mode(emulation, "standby") == "OK"
+        assert set_mode(emulation, "lost_in_space") == "OK"
         await until(lambda: emulation.device.cycle.published > 2)
 
     run(scenario, ANSWERING, *others, ANSWERING)
@@ -86,14 +86,14 @@ def test_a_pipeline_that_does_not_come_back_is_given_up_until_a_reset(run, caplo
         device = emulation.device
         await lose_the_pipeline(emulation, started)
         await until(lambda: device.modes.error == "pipeline_ended")
-        assert device.telemetry_values("device_status")["error"] == "pipeline_ended"
+        assert read(emulation, "device_status")["error"] == "pipeline_ended"
         assert "reset the device to try again" in caplog.text
         await asyncio.sleep(0.3)
         assert len(started) == 1 + ATTEMPTS
-        assert command(emulation, "standby") == "SEQUENCE"
-        device.telecommand("reset", {})
+        assert set_mode(emulation, "standby") == "SEQUENCE"
+        command(emulation, "reset")
         await until(lambda: device.modes.mode == "standby")
-        assert command(emulation, "lost_in_space") == "OK"
+        assert set_mode(emulation, "lost_in_space") == "OK"
         await until(lambda: device.cycle.published > 2)
 
     run(scenario, *programs)
@@ -114,7 +114,7 @@ def test_a_restart_that_the_system_refuses_is_tried_again(run, monkeypatch):
         monkeypatch.setattr(emulation.imager, "restart", refuse_first)
         await lose_the_pipeline(emulation, started)
         await until(lambda: emulation.device.warm)
-        assert command(emulation, "standby") == "OK"
+        assert set_mode(emulation, "standby") == "OK"
 
     run(scenario, ANSWERING)
 

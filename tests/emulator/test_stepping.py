@@ -45,7 +45,7 @@ def long_step(run):
 
     def long_step():
         async def scenario(emulation, line):
-            peer = Peer(emulation.ready_words["serial"])
+            peer = Peer(emulation.ready_fields["serial"])
             turns = 0
 
             async def count():
@@ -77,7 +77,7 @@ def test_a_long_step_loses_no_byte_and_gives_the_same_ones_again(long_step):
 
 def test_a_request_is_answered_in_the_middle_of_a_long_step(run):
     async def scenario(emulation, _line):
-        peer = Peer(emulation.ready_words["serial"])
+        peer = Peer(emulation.ready_fields["serial"])
         stepping = asyncio.create_task(emulation.stepper.step(STEP_S))
         asked = emulation.device.counters.telemetry
         os.write(peer.fd, encode_request(Request.of(128)))
@@ -94,12 +94,12 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
 
     async def scenario(emulation, _line):
         statistics = emulation.serial.transport.statistics
-        os.open(emulation.ready_words["serial"], os.O_RDWR | os.O_NOCTTY)  # a peer that reads nothing
+        os.open(emulation.ready_fields["serial"], os.O_RDWR | os.O_NOCTTY)  # a peer that reads nothing
         await emulation.stepper.step(STEP_S)
         await emulation.stepper.step(STEP_S)
         assert statistics.dropped > 0
         assert caplog.text.count("does not read") == 1
-        peer = Peer(emulation.ready_words["serial"])
+        peer = Peer(emulation.ready_fields["serial"])
         await emulation.serial.transport.drain()
         dropped = statistics.dropped
         await emulation.stepper.step(STEP_S)
@@ -112,7 +112,7 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
 
 def test_delays_of_a_wire_pass_in_run_time(run):
     async def scenario(emulation, _line):
-        peer = Peer(emulation.ready_words["serial"])
+        peer = Peer(emulation.ready_fields["serial"])
         emulation.serial.wire.settings = type(emulation.serial.wire.settings)(delay_s=5.0)
         os.write(peer.fd, encode_request(Request.of(128)))
         while emulation.device.counters.telemetry == 0:

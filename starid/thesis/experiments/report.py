@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from starid.files import write_atomically
 from starid.thesis.experiments.experiment import Kind, Row
 from starid.thesis.experiments.known_misses import known_miss
-from starid.files import write_atomically
 from starid.thesis.experiments.runner import Finished
 
 REPORT_FILE: Final = "report.md"

@@ -10,7 +10,7 @@ import pytest
 import starhil.protocol.transports.can
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
-from tests.emulator.runs import Control
+from tests.emulator.runs import Control, command
 
 
 def test_time_passes_only_by_steps(run):
@@ -117,7 +117,7 @@ def test_frames_are_told_with_truth_and_error(run):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             await control.do("step", seconds=1.0)
-            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+            command(emulation, "set_mode", mode="lost_in_space")
             await control.do("step", seconds=3.0)
             frames = (await control.do("frames", count=2))["frames"]
             assert [frame["frame"] for frame in frames] == [2, 3]
@@ -178,7 +178,7 @@ def test_a_fault_of_ours_is_answered_and_logged_and_the_connection_stays(run, mo
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             with monkeypatch.context() as patch:
-                patch.setattr(emulation.faults, "describe", lambda: {}[0])
+                patch.setattr(run.launched.faults, "describe", lambda: {}[0])
                 answer = await control.do("clear_faults", id=4)
             assert answer["id"] == 4
             assert not answer["ok"]
@@ -197,7 +197,7 @@ def test_a_live_feed_stays_until_another_one_is_there(run, protocol):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             first = emulation.feed
-            where = emulation.ready_words["truth"]
+            where = emulation.ready_fields["truth"]
             refused = await control.do("set_truth", truth={**live, "host": "192.0.2.1", "port": 5000})
             assert not refused["ok"]
             assert emulation.feed is first
@@ -245,11 +245,11 @@ def test_faults_are_brought_about_and_cleared(run):
             assert (await control.do("fault", device={"stuck": True}))["faults"] == {
                 "device": {"stuck": True}
             }
-            assert device.deaf
+            assert device.unresponsive
             await control.do("fault", serial={"drop": 0.5, "split": 4}, device={"error": "injected"})
             assert device.modes.error == "injected"
             assert emulation.serial.wire.settings.drop == 0.5
-            assert not device.deaf
+            assert not device.unresponsive
             assert (await control.do("clear_faults"))["faults"] == {}
             assert emulation.serial.wire.settings.none
             await control.do("fault", device={"reset": "watchdog"})
@@ -274,7 +274,7 @@ def test_optical_faults_go_with_each_frame(run):
         async with Control(emulation) as control:
             await control.do("step", seconds=1.0)
             assert (await control.do("fault", optical={"false_stars": 7, "blocked_share": 0.25}))["ok"]
-            emulation.device.telecommand("set_mode", {"mode": "lost_in_space"})
+            command(emulation, "set_mode", mode="lost_in_space")
             await control.do("step", seconds=1.0)
             assert run.picture.frames[-1].faults == {"false_stars": 7, "blocked_share": 0.25}
             await control.do("clear_faults")
@@ -289,7 +289,7 @@ def test_a_live_feed_drives_the_truth(run, protocol):
     message = json.dumps({"t": 5.0, "q": [0.0, 0.0, 0.0, 1.0], "rate": [0.0, 0.0, 1.0]}).encode()
 
     async def scenario(emulation, line):
-        kind, host, port = emulation.ready_words["truth"].split(":")
+        kind, host, port = emulation.ready_fields["truth"].split(":")
         assert kind == protocol
         assert f"truth={protocol}:127.0.0.1:" in line
         loop = asyncio.get_running_loop()
@@ -318,6 +318,6 @@ def test_quit_ends_the_run(run):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             assert (await control.do("quit"))["ok"]
-        await asyncio.wait_for(emulation.ended.wait(), 5.0)
+        await asyncio.wait_for(run.launched.ended.wait(), 5.0)
 
     run(scenario)

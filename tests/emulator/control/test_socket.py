@@ -12,8 +12,8 @@ import pytest
 
 from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.control.socket import ControlSocket
-from starhil.emulator.emulation import RunOptions
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.launch import RunOptions
 from tests.emulator.runs import Control
 
 
@@ -30,7 +30,7 @@ def mode(path) -> int:
 
 def test_the_socket_is_for_its_user_alone_and_gone_at_the_end(run, runtime_folder):
     async def scenario(emulation, line):
-        path = emulation.ready_words["control"].removeprefix("unix:")
+        path = emulation.ready_fields["control"].removeprefix("unix:")
         assert f"control=unix:{path}" in line
         assert path == str(runtime_folder / "starhil" / f"control-{os.getpid()}")
         assert mode(path) == 0o600
@@ -49,7 +49,7 @@ def test_without_a_folder_of_the_session_it_is_one_of_the_user(run, tmp_path, mo
     (tmp_path / f"starhil-{os.geteuid()}").mkdir(mode=0o777)
 
     async def scenario(emulation, _line):
-        return emulation.ready_words["control"].removeprefix("unix:")
+        return emulation.ready_fields["control"].removeprefix("unix:")
 
     path = run(scenario)
     assert path.startswith(f"{tmp_path}/starhil-{os.geteuid()}/")
@@ -61,7 +61,7 @@ def test_a_folder_of_somebody_else_is_not_used(run, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     (tmp_path / "theirs").mkdir()
     (tmp_path / f"starhil-{os.geteuid()}").symlink_to(tmp_path / "theirs")
-    with pytest.raises(EmulatorError, match=r"somebody else's; give --control unix:/PATH"):
+    with pytest.raises(EmulatorError, match=r"belongs to another user; give --control unix:/PATH"):
         run(lambda *_: None)
 
 
@@ -72,7 +72,7 @@ def test_a_socket_that_a_killed_emulator_left_is_replaced(run, tmp_path):
     assert path.is_socket()
 
     async def scenario(emulation, _line):
-        assert emulation.ready_words["control"] == f"unix:{path}"
+        assert emulation.ready_fields["control"] == f"unix:{path}"
         async with Control(emulation) as control:
             assert (await control.do("status"))["ok"]
 
@@ -91,7 +91,7 @@ def test_a_path_in_use_is_refused_and_left_alone(run, tmp_path):
             run(lambda *_: None, options=options)
         assert path.is_socket()
     path.unlink()
-    with pytest.raises(EmulatorError, match="is no socket; choose another path"):
+    with pytest.raises(EmulatorError, match="is not a socket; choose another path"):
         run(lambda *_: None, options=RunOptions(control=f"unix:{text}"))
     assert text.read_text() == "of great worth"
 
@@ -130,7 +130,7 @@ def test_with_a_token_nothing_is_done_without_it(run, control):
                     "ok": False,
                     "error": "token: missing or wrong; give that of --control-token",
                 }
-            assert not emulation.ended.is_set()
+            assert not run.launched.ended.is_set()
             assert (await control.do("status", token="sésame"))["ok"]
 
     run(scenario, options=RunOptions(control=control, control_token="sésame"))
@@ -167,7 +167,7 @@ def test_a_key_given_twice_is_refused(run):
                 answer = await control.raw(line)
                 assert answer["ok"] is False
                 assert "given twice" in answer["error"]
-            assert not emulation.ended.is_set()
+            assert not run.launched.ended.is_set()
 
     run(scenario)
 

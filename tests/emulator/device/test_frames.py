@@ -88,7 +88,7 @@ def test_the_highest_rate_that_an_exposure_leaves_is_reached(bench, exposure, ra
     assert abs(attitude["frame_counter"] - 10.0 * rate) <= 0.25 * rate
     mid_points = [frame.index for frame in bench.picture.frames]
     assert len(set(mid_points)) == len(mid_points)
-    assert bench.device.cycle.left_out == 0
+    assert bench.device.cycle.skipped == 0
 
 
 def test_at_a_high_rate_no_exposure_is_left_out_while_results_come_in_time(bench):
@@ -100,10 +100,10 @@ def test_at_a_high_rate_no_exposure_is_left_out_while_results_come_in_time(bench
     assert in_time > MAX_PENDING
     bench.imager.pending = in_time
     bench.step(1.0)
-    assert bench.device.cycle.left_out == 0
+    assert bench.device.cycle.skipped == 0
     bench.imager.pending = in_time + 1
     bench.step(1.0)
-    assert bench.device.cycle.left_out == 50
+    assert bench.device.cycle.skipped == 50
 
 
 def test_delay_time_moves_the_exposure(make_bench):
@@ -126,7 +126,7 @@ def test_exposures_that_the_machine_has_no_time_for_are_left_out_and_tracking_go
     during = bench.read("precise_attitude")
     assert (during["valid"], during["mode"], bench.mode) == (True, "tracking", "tracking")
     assert during["frame_counter"] == before["frame_counter"]
-    assert bench.device.cycle.left_out == 2
+    assert bench.device.cycle.skipped == 2
     bench.imager.pending = 0
     bench.step(2.0)
     after = bench.read("precise_attitude")

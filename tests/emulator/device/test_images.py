@@ -95,7 +95,7 @@ def test_the_last_frame_can_be_downloaded_without_a_capture(bench):
     assert bench.command("init_image_download", sram=1, image_size="size_64") is ErrorCode.OK
     assert not bench.read("acknowledge")["processed"]
     row = bench.icd.telemetry["image_frame"]
-    assert bench.device.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
+    assert bench.requests.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
     bench.step(0.2)
     assert bench.read("acknowledge")["processed"]
     assert bench.device.images.download.frame == bench.picture.frames[-1].index
@@ -119,7 +119,7 @@ def test_a_smaller_size_is_the_mean_over_squares():
 def test_a_whole_frame_is_taken_beside_what_is_stored(bench):
     save(bench, "size_64")
     taken = []
-    bench.device.images.take_full(taken.append)
+    bench.device.images.capture_full(taken.append)
     assert bench.command("save_image", image_size="size_64") is ErrorCode.BUSY
     bench.step(1.0)
     (frame,) = taken
@@ -152,7 +152,7 @@ def test_a_whole_frame_is_taken_though_frames_stop(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
     taken = []
-    bench.device.images.take_full(taken.append)
+    bench.device.images.capture_full(taken.append)
     bench.command("set_mode", mode="standby")
     bench.step(0.25)
     assert [frame.frame for frame in taken] == [bench.picture.frames[-1].index]
@@ -162,7 +162,7 @@ def test_a_capture_ends_when_the_pipeline_is_lost(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
     bench.command("save_image", image_size="size_64")
-    bench.imager._handle = lambda _request: Failure("gone", fatal=True)
+    bench.imager._handle = lambda _request: Failure("gone")
     bench.device.pipeline_lost()
     bench.step(0.25)
     assert bench.read("image_status") == {"percent": 0, "status": "storage_error"}

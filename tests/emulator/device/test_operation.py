@@ -68,7 +68,7 @@ def test_a_lost_pipeline_is_an_error_until_it_is_back(bench):
 
 
 def test_a_stuck_device_takes_and_answers_nothing(bench):
-    bench.device.deaf = True
-    assert bench.device.handle(Request.of(128)) == []
-    bench.device.deaf = False
+    bench.device.unresponsive = True
+    assert bench.requests.handle(Request.of(128)) == []
+    bench.device.unresponsive = False
     assert bench.read("communication_status")["telemetry_count"] == 1

@@ -2,7 +2,7 @@
 
 import pytest
 
-from starhil.emulator.device.device import missing_handlers
+from starhil.emulator.device.requests import missing_handlers
 from starhil.emulator.device.telecommands import TELECOMMANDS
 from starhil.emulator.device.telemetry import TELEMETRY
 from starhil.emulator.profile import Profile
@@ -43,7 +43,7 @@ def test_every_telemetry_row_answers_in_every_state(make_bench, name, mode):
     ],
 )
 def test_bad_requests_get_the_published_code_and_change_nothing(bench, identifier, data, code):
-    (reply,) = bench.device.handle(Request.of(identifier, data))
+    (reply,) = bench.requests.handle(Request.of(identifier, data))
     assert (reply.kind, reply.id, reply.code) == (ReplyKind.NACK, identifier, code)
     assert bench.mode == "standby"
 
@@ -64,7 +64,7 @@ def test_acknowledge_tells_what_became_of_the_last_telecommand(bench):
 def test_counters_count_and_clear(bench):
     for _ in range(3):
         bench.command("set_mode", mode="standby")
-    bench.device.handle(Request.of(31))
+    bench.requests.handle(Request.of(31))
     status = bench.read("communication_status")
     assert (status["telecommand_count"], status["telemetry_count"]) == (4, 1)
     assert bench.command("clear_counters") is ErrorCode.OK
@@ -80,7 +80,7 @@ def test_counters_wrap_at_16_bits(bench):
 
 def test_unsolicited_telemetry_goes_out_at_its_rate(bench):
     sent = []
-    bench.device.outlets.append(sent.append)
+    bench.requests.unsolicited_receivers.append(sent.append)
     assert bench.command("set_unsolicited", telemetry=160, rate=4.0) is ErrorCode.OK
     bench.step(9.99)
     assert len(sent) == 40
@@ -94,7 +94,7 @@ def test_unsolicited_telemetry_goes_out_at_its_rate(bench):
 def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
     bench = make_bench(Profile(parameters={"unsolicited_rate": 2.0, "unsolicited_selection": 128}))
     sent = []
-    bench.device.outlets.append(sent.append)
+    bench.requests.unsolicited_receivers.append(sent.append)
     bench.start()
     assert len(sent) == 3
     assert sent[0].id == 128
@@ -102,7 +102,7 @@ def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
 
 def test_unsolicited_image_frame_is_left_out_while_an_image_is_opened(bench):
     sent = []
-    bench.device.outlets.append(sent.append)
+    bench.requests.unsolicited_receivers.append(sent.append)
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
     bench.command("set_unsolicited", telemetry=192, rate=20.0)
@@ -114,6 +114,28 @@ def test_unsolicited_image_frame_is_left_out_while_an_image_is_opened(bench):
     bench.step(0.1)
     assert len(sent) == 3
     assert len(sent[-1].data) == 128
+
+
+def test_a_telecommand_that_fails_unexpectedly_ends_with_an_error_code_and_is_logged(
+    bench, monkeypatch, caplog
+):
+    monkeypatch.setitem(TELECOMMANDS, "set_mode", lambda *_: 1 / 0)
+    assert bench.command("set_mode", mode="standby") is ErrorCode.INTERNAL
+    assert bench.read("acknowledge") == {
+        "last_telecommand": 96, "processed": True, "error": "internal", "parameter_index": 0,
+    }  # fmt: skip
+    assert "telecommand 96: internal error: ZeroDivisionError" in caplog.text
+    bench.command("clear_counters")
+    assert not bench.read("communication_status")["telecommand_overrun"]
+
+
+def test_telemetry_that_fails_unexpectedly_is_answered_with_an_error_code_and_logged(
+    bench, monkeypatch, caplog
+):
+    monkeypatch.setitem(TELEMETRY, "rates", lambda _device: 1 / 0)
+    (reply,) = bench.requests.handle(Request.of(bench.icd.telemetry["rates"].id))
+    assert (reply.kind, reply.code) == (ReplyKind.NACK, ErrorCode.INTERNAL)
+    assert "telemetry rates: internal error: ZeroDivisionError" in caplog.text
 
 
 def test_unsolicited_telemetry_needs_a_row(bench):

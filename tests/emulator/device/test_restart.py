@@ -2,7 +2,7 @@
 
 import pytest
 
-from starhil.emulator.device.device import do_at_once
+from starhil.emulator.device.device import run_at_once
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.messages import ErrorCode, ReplyKind
@@ -58,7 +58,7 @@ class LaterBackground:
     def catch_up(self):
         waiting, self.waiting = self.waiting, []
         for work, done in waiting:
-            do_at_once(work, done)
+            run_at_once(work, done)
 
 
 def test_a_reset_before_the_disk_has_parameters_keeps_them(make_bench, tmp_path):

@@ -131,7 +131,7 @@ def test_a_full_disk_leaves_the_state_before_it_and_nothing_half_written(tmp_pat
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
     try:
-        with pytest.raises(EmulatorError, match="the state before it is kept"):
+        with pytest.raises(EmulatorError, match="the previous state is kept"):
             store.save({"boot_count": 2})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

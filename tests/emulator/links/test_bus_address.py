@@ -58,7 +58,7 @@ def test_a_second_device_on_a_bus_warns_at_its_start_and_works(kind, remedy, ben
         await hub.start()
         if kind is CanopenLink:
             bench.device.parameters.set({"canopen_node": 44})
-        links = [kind(bench.device, open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0")) for _ in range(2)]
+        links = [kind(bench.requests, open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0")) for _ in range(2)]
         await links[0].start()
         assert clashes(caplog) == []
         await links[1].start()
@@ -74,7 +74,7 @@ def test_a_second_device_on_a_bus_warns_at_its_start_and_works(kind, remedy, ben
 def test_a_frame_from_a_node_of_the_same_address_is_reported_once(bench, caplog):
     async def main():
         bus = Wire()
-        link = CanLink(bench.device, bus)
+        link = CanLink(bench.requests, bus)
         await link.start()
         caplog.clear()
         bus.arrive(REQUEST)

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.canopen import (
     FRAME_ROWS,
     STATUS_ROW,
-    BaseFramePieces,
     CanopenLink,
     not_before,
     open_canopen,
@@ -104,7 +104,7 @@ def linked(make_bench):
         async def within() -> None:
             bench = make_bench(**device).start()
             transport = PaperTransport()
-            link = CanopenLink(bench.device, transport, storage)
+            link = CanopenLink(bench.requests, transport, storage)
             await link.start()
             test(Link(bench, link, transport))
             await link.close()
@@ -140,7 +140,7 @@ def test_rows_are_those_of_the_other_links(linked):
     def test(link):
         for name in ("identification", "precise_attitude", "star_config"):
             row = link.bench.icd.telemetry[name]
-            assert link.upload(0x2000, row.id) == link.device.telemetry(name)
+            assert link.upload(0x2000, row.id) == link.bench.requests.telemetry(name)
 
     linked(test)
 
@@ -313,10 +313,10 @@ def test_error_mode_is_an_emergency(linked):
 
 def test_deaf_device_hears_and_says_nothing(linked):
     def test(link):
-        link.device.deaf = True
+        link.device.unresponsive = True
         assert link.sdo("40 00 10 00") == ""
         assert link.step(3.0) == []
-        link.device.deaf = False
+        link.device.unresponsive = False
         assert link.sdo("40 00 10 00") != ""
         assert link.step(3.0) != []
 
@@ -374,8 +374,8 @@ def test_rows_that_make_events_exist():
 
 def test_storage_in_the_folder_of_the_state(make_bench, tmp_path):
     async def within() -> None:
-        device = make_bench().start().device
-        link = open_canopen(device, PaperTransport(), tmp_path, 1)
+        requests = make_bench().start().requests
+        link = open_canopen(requests, PaperTransport(), tmp_path, 1)
         await link.start()
         link.slave.store_lss(60, 500_000)
         await link.close()
@@ -387,7 +387,7 @@ def test_storage_in_the_folder_of_the_state(make_bench, tmp_path):
 @pytest.mark.parametrize("data", [b"", b"\x01\x02"])
 def test_damaged_frames_stay_frames_of_the_base_format(data):
     rng = random.Random(1)
-    pieces = BaseFramePieces()
+    pieces = CanDamage(extended=False)
     frame = CanFrame(0x181, data, extended=False)
     for _ in range(50):
         damaged = pieces.corrupt(frame, rng)

@@ -9,7 +9,7 @@ from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
-from starhil.emulator.links.serial import SerialLink, SerialPieces
+from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.protocol.can_framing import (
     CanFrame,
@@ -64,8 +64,8 @@ class Linked:
         bench.device.parameters.set({"serial_dialect": dialect})
         self.bench = bench
         self.uart, self.bus = Wire(), Wire()
-        self.serial = SerialLink(bench.device, self.uart)
-        self.can = CanLink(bench.device, self.bus)
+        self.serial = SerialLink(bench.requests, self.uart)
+        self.can = CanLink(bench.requests, self.bus)
 
     async def start(self):
         await self.serial.start()
@@ -214,7 +214,7 @@ def test_unsolicited_telemetry_goes_to_can_and_to_dialect_c_only(bench):
 def test_a_gap_between_frames_is_kept(bench):
     async def scenario():
         bus = Wire()
-        link = CanLink(bench.device, bus, frame_gap_s=0.003)
+        link = CanLink(bench.requests, bus, frame_gap_s=0.003)
         await link.start()
         for frame in encode_request_frames(Request.of(211), 1, 4):
             bus.arrive(frame)
@@ -229,7 +229,7 @@ def test_a_gap_between_frames_is_kept(bench):
 def test_the_acknowledge_of_a_reset_waits_for_its_turn_and_leaves(bench):
     async def scenario():
         bus = Wire()
-        link = CanLink(bench.device, bus, frame_gap_s=0.001)
+        link = CanLink(bench.requests, bus, frame_gap_s=0.001)
         await link.start()
         reset = bench.icd.telecommands["reset"]
         for request in (Request.of(211), Request.of(reset.id, reset.encode({}))):
@@ -252,7 +252,7 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
         linked = await Linked(bench).start()
         rng = random.Random(SEED)
         counted = 0
-        handle = bench.device.handle
+        handle = bench.requests.handle
 
         def watched(request, later):
             nonlocal counted
@@ -265,7 +265,7 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
                 assert replies[0].code is ErrorCode.INVALID_LENGTH
             return replies
 
-        bench.device.handle = watched
+        bench.requests.handle = watched
         for _ in range(JUNK):
             junk = rng.randbytes(rng.randint(1, 40))
             if rng.random() < 0.5:  # as hard as can be: whole messages with any id and content
@@ -273,7 +273,7 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
             linked.uart.arrive(junk)
         linked.uart.arrive(b"\x1f\xff\x1f\xff")  # ends whatever was begun
         status = bench.device.counters
-        bench.device.handle = handle
+        bench.requests.handle = handle
         assert counted > JUNK // 4
         assert status.telecommands + status.telemetry == counted
         assert "uart_protocol_error" in status.flags
@@ -288,14 +288,14 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
         linked = await Linked(bench).start()
         rng = random.Random(SEED)
         requests = 0
-        handle = bench.device.handle
+        handle = bench.requests.handle
 
         def watched(request, later):
             nonlocal requests
             requests += 1
             return handle(request, later)
 
-        bench.device.handle = watched
+        bench.requests.handle = watched
         for _ in range(JUNK):
             identifier = CanIdentifier(
                 rng.randrange(32), rng.randrange(256), rng.randrange(256), rng.choice((4, 4, 4, 9))
@@ -307,7 +307,7 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
             MessageType.TELECOMMAND_ACK, MessageType.TELECOMMAND_NACK, MessageType.TELEMETRY, MessageType.TELEMETRY_NACK,
             MessageType.TELEMETRY_EXTENDED,
         }  # fmt: skip
-        bench.device.handle = handle
+        bench.requests.handle = handle
         assert bench.device.counters.telecommands + bench.device.counters.telemetry == requests
         assert "can_telecommand_error" in bench.device.counters.flags
         bench.device.parameters.set({"can_address": 4})
@@ -372,7 +372,7 @@ def test_wire_faults_damage_what_goes_out(bench, settings, expected):
 def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
     clock, scheduler, sent = SteppedClock(), Scheduler(), []
     wire = WireFaults(
-        lambda item: sent.append((clock.now_ns() / 1e9, item)), SerialPieces(), clock, scheduler, 1
+        lambda item: sent.append((clock.now_ns() / 1e9, item)), SerialDamage(), clock, scheduler, 1
     )
     wire.settings = WireFaultSettings(split=2, gap_s=0.5)
     wire.send(b"abcd")

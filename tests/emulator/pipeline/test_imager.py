@@ -90,7 +90,7 @@ def test_a_pipeline_that_ends_fails_what_is_pending_and_can_be_started_again(mak
         while not losses:
             await asyncio.sleep(0.01)
         imager.submit(REQUEST, answers.append)
-        assert [answer.fatal for answer in answers] == [True, True]
+        assert [type(answer) for answer in answers] == [Failure, Failure]
         await imager.restart()
         imager.submit(REQUEST, answers.append)
         await imager.settle()
@@ -140,7 +140,7 @@ def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, ca
     "program",
     [
         "",
-        WORKER + "send(Failure('no catalogue', fatal=True))\n",
+        WORKER + "send(Failure('no catalogue'))\n",
         WORKER + "stream.write(LENGTH.pack(3) + b'abc')\nstream.flush()\nreceive()\n",
     ],
 )

@@ -264,7 +264,7 @@ def test_live_feed_on_run_time_takes_times_as_they_stand():
     [
         ("nonsense", "JSON"),
         ("[1]", "object"),
-        ('{"q":[0,0,0,1],"t":1,"t":2}', "key 't' is given twice"),
+        ('{"q":[0,0,0,1],"t":1,"t":2}', "key 't' is repeated"),
         ("{}", "q is missing"),
         ('{"q":[0,0,0,1],"w":1}', "unknown key 'w'"),
         ('{"q":[0,0,0]}', "q is not 4 numbers"),
