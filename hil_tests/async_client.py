@@ -5,15 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Any, Final
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
 from starhil.hil_tests.images import Image, download_by_bursts, download_by_frames
-from starhil.hil_tests.links import (
-    HostLink,
-)
-from starhil.hil_tests.readings import Ack, Reading, Transaction
+from starhil.hil_tests.links import HostLink
+from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition, load_icd
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
@@ -23,6 +22,8 @@ DEFAULT_TIMEOUT_S: Final = 1.0
 """Time-out of a transaction, that of current public flight software."""
 UNSOLICITED_KEPT: Final = 1000
 """Unsolicited readings that wait to be taken; the oldest go first."""
+HISTORY_LENGTH: Final = 10_000
+"""Newest transactions, faults and stray replies that a client keeps."""
 SETTLE_S: Final = 0.05
 """Pause after a time-out, in which a late reply is thrown away so that no later request takes it for its own."""
 
@@ -45,7 +46,7 @@ class AsyncObcClient:
 
     def __init__(
         self,
-        link: HostLink,
+        link: HostLink[Any],
         icd: InterfaceDefinition | None = None,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
@@ -55,9 +56,9 @@ class AsyncObcClient:
         self.icd = load_icd() if icd is None else icd
         self.timeout_s = timeout_s
         self.retries = retries
-        self.transactions: list[Transaction] = []
-        self.faults: list[LinkFault] = []
-        self.stray_replies: list[Reply] = []
+        self.transactions: deque[Transaction] = deque(maxlen=HISTORY_LENGTH)
+        self.faults: deque[LinkFault] = deque(maxlen=HISTORY_LENGTH)
+        self.stray_replies: deque[Reply] = deque(maxlen=HISTORY_LENGTH)
         self.unsolicited: asyncio.Queue[Reading] = asyncio.Queue(UNSOLICITED_KEPT)
         self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
@@ -256,7 +257,7 @@ class AsyncObcClient:
             return reply, end - begin
         except TimeoutError:
             await asyncio.sleep(SETTLE_S)
-            self.link.forget()
+            self.link.reset_receiver()
             return None
         finally:
             self._pending = None

@@ -17,7 +17,7 @@ from typing import Final
 
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import CanLoad, Spread
-from starhil.hil_tests.realtime import give_realtime
+from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.protocol.can_framing import (
     CanFrame,
     CanHostReceiver,
@@ -114,7 +114,7 @@ class OtherTraffic:
         far.close()
         self._hear()
         if realtime and self._process.pid is not None:
-            give_realtime(self._process.pid)
+            set_realtime_priority(self._process.pid)
         self._pipe.send("go")
 
     def stop(self) -> tuple[float, int, int, int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -14,12 +15,12 @@ from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
     DEFAULT_HOST_ADDRESS,
-    CanLink,
+    CanHostLink,
     HostLink,
-    SerialLink,
+    SerialHostLink,
 )
 from starhil.hil_tests.loop_thread import LoopThread
-from starhil.hil_tests.readings import Ack, Reading, Transaction
+from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
@@ -41,7 +42,7 @@ class ObcClient:
 
     def __init__(
         self,
-        make_link: Callable[[], HostLink],
+        make_link: Callable[[], HostLink[Any]],
         icd: InterfaceDefinition | None = None,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
@@ -56,7 +57,10 @@ class ObcClient:
 
     @staticmethod
     async def _open(
-        make_link: Callable[[], HostLink], icd: InterfaceDefinition | None, timeout_s: float, retries: int
+        make_link: Callable[[], HostLink[Any]],
+        icd: InterfaceDefinition | None,
+        timeout_s: float,
+        retries: int,
     ) -> AsyncObcClient:
         core = AsyncObcClient(make_link(), icd, timeout_s=timeout_s, retries=retries)
         await core.start()
@@ -81,10 +85,10 @@ class ObcClient:
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
 
-        def make_link() -> HostLink:
+        def make_link() -> HostLink[Any]:
             if serial is not None:
-                return SerialLink(serial, dialect=Dialect(dialect), baud=baud, log=log)
-            return CanLink(str(can), host_address=host_address, device_address=device_address, log=log)
+                return SerialHostLink(serial, dialect=Dialect(dialect), baud=baud, log=log)
+            return CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
 
         return cls(make_link, icd, timeout_s=timeout_s, retries=retries)
 
@@ -112,18 +116,18 @@ class ObcClient:
         return self.core.icd
 
     @property
-    def transactions(self) -> list[Transaction]:
-        """All requests so far, with outcome and latency."""
+    def transactions(self) -> deque[Transaction]:
+        """The newest requests, with outcome and latency."""
         return self.core.transactions
 
     @property
-    def faults(self) -> list[LinkFault]:
-        """Input that made no message."""
+    def faults(self) -> deque[LinkFault]:
+        """The newest input that formed no message."""
         return self.core.faults
 
     @property
-    def stray_replies(self) -> list[Reply]:
-        """Replies that answered no request."""
+    def stray_replies(self) -> deque[Reply]:
+        """The newest replies that answered no request."""
         return self.core.stray_replies
 
     def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:

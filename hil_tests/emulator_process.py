@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,11 +18,6 @@ from typing import IO, Final, Self
 
 from starhil.hil_tests.errors import EmulatorProcessError
 
-STARHIL: Final = "from starhil.emulator.cli.app import main; main()"
-"""What the command `starhil` does, for a Python whose script folder is not known."""
-_ENDS_WITH_PARENT: Final = (
-    "from starhil.emulator.parent_death_signal import end_with_parent; end_with_parent({}, {:d}); "
-)
 READY_WITHIN_S: Final = 300.0
 """A first start on a machine compiles for minutes; a warm one takes about 3 s."""
 STOP_WITHIN_S: Final = 15.0
@@ -62,10 +58,28 @@ def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
     return command if log is None else [*command, "--log", str(log)]
 
 
+def installed_command() -> str:
+    """Return the path of the command `starhil`: beside this Python, else on PATH.
+
+    Raises
+    ------
+    EmulatorProcessError
+        It is not installed.
+    """
+    beside_python = Path(sys.executable).with_name("starhil")
+    if os.access(beside_python, os.X_OK):
+        return str(beside_python)
+    found = shutil.which("starhil")
+    if found is None:
+        raise EmulatorProcessError(
+            f"the command starhil is neither beside {sys.executable} nor on PATH; install it with pip install starhil"
+        )
+    return found
+
+
 def _starhil_command() -> list[str]:
-    """Return the command `starhil` of this very Python, which the kernel ends by SIGTERM when this process has ended."""
-    code = _ENDS_WITH_PARENT.format(os.getpid(), signal.SIGTERM) + STARHIL
-    return [sys.executable, "-c", code]
+    """Return the beginning of a command line for `starhil`, which SIGTERM ends when this process has ended."""
+    return [sys.executable, "-m", "starhil.hil_tests.end_with_parent", str(os.getpid()), installed_command()]
 
 
 def parse_ready_line(line: str) -> dict[str, str]:

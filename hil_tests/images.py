@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
-from starhil.hil_tests.readings import Reading
+from starhil.hil_tests.transactions import Reading
 from starhil.protocol.image_transfer import (
     FRAME_SIZE,
     MAP_PARTS,

@@ -51,10 +51,10 @@ def starhil_emulator(
     an error.
     """
     from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-    from starhil.hil_tests.own_hub import OwnBus
+    from starhil.hil_tests.private_can_bus import PrivateCanBus
 
     folder: Path = tmp_path_factory.mktemp("starhil")
-    with OwnBus() as channel:
+    with PrivateCanBus() as channel:
         command = emulator_command(
             profile=request.config.getoption("--starhil-profile"),
             serial="auto",

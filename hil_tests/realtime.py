@@ -9,7 +9,7 @@ from starhil.hil_tests.errors import BenchError
 PRIORITY = 1
 
 
-def give_realtime(process: int = 0) -> None:
+def set_realtime_priority(process: int = 0) -> None:
     """Let a process (0: this one) go before all ordinary ones, but not the processes that it starts later.
 
     Raises

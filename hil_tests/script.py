@@ -50,7 +50,7 @@ from starhil.hil_tests.expect import (
     read_stated_attitude,
     show,
 )
-from starhil.hil_tests.raw_exchange import parse_frame, pattern
+from starhil.hil_tests.raw_traffic import parse_frame, pattern
 from starhil.hil_tests.script_model import (
     LINKS,
     SIGNALS,

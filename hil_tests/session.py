@@ -15,8 +15,7 @@ from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.expect import resolve, show
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.png import write_png
-from starhil.hil_tests.raw_exchange import matches, pattern, send_and_listen
-from starhil.hil_tests.readings import Reading
+from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
 from starhil.hil_tests.results import (
     FAILED,
     PASSED,
@@ -40,7 +39,8 @@ from starhil.hil_tests.script_model import (
     Step,
     Wait,
 )
-from starhil.hil_tests.truth_file import TruthFile
+from starhil.hil_tests.transactions import Reading
+from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.values import Value
 
@@ -107,7 +107,7 @@ class SessionRunner:
         path = truth_path
         if path is None and script.truth.file is not None:
             path = folder / script.truth.file
-        self._truth_file = None if path is None else TruthFile(path)
+        self._truth_log = None if path is None else TruthLogReader(path)
 
     def run(self) -> SessionResult:
         """Run all steps; after a failed one the rest is skipped unless the script says `keep_going`."""
@@ -404,11 +404,11 @@ class SessionRunner:
             return []
         truth = check.truth or self._script.truth.attitude
         if truth is None:
-            if self._truth_file is None:
+            if self._truth_log is None:
                 raise BenchError(f"step {step.number}: no truth to compare the attitude with")
             if "time_of_exposure" not in reading.values:
                 raise BenchError(f"step {step.number}: {reading.name} carries no time; read precise_attitude")
-            truth = self._truth_file.at(float(reading["time_of_exposure"]))
+            truth = self._truth_log.at(float(reading["time_of_exposure"]))
         error, problem = check.judge(reading.values, truth)
         if error is not None:
             outcome.figures.update(

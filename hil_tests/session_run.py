@@ -15,7 +15,7 @@ from starhil.hil_tests.bench import Bench, LinkOptions
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.results import (
     FAILED,
     PASSED,
@@ -26,10 +26,10 @@ from starhil.hil_tests.results import (
     prepare_report,
     write_junit,
 )
-from starhil.hil_tests.scratch import scratch_folder
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.icd import load_icd
 from starhil.protocol.serial_framing import Dialect
 
@@ -101,8 +101,8 @@ def run_session(request: SessionRequest) -> SessionResult:
             emulator = None
             if request.start:
                 if options.can == "auto":
-                    options = replace(options, can=stack.enter_context(OwnBus()))
-                state = stack.enter_context(scratch_folder("starhil-session-"))
+                    options = replace(options, can=stack.enter_context(PrivateCanBus()))
+                state = stack.enter_context(temporary_folder("starhil-session-"))
                 emulator = _emulator(request, script, options, folder, state)
             bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
             for link in bench.links:

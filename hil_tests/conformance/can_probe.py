@@ -13,7 +13,7 @@ from starhil.hil_tests.conformance.link_probe import (
     ProbeTimes,
 )
 from starhil.hil_tests.conformance.ports import Port
-from starhil.hil_tests.raw_exchange import format_frame
+from starhil.hil_tests.raw_traffic import format_frame, parse_frame
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -101,6 +101,14 @@ class CanProbe(LinkProbe):
         """Send a frame as it stands."""
         self.log.append(f"{self.now():.4f} -> {format_frame(frame)}")
         self.bus.send(frame)
+
+    def send_text(self, text: str) -> None:
+        """Send a frame written as for `cansend`, with HH and DD for the addresses of host and device."""
+        self.send(parse_frame(self.with_addresses(text)))
+
+    def with_addresses(self, text: str) -> str:
+        """Replace HH and DD in the text of a frame by the addresses of host and device."""
+        return text.replace("HH", f"{self.host:02X}").replace("DD", f"{self.device:02X}")
 
     def _take(self, timeout_s: float) -> bool:
         frame = self.bus.receive(timeout_s)

@@ -17,9 +17,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
     multiplexer,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusive=True)
 REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
 WATCHED: Final = 0x05
 """A node-ID that stands for a watched node; nobody else on the bus may have it."""
@@ -63,13 +63,7 @@ class Provocation:
             self._probe.send(0x700 + WATCHED, b"\x05")
 
 
-@case(
-    _CASES,
-    "canopen.emcy.format",
-    "EMCY has 8 bytes: code, error register, 5 bytes",
-    "CiA 301 7.2.7.3",
-    intrusive=True,
-)
+@EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
 def emcy_format(probe: CanopenProbe) -> None:
     """The register is that of 1001h, with the generic bit."""
     error = Provocation(probe)
@@ -80,7 +74,7 @@ def emcy_format(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1001), data[2], "1001h")
 
 
-@case(_CASES, "canopen.emcy.once", "one EMCY an error", "CiA 301 7.2.7.1", intrusive=True)
+@EMCY.case("once", "one EMCY an error", "CiA 301 7.2.7.1")
 def emcy_once(probe: CanopenProbe) -> None:
     """The same error again while it is there sends nothing."""
     error = Provocation(probe)
@@ -90,7 +84,7 @@ def emcy_once(probe: CanopenProbe) -> None:
     probe.expect_silence(error.emergency, "second EMCY")
 
 
-@case(_CASES, "canopen.emcy.gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1", intrusive=True)
+@EMCY.case("gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
     """The error register is clear again, the history keeps the error."""
     error = Provocation(probe)
@@ -105,13 +99,7 @@ def emcy_gone(probe: CanopenProbe) -> None:
         check_equal(probe.number(0x1003, 0), count, "errors in the history")
 
 
-@case(
-    _CASES,
-    "canopen.emcy.history",
-    "the error history has the newest first",
-    "CiA 301 7.5.2.3",
-    intrusive=True,
-)
+@EMCY.case("history", "the error history has the newest first")
 def emcy_history(probe: CanopenProbe) -> None:
     """Its count grows by one an error up to its length; sub-index 1 has the newest code; writing 0 clears it."""
     probe.require(0x1003)
@@ -129,7 +117,7 @@ def emcy_history(probe: CanopenProbe) -> None:
         probe.expect(error.emergency, "EMCY 0000h")
 
 
-@case(_CASES, "canopen.emcy.history-order", "older errors move up", "CiA 301 7.5.2.3", intrusive=True)
+@EMCY.case("history-order", "older errors move up")
 def emcy_history_order(probe: CanopenProbe) -> None:
     """A second, other error: a watched node that falls silent."""
     probe.require(0x1003)
@@ -148,22 +136,14 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     check_equal(data[2], register, "error register with the error that remains")
 
 
-@case(
-    _CASES, "canopen.emcy.history-write", "the error history takes 0 only", "CiA 301 7.5.2.3", intrusive=True
-)
+@EMCY.case("history-write", "the error history takes 0 only")
 def emcy_history_write(probe: CanopenProbe) -> None:
     """Any other number is refused by 0609 0030h."""
     probe.require(0x1003)
     probe.expect_refusal(0x1003, 0, 1, 1, *REFUSED)
 
 
-@case(
-    _CASES,
-    "canopen.emcy.switch",
-    "EMCY is switched off by bit 31 and moved only then",
-    "CiA 301 7.5.2.15",
-    intrusive=True,
-)
+@EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
     """Another identifier while it is on is refused, as are restricted ones."""
     error = Provocation(probe)
@@ -180,7 +160,7 @@ def emcy_switch(probe: CanopenProbe) -> None:
     probe.expect(0x91, "EMCY under its new identifier")
 
 
-@case(_CASES, "canopen.emcy.inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16", intrusive=True)
+@EMCY.case("inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16")
 def emcy_inhibit(probe: CanopenProbe) -> None:
     """With 100 ms the second comes 100 ms after the first."""
     probe.require(0x1015)
@@ -196,7 +176,7 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
     )
 
 
-@case(_CASES, "canopen.emcy.stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
+@EMCY.case("stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5")
 def emcy_stopped(probe: CanopenProbe) -> None:
     """A watched node falls silent in STOPPED: nothing until the node leaves it."""
     probe.require(0x1016)
@@ -209,4 +189,4 @@ def emcy_stopped(probe: CanopenProbe) -> None:
     check(probe.number(0x1001) & 0x10, "communication error in 1001h", probe.number(0x1001))
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*EMCY.cases,)

@@ -15,9 +15,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+NMT: Final = CaseArea[CanopenProbe]("canopen.nmt", "CiA 301 7.3.2.2", intrusive=True)
+ERROR_CONTROL: Final = CaseArea[CanopenProbe]("canopen.error-control", "CiA 301 7.2.8.3.2", intrusive=True)
 NMT_CLAUSE: Final = "CiA 301 7.3.2.2"
 CONTROL_CLAUSE: Final = "CiA 301 7.2.8.3"
 STATE_OF: Final = {START: 0x05, STOP: 0x04, PRE_OPERATIONAL: 0x7F}
@@ -36,13 +37,7 @@ def _state(probe: CanopenProbe) -> int:
     return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]
 
 
-@case(
-    _CASES,
-    "canopen.nmt.boot-up",
-    "boot-up message, then PRE-OPERATIONAL by itself",
-    f"{NMT_CLAUSE}.1",
-    intrusive=True,
-)
+@NMT.case("boot-up", "boot-up message, then PRE-OPERATIONAL by itself", "CiA 301 7.3.2.2.1")
 def boot_up(probe: CanopenProbe) -> None:
     """After each reset one frame 700h + node-ID with one byte 00, and SDO works."""
     for command in (RESET_COMMUNICATION, RESET_NODE):
@@ -53,9 +48,7 @@ def boot_up(probe: CanopenProbe) -> None:
         check_equal(_state(probe), 0x7F, "state")
 
 
-@case(
-    _CASES, "canopen.nmt.boot-up-once", "one boot-up message a reset", f"{CONTROL_CLAUSE}.3", intrusive=True
-)
+@NMT.case("boot-up-once", "one boot-up message a reset", "CiA 301 7.2.8.3.3")
 def boot_up_once(probe: CanopenProbe) -> None:
     """No second frame 00."""
     probe.reset_communication()
@@ -63,13 +56,7 @@ def boot_up_once(probe: CanopenProbe) -> None:
     check(data is None, "one boot-up message", "two")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.commands",
-    "start, stop and enter PRE-OPERATIONAL from every state",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("commands", "start, stop and enter PRE-OPERATIONAL from every state")
 def commands(probe: CanopenProbe) -> None:
     """All nine changes, addressed to the node."""
     _prepare(probe)
@@ -80,7 +67,7 @@ def commands(probe: CanopenProbe) -> None:
             check_equal(_state(probe), state, f"state after commands {before} and {command}:")
 
 
-@case(_CASES, "canopen.nmt.broadcast", "commands to all nodes", f"{CONTROL_CLAUSE}", intrusive=True)
+@NMT.case("broadcast", "commands to all nodes", "CiA 301 7.2.8.3")
 def broadcast(probe: CanopenProbe) -> None:
     """Node-ID 0 stands for every node; only for a bus with nothing else in operation."""
     _prepare(probe)
@@ -89,13 +76,7 @@ def broadcast(probe: CanopenProbe) -> None:
         check_equal(_state(probe), state, f"state after command {command} to all:")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.other-node",
-    "commands to another node are not obeyed",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("other-node", "commands to another node are not obeyed")
 def other_node(probe: CanopenProbe) -> None:
     """Start for the next node-ID."""
     _prepare(probe)
@@ -103,13 +84,7 @@ def other_node(probe: CanopenProbe) -> None:
     check_equal(_state(probe), 0x7F, "state")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.malformed",
-    "frames that are no NMT command are not obeyed",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("malformed", "frames that are no NMT command are not obeyed")
 def malformed(probe: CanopenProbe) -> None:
     """Unknown specifier, one byte, three bytes, extended frame."""
     _prepare(probe)
@@ -121,7 +96,7 @@ def malformed(probe: CanopenProbe) -> None:
     check_equal(_state(probe), 0x7F, "state after an extended frame:")
 
 
-@case(_CASES, "canopen.nmt.reset-states", "resets work from every state", f"{NMT_CLAUSE}", intrusive=True)
+@NMT.case("reset-states", "resets work from every state")
 def reset_states(probe: CanopenProbe) -> None:
     """Reset node and reset communication from OPERATIONAL and STOPPED."""
     for before in (START, STOP):
@@ -132,13 +107,7 @@ def reset_states(probe: CanopenProbe) -> None:
             probe.expect_boot_up()
 
 
-@case(
-    _CASES,
-    "canopen.nmt.reset-communication",
-    "reset communication restores the communication profile",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("reset-communication", "reset communication restores the communication profile")
 def reset_communication(probe: CanopenProbe) -> None:
     """A changed heartbeat time has its stored value again."""
     before = probe.number(0x1017)
@@ -147,13 +116,7 @@ def reset_communication(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1017), before, "1017h")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.sdo-states",
-    "SDO in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED",
-    f"{NMT_CLAUSE}.5",
-    intrusive=True,
-)
+@NMT.case("sdo-states", "SDO in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED", "CiA 301 7.3.2.2.5")
 def sdo_states(probe: CanopenProbe) -> None:
     """As the table of states and communication objects has it."""
     for command, answered in ((PRE_OPERATIONAL, True), (START, True), (STOP, False)):
@@ -165,13 +128,7 @@ def sdo_states(probe: CanopenProbe) -> None:
 # Heartbeat
 
 
-@case(
-    _CASES,
-    "canopen.error-control.heartbeat",
-    "heartbeat at its period with the state",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("heartbeat", "heartbeat at its period with the state")
 def heartbeat(probe: CanopenProbe) -> None:
     """One byte, bit 7 clear; period within a fifth over five heartbeats of 100 ms."""
     _prepare(probe, 100)
@@ -183,13 +140,7 @@ def heartbeat(probe: CanopenProbe) -> None:
     check(0.08 <= mean <= 0.12, "period 0.1 s", f"{mean:.4f} s")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.heartbeat-off",
-    "no heartbeat with time 0",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("heartbeat-off", "no heartbeat with time 0")
 def heartbeat_off(probe: CanopenProbe) -> None:
     """1017h set to 0."""
     _prepare(probe, 50)
@@ -198,13 +149,7 @@ def heartbeat_off(probe: CanopenProbe) -> None:
     probe.expect_silence(0x700 + probe.node, "heartbeat", 0.3)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.heartbeat-stopped",
-    "heartbeat goes on in STOPPED",
-    f"{NMT_CLAUSE}.5",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("heartbeat-stopped", "heartbeat goes on in STOPPED", "CiA 301 7.3.2.2.5")
 def heartbeat_stopped(probe: CanopenProbe) -> None:
     """With state 04."""
     _prepare(probe)
@@ -226,13 +171,7 @@ def _prepare_guarding(probe: CanopenProbe) -> None:
     probe.drain()
 
 
-@case(
-    _CASES,
-    "canopen.error-control.guarding",
-    "node guarding with toggle bit",
-    f"{CONTROL_CLAUSE}.1",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("guarding", "node guarding with toggle bit", "CiA 301 7.2.8.3.1")
 def guarding(probe: CanopenProbe) -> None:
     """The toggle bit begins at 0 after a reset and alternates; the state is right."""
     _prepare_guarding(probe)
@@ -249,12 +188,8 @@ def guarding(probe: CanopenProbe) -> None:
     check_equal(_guard(probe), 0x7F, "first answer after the reset")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.guarding-or-heartbeat",
-    "no node guarding while the heartbeat is on",
-    f"{CONTROL_CLAUSE}.1",
-    intrusive=True,
+@ERROR_CONTROL.case(
+    "guarding-or-heartbeat", "no node guarding while the heartbeat is on", "CiA 301 7.2.8.3.1"
 )
 def guarding_or_heartbeat(probe: CanopenProbe) -> None:
     """A remote request is not answered with 1017h set."""
@@ -265,7 +200,7 @@ def guarding_or_heartbeat(probe: CanopenProbe) -> None:
     probe.expect_silence(0x700 + probe.node, "answer to node guarding", 0.2)
 
 
-@case(_CASES, "canopen.error-control.life-guarding", "life guarding", f"{CONTROL_CLAUSE}.1", intrusive=True)
+@ERROR_CONTROL.case("life-guarding", "life guarding", "CiA 301 7.2.8.3.1")
 def life_guarding(probe: CanopenProbe) -> None:
     """It begins with the first request; when they end, EMCY 8130h comes and OPERATIONAL is left."""
     _prepare_guarding(probe)
@@ -298,26 +233,14 @@ def _watch(probe: CanopenProbe) -> int:
     return _emergency(probe)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer-start",
-    "a watch begins with the first heartbeat",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer-start", "a watch begins with the first heartbeat")
 def consumer_start(probe: CanopenProbe) -> None:
     """No EMCY while the watched node was never heard."""
     emergency = _watch(probe)
     probe.expect_silence(emergency, "EMCY", 0.4)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer",
-    "a watched node falls silent and comes back",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer", "a watched node falls silent and comes back")
 def consumer(probe: CanopenProbe) -> None:
     """EMCY 8130h after the time, not before; error register set; EMCY 0000h when it is heard again."""
     emergency = _watch(probe)
@@ -333,13 +256,7 @@ def consumer(probe: CanopenProbe) -> None:
     check_equal(data[:3], bytes(3), "error code and register")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.behaviour",
-    "error behaviour when a watched node falls silent",
-    "CiA 301 7.5.2.32",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("behaviour", "error behaviour when a watched node falls silent", "CiA 301 7.5.2.32")
 def behaviour(probe: CanopenProbe) -> None:
     """1029h:01h at 0 leads to PRE-OPERATIONAL, at 1 to no change, at 2 to STOPPED."""
     probe.require(0x1029)
@@ -354,13 +271,7 @@ def behaviour(probe: CanopenProbe) -> None:
         check_equal(_state(probe), state, f"state with 1029h:01h at {value}:")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer-twice",
-    "one node is watched by one entry",
-    "CiA 301 7.5.2.18",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer-twice", "one node is watched by one entry", "CiA 301 7.5.2.18")
 def consumer_twice(probe: CanopenProbe) -> None:
     """A second entry for the same node is refused by 0604 0043h."""
     _watch(probe)
@@ -371,13 +282,7 @@ def consumer_twice(probe: CanopenProbe) -> None:
     probe.set(0x1016, 2, (OTHER_NODE + 1) << 16 | 200)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer-off",
-    "a watch with time 0 is off",
-    "CiA 301 7.5.2.18",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer-off", "a watch with time 0 is off", "CiA 301 7.5.2.18")
 def consumer_off(probe: CanopenProbe) -> None:
     """Heard once, then switched off: no EMCY."""
     emergency = _watch(probe)
@@ -388,4 +293,7 @@ def consumer_off(probe: CanopenProbe) -> None:
         raise CaseFailed("no EMCY", data.hex(" "))
 
 
-CASES = tuple(_CASES)
+CASES: Final = (
+    *NMT.cases,
+    *ERROR_CONTROL.cases,
+)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from starhil.hil_tests.conformance.canopen_pdo import (
     FIXED,
     FORBIDDEN,
@@ -22,12 +24,12 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
     size_of,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+RPDO: Final = CaseArea[CanopenProbe]("canopen.rpdo", "CiA 301 7.2.2.2", intrusive=True)
 
 
-@case(_CASES, "canopen.rpdo.event", "event-driven RPDO acts at once", "CiA 301 7.2.2.2", intrusive=True)
+@RPDO.case("event", "event-driven RPDO acts at once")
 def rpdo_event(probe: CanopenProbe) -> None:
     """The object has the value that was sent."""
     item = writable(probe)
@@ -41,7 +43,7 @@ def rpdo_event(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.rpdo.gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5", intrusive=True)
+@RPDO.case("gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def rpdo_gate(probe: CanopenProbe) -> None:
     """In PRE-OPERATIONAL and in STOPPED the object keeps its value."""
     item = writable(probe)
@@ -59,13 +61,7 @@ def rpdo_gate(probe: CanopenProbe) -> None:
         check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(
-    _CASES,
-    "canopen.rpdo.synchronous",
-    "synchronous RPDO acts at the next SYNC",
-    "CiA 301 7.2.2.2",
-    intrusive=True,
-)
+@RPDO.case("synchronous", "synchronous RPDO acts at the next SYNC")
 def rpdo_synchronous(probe: CanopenProbe) -> None:
     """The old value before it, the latest received after it."""
     item = writable(probe)
@@ -81,13 +77,7 @@ def rpdo_synchronous(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(
-    _CASES,
-    "canopen.rpdo.short",
-    "too short an RPDO is reported and not processed",
-    "CiA 301 7.2.2.3, 7.2.7.1",
-    intrusive=True,
-)
+@RPDO.case("short", "too short an RPDO is reported and not processed", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_short(probe: CanopenProbe) -> None:
     """EMCY 8210h; the object keeps its value."""
     item = writable(probe)
@@ -101,7 +91,7 @@ def rpdo_short(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(_CASES, "canopen.rpdo.long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1", intrusive=True)
+@RPDO.case("long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_long(probe: CanopenProbe) -> None:
     """EMCY 8220h, and EMCY 0000h after one of the right length."""
     item = writable(probe)
@@ -116,13 +106,7 @@ def rpdo_long(probe: CanopenProbe) -> None:
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
 
 
-@case(
-    _CASES,
-    "canopen.rpdo.place-holder",
-    "place holders skip bytes of an RPDO",
-    "CiA 301 7.4.7",
-    intrusive=True,
-)
+@RPDO.case("place-holder", "place holders skip bytes of an RPDO", "CiA 301 7.4.7")
 def place_holder(probe: CanopenProbe) -> None:
     """UNSIGNED16 mapped by its type before the object."""
     if 0x0006 not in probe.od:
@@ -137,7 +121,7 @@ def place_holder(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.rpdo.deadline", "deadline of an RPDO", "CiA 301 7.5.2.35", intrusive=True)
+@RPDO.case("deadline", "deadline of an RPDO", "CiA 301 7.5.2.35")
 def deadline(probe: CanopenProbe) -> None:
     """With an event timer of 100 ms EMCY 8250h comes 100 ms after the last message, not before the first."""
     item = writable(probe)
@@ -157,9 +141,7 @@ def deadline(probe: CanopenProbe) -> None:
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
 
 
-@case(
-    _CASES, "canopen.rpdo.refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35", intrusive=True
-)
+@RPDO.case("refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35")
 def rpdo_refused(probe: CanopenProbe) -> None:
     """Restricted identifiers, another identifier in use, types 241 to 253, read-only objects."""
     index, item = first(probe, 0x1400), writable(probe)
@@ -178,4 +160,4 @@ def rpdo_refused(probe: CanopenProbe) -> None:
     probe.expect_refusal(index + 0x200, 1, entry(constant_), 4, ABORT_NOT_MAPPABLE)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*RPDO.cases,)

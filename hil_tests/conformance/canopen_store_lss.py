@@ -14,9 +14,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+STORE: Final = CaseArea[CanopenProbe]("canopen.store", "CiA 301 7.5.2.11", intrusive=True)
+LSS: Final = CaseArea[CanopenProbe]("canopen.lss", "CiA 305 states", intrusive=True)
 SIGNATURE_REFUSED: Final = (ABORT_NOT_STORED, 0x08000021, 0x08000022)
 
 
@@ -26,7 +27,7 @@ def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
     probe.expect_boot_up()
 
 
-@case(_CASES, "canopen.store.ability", "1010h and 1011h tell what they can do", "CiA 301 7.5.2.11")
+@STORE.case("ability", "1010h and 1011h tell what they can do", intrusive=False)
 def ability(probe: CanopenProbe) -> None:
     """Bit 0: on command, bit 1: by itself; the others are zero."""
     for index in (0x1010, 0x1011):
@@ -34,7 +35,7 @@ def ability(probe: CanopenProbe) -> None:
             check(probe.number(index, 1) & ~0x03 == 0, f"{index:04X}h:01h 0 to 3", probe.number(index, 1))
 
 
-@case(_CASES, "canopen.store.signature", "wrong signatures are refused", "CiA 301 7.5.2.11", intrusive=True)
+@STORE.case("signature", "wrong signatures are refused")
 def signature(probe: CanopenProbe) -> None:
     """Abort 0800 002xh for anything but `save` and `load`, and for the two exchanged."""
     probe.require(0x1010)
@@ -44,13 +45,7 @@ def signature(probe: CanopenProbe) -> None:
                 probe.expect_refusal(index, 1, value, 4, *SIGNATURE_REFUSED)
 
 
-@case(
-    _CASES,
-    "canopen.store.save",
-    "stored parameters are back after a reset",
-    "CiA 301 7.5.2.11",
-    intrusive=True,
-)
+@STORE.case("save", "stored parameters are back after a reset")
 def save(probe: CanopenProbe) -> None:
     """After reset node and reset communication; what was changed afterwards is not."""
     probe.require(0x1010)
@@ -68,13 +63,7 @@ def _restore(probe: CanopenProbe) -> None:
     _reset(probe)
 
 
-@case(
-    _CASES,
-    "canopen.store.restore",
-    "defaults hold from the next reset on",
-    "CiA 301 7.5.2.12",
-    intrusive=True,
-)
+@STORE.case("restore", "defaults hold from the next reset on", "CiA 301 7.5.2.12")
 def restore(probe: CanopenProbe) -> None:
     """`load` changes nothing until then."""
     probe.require(0x1010)
@@ -88,13 +77,7 @@ def restore(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1017), 0 if default is None else default.default, "1017h after the reset")
 
 
-@case(
-    _CASES,
-    "canopen.store.groups",
-    "communication and application are stored apart",
-    "CiA 301 7.5.2.11",
-    intrusive=True,
-)
+@STORE.case("groups", "communication and application are stored apart")
 def groups(probe: CanopenProbe) -> None:
     """Storing the application's leaves the communication profile as it was stored."""
     probe.require(0x1010)
@@ -108,13 +91,7 @@ def groups(probe: CanopenProbe) -> None:
     _restore(probe)
 
 
-@case(
-    _CASES,
-    "canopen.store.pdo",
-    "a stored PDO configuration is back after a reset",
-    "CiA 301 7.5.2.11",
-    intrusive=True,
-)
+@STORE.case("pdo", "a stored PDO configuration is back after a reset")
 def pdo(probe: CanopenProbe) -> None:
     """Transmission type of the first TPDO."""
     probe.require(0x1010)
@@ -155,13 +132,7 @@ def _wait(probe: CanopenProbe) -> None:
     probe.send(LSS_TO_SLAVE, b"\x04" + bytes(7))
 
 
-@case(
-    _CASES,
-    "canopen.lss.selective",
-    "switch state selective",
-    "CiA 305 switch state selective",
-    intrusive=True,
-)
+@LSS.case("selective", "switch state selective", "CiA 305 switch state selective")
 def selective(probe: CanopenProbe) -> None:
     """The identity selects the node; any other does not."""
     identity = _select(probe)
@@ -175,7 +146,7 @@ def selective(probe: CanopenProbe) -> None:
     check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
 
 
-@case(_CASES, "canopen.lss.global", "switch state global", "CiA 305 switch state global", intrusive=True)
+@LSS.case("global", "switch state global", "CiA 305 switch state global")
 def global_(probe: CanopenProbe) -> None:
     """Into configuration and back, unanswered."""
     _select(probe)
@@ -186,7 +157,7 @@ def global_(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@case(_CASES, "canopen.lss.inquire", "inquire identity and node-ID", "CiA 305 inquire", intrusive=True)
+@LSS.case("inquire", "inquire identity and node-ID", "CiA 305 inquire")
 def inquire(probe: CanopenProbe) -> None:
     """The four numbers of 1018h, and the node-ID in use."""
     identity = _select(probe)
@@ -197,9 +168,7 @@ def inquire(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@case(
-    _CASES, "canopen.lss.waiting", "a waiting node obeys no configuration", "CiA 305 states", intrusive=True
-)
+@LSS.case("waiting", "a waiting node obeys no configuration")
 def waiting(probe: CanopenProbe) -> None:
     """Node-ID, bit timing, store and inquiries are not answered."""
     _select(probe)
@@ -209,7 +178,7 @@ def waiting(probe: CanopenProbe) -> None:
         check(answer is None, f"no answer to {data}", answer)
 
 
-@case(_CASES, "canopen.lss.node-id", "configure node-ID", "CiA 305 configure node-ID", intrusive=True)
+@LSS.case("node-id", "configure node-ID", "CiA 305 configure node-ID")
 def node_id(probe: CanopenProbe) -> None:
     """Numbers that are none are refused; a new one holds from the reset of the communication on, and back."""
     _select(probe)
@@ -234,9 +203,7 @@ def node_id(probe: CanopenProbe) -> None:
     probe.expect_boot_up()
 
 
-@case(
-    _CASES, "canopen.lss.bit-timing", "configure bit timing", "CiA 305 configure bit timing", intrusive=True
-)
+@LSS.case("bit-timing", "configure bit timing", "CiA 305 configure bit timing")
 def bit_timing(probe: CanopenProbe) -> None:
     """Rates of the data sheet are taken, index 5, 9 and other tables refused; nothing is activated."""
     _select(probe)
@@ -253,9 +220,7 @@ def bit_timing(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@case(
-    _CASES, "canopen.lss.identify", "identify remote slave", "CiA 305 identify remote slave", intrusive=True
-)
+@LSS.case("identify", "identify remote slave", "CiA 305 identify remote slave")
 def identify(probe: CanopenProbe) -> None:
     """Answered by 4Fh if the node is within the ranges, not otherwise."""
     _select(probe)
@@ -281,13 +246,7 @@ def identify(probe: CanopenProbe) -> None:
             check(answer is None, "no answer", answer)
 
 
-@case(
-    _CASES,
-    "canopen.lss.configured",
-    "a configured node takes no part in fastscan",
-    "CiA 305 fastscan",
-    intrusive=True,
-)
+@LSS.case("configured", "a configured node takes no part in fastscan", "CiA 305 fastscan")
 def configured(probe: CanopenProbe) -> None:
     """Neither fastscan nor identify non-configured is answered."""
     _select(probe)
@@ -297,13 +256,7 @@ def configured(probe: CanopenProbe) -> None:
         check(answer is None, f"no answer to {data}", answer)
 
 
-@case(
-    _CASES,
-    "canopen.lss.fastscan",
-    "fastscan finds a node without a node-ID",
-    "CiA 305 fastscan",
-    intrusive=True,
-)
+@LSS.case("fastscan", "fastscan finds a node without a node-ID", "CiA 305 fastscan")
 def fastscan(probe: CanopenProbe) -> None:
     """The node-ID is taken away, the identity found bit by bit, the node-ID given back; only without other such nodes."""
     identity = _select(probe)
@@ -344,7 +297,7 @@ def _scan(probe: CanopenProbe) -> list[int]:
     return identity
 
 
-@case(_CASES, "canopen.lss.states", "LSS works in every NMT state", "CiA 305 states", intrusive=True)
+@LSS.case("states", "LSS works in every NMT state")
 def states(probe: CanopenProbe) -> None:
     """The node is selected in OPERATIONAL and asked in STOPPED."""
     _select(probe)
@@ -356,4 +309,7 @@ def states(probe: CanopenProbe) -> None:
         _wait(probe)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (
+    *STORE.cases,
+    *LSS.cases,
+)

@@ -13,9 +13,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+SYNC: Final = CaseArea[CanopenProbe]("canopen.sync", "CiA 301 7.5.2.5", intrusive=True)
+TIME: Final = CaseArea[CanopenProbe]("canopen.time", "CiA 301 7.5.2.13", intrusive=True)
 REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
 FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 
@@ -28,9 +29,7 @@ def _quiet(probe: CanopenProbe) -> None:
 # SYNC
 
 
-@case(
-    _CASES, "canopen.sync.identifier", "identifiers that SYNC may not have", "CiA 301 7.5.2.5", intrusive=True
-)
+@SYNC.case("identifier", "identifiers that SYNC may not have")
 def sync_identifier(probe: CanopenProbe) -> None:
     """Restricted ones and the extended format are refused by 0609 0030h."""
     probe.require(0x1005)
@@ -39,9 +38,7 @@ def sync_identifier(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1005) & 0x7FF, 0x80, "1005h as before")
 
 
-@case(
-    _CASES, "canopen.sync.counter-range", "values of the counter overflow", "CiA 301 7.5.2.22", intrusive=True
-)
+@SYNC.case("counter-range", "values of the counter overflow", "CiA 301 7.5.2.22")
 def sync_counter_range(probe: CanopenProbe) -> None:
     """1 and 241 to 255 are refused by 0609 0030h, 2 to 240 taken."""
     probe.require(0x1019)
@@ -51,13 +48,7 @@ def sync_counter_range(probe: CanopenProbe) -> None:
         probe.set(0x1019, 0, value, 1)
 
 
-@case(
-    _CASES,
-    "canopen.sync.counter-fixed",
-    "counter overflow is fixed while a period is set",
-    "CiA 301 7.5.2.22",
-    intrusive=True,
-)
+@SYNC.case("counter-fixed", "counter overflow is fixed while a period is set", "CiA 301 7.5.2.22")
 def sync_counter_fixed(probe: CanopenProbe) -> None:
     """Abort 0800 0022h with 1006h set."""
     probe.require(0x1019)
@@ -68,9 +59,7 @@ def sync_counter_fixed(probe: CanopenProbe) -> None:
     probe.set(0x1019, 0, 10, 1)
 
 
-@case(
-    _CASES, "canopen.sync.length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3", intrusive=True
-)
+@SYNC.case("length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3")
 def sync_length(probe: CanopenProbe) -> None:
     """EMCY 8240h for a counter that is not configured, and for one that is missing."""
     probe.require(0x1014)
@@ -86,7 +75,7 @@ def sync_length(probe: CanopenProbe) -> None:
         check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
 
 
-@case(_CASES, "canopen.sync.producer", "SYNC producer", "CiA 301 7.5.2.5", intrusive=True)
+@SYNC.case("producer", "SYNC producer")
 def sync_producer(probe: CanopenProbe) -> None:
     """Bit 30 of 1005h and 1006h make SYNCs at their period with the counter from 1, or are refused by 0609 0030h."""
     probe.require(0x1006)
@@ -110,13 +99,7 @@ def sync_producer(probe: CanopenProbe) -> None:
 # TIME
 
 
-@case(
-    _CASES,
-    "canopen.time.identifier",
-    "identifiers that TIME may not have",
-    "CiA 301 7.5.2.13",
-    intrusive=True,
-)
+@TIME.case("identifier", "identifiers that TIME may not have")
 def time_identifier(probe: CanopenProbe) -> None:
     """Restricted ones and the extended format are refused by 0609 0030h, a change while it is consumed too."""
     probe.require(0x1012)
@@ -127,9 +110,7 @@ def time_identifier(probe: CanopenProbe) -> None:
     probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *REFUSED)
 
 
-@case(
-    _CASES, "canopen.time.malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3", intrusive=True
-)
+@TIME.case("malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3")
 def time_malformed(probe: CanopenProbe) -> None:
     """Five and seven bytes, and more milliseconds than a day has; the node goes on."""
     for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
@@ -137,4 +118,7 @@ def time_malformed(probe: CanopenProbe) -> None:
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
 
 
-CASES = tuple(_CASES)
+CASES: Final = (
+    *SYNC.cases,
+    *TIME.cases,
+)

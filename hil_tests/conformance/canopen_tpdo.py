@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from canopen.objectdictionary import ODVariable
 
 from starhil.hil_tests.conformance.canopen_pdo import (
@@ -33,12 +35,12 @@ from starhil.hil_tests.conformance.canopen_probe import (
     is_integer,
     size_of,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+TPDO: Final = CaseArea[CanopenProbe]("canopen.tpdo", "CiA 301 7.5.2.37", intrusive=True)
 
 
-@case(_CASES, "canopen.tpdo.cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2", intrusive=True)
+@TPDO.case("cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2")
 def cyclic(probe: CanopenProbe) -> None:
     """Types 1 and 3: the mapped value, at the SYNCs it has to come at, and at no other."""
     index, item = first(probe, 0x1800), constant(probe)
@@ -56,13 +58,7 @@ def cyclic(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.not-without-sync",
-    "synchronous TPDO waits for SYNC",
-    "CiA 301 7.2.2.2",
-    intrusive=True,
-)
+@TPDO.case("not-without-sync", "synchronous TPDO waits for SYNC", "CiA 301 7.2.2.2")
 def not_without_sync(probe: CanopenProbe) -> None:
     """Nothing in half a second without a SYNC."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
@@ -70,13 +66,7 @@ def not_without_sync(probe: CanopenProbe) -> None:
     probe.expect_silence(identifier, "TPDO without SYNC", 0.5)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.acyclic",
-    "acyclic TPDO at the SYNC after an event only",
-    "CiA 301 7.5.2.37",
-    intrusive=True,
-)
+@TPDO.case("acyclic", "acyclic TPDO at the SYNC after an event only")
 def acyclic(probe: CanopenProbe) -> None:
     """Type 0: a write to the mapped object is the event; the next SYNC sends, the one after does not."""
     item = writable(probe)
@@ -99,7 +89,7 @@ def acyclic(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.tpdo.sync-start", "SYNC start value", "CiA 301 7.5.2.37", intrusive=True)
+@TPDO.case("sync-start", "SYNC start value")
 def sync_start(probe: CanopenProbe) -> None:
     """Type 2 with start value 3 is sent at counters 3, 5 and 7."""
     probe.require(0x1019)
@@ -115,7 +105,7 @@ def sync_start(probe: CanopenProbe) -> None:
     check_equal(sent, [3, 5, 7], "counters")
 
 
-@case(_CASES, "canopen.tpdo.event", "event-driven TPDO after a change", "CiA 301 7.2.2.2", intrusive=True)
+@TPDO.case("event", "event-driven TPDO after a change", "CiA 301 7.2.2.2")
 def event(probe: CanopenProbe) -> None:
     """A write to the mapped object sends it; SYNC does not."""
     item = writable(probe)
@@ -131,7 +121,7 @@ def event(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.tpdo.event-timer", "event timer", "CiA 301 7.5.2.37", intrusive=True)
+@TPDO.case("event-timer", "event timer")
 def event_timer(probe: CanopenProbe) -> None:
     """With 50 ms the TPDO comes every 50 ms, within a fifth."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
@@ -143,7 +133,7 @@ def event_timer(probe: CanopenProbe) -> None:
     check(0.04 <= mean <= 0.06, "period 0.05 s", f"{mean:.4f} s")
 
 
-@case(_CASES, "canopen.tpdo.inhibit", "inhibit time", "CiA 301 7.5.2.37", intrusive=True)
+@TPDO.case("inhibit", "inhibit time")
 def inhibit(probe: CanopenProbe) -> None:
     """Two events at once with 100 ms: the second is sent 100 ms after the first, with the newest value."""
     item = writable(probe)
@@ -163,7 +153,7 @@ def inhibit(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.tpdo.gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5", intrusive=True)
+@TPDO.case("gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def gate(probe: CanopenProbe) -> None:
     """By SYNC and by timer, neither in PRE-OPERATIONAL nor in STOPPED, again in OPERATIONAL."""
     index, item = first(probe, 0x1800), constant(probe)
@@ -179,7 +169,7 @@ def gate(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@case(_CASES, "canopen.tpdo.mapping", "remapping at run time", "CiA 301 7.5.2.38", intrusive=True)
+@TPDO.case("mapping", "remapping at run time", "CiA 301 7.5.2.38")
 def mapping(probe: CanopenProbe) -> None:
     """Two objects in one order and in the other."""
     index = first(probe, 0x1800)
@@ -201,9 +191,7 @@ def mapping(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@case(
-    _CASES, "canopen.tpdo.identifier", "a TPDO under another identifier", "CiA 301 7.5.2.37", intrusive=True
-)
+@TPDO.case("identifier", "a TPDO under another identifier")
 def identifier_moves(probe: CanopenProbe) -> None:
     """It is sent under the new identifier and not under the old one."""
     index, item = first(probe, 0x1800), constant(probe)
@@ -216,9 +204,7 @@ def identifier_moves(probe: CanopenProbe) -> None:
     probe.expect_silence(old, "TPDO under its old identifier")
 
 
-@case(
-    _CASES, "canopen.tpdo.forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5", intrusive=True
-)
+@TPDO.case("forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5")
 def forbidden(probe: CanopenProbe) -> None:
     """Restricted ones and the extended format, abort 0609 0030h."""
     index = first(probe, 0x1800)
@@ -228,13 +214,7 @@ def forbidden(probe: CanopenProbe) -> None:
         probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *REFUSED)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.fixed",
-    "what a TPDO in use does not let be changed",
-    "CiA 301 7.5.2.37",
-    intrusive=True,
-)
+@TPDO.case("fixed", "what a TPDO in use does not let be changed")
 def fixed(probe: CanopenProbe) -> None:
     """Identifier, inhibit time, SYNC start value, mapping."""
     index, item = first(probe, 0x1800), constant(probe)
@@ -253,13 +233,7 @@ def fixed(probe: CanopenProbe) -> None:
     probe.set(index + 0x200, 1, entry(item))
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.types",
-    "transmission types that there are none of",
-    "CiA 301 7.5.2.37",
-    intrusive=True,
-)
+@TPDO.case("types", "transmission types that there are none of")
 def types(probe: CanopenProbe) -> None:
     """241 to 251 are reserved, abort 0609 0030h."""
     index = first(probe, 0x1800)
@@ -269,7 +243,7 @@ def types(probe: CanopenProbe) -> None:
         probe.set(index, 2, value, 1)
 
 
-@case(_CASES, "canopen.tpdo.reserved", "sub-index 4 of a TPDO is not served", "CiA 301 7.5.2.37")
+@TPDO.case("reserved", "sub-index 4 of a TPDO is not served", intrusive=False)
 def reserved(probe: CanopenProbe) -> None:
     """Abort 0609 0011h unless the data sheet has it."""
     index = first(probe, 0x1800)
@@ -278,13 +252,7 @@ def reserved(probe: CanopenProbe) -> None:
     probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), ABORT_NO_SUBINDEX)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.mapping-refused",
-    "mapping of what cannot be mapped",
-    "CiA 301 7.5.2.38",
-    intrusive=True,
-)
+@TPDO.case("mapping-refused", "mapping of what cannot be mapped", "CiA 301 7.5.2.38")
 def mapping_refused(probe: CanopenProbe) -> None:
     """No such object, not mappable, wrong length, more than 64 bits, too many objects."""
     index, item = first(probe, 0x1800), constant(probe)
@@ -303,9 +271,7 @@ def mapping_refused(probe: CanopenProbe) -> None:
         probe.expect_refusal(index + 0x200, 1, entry(hidden), 4, ABORT_NOT_MAPPABLE)
 
 
-@case(
-    _CASES, "canopen.tpdo.mapping-length", "mapping of more than 64 bits", "CiA 301 7.5.2.38", intrusive=True
-)
+@TPDO.case("mapping-length", "mapping of more than 64 bits", "CiA 301 7.5.2.38")
 def mapping_length(probe: CanopenProbe) -> None:
     """Abort 0604 0042h for the sum and for the number of objects."""
     index = first(probe, 0x1800)
@@ -321,4 +287,4 @@ def mapping_length(probe: CanopenProbe) -> None:
     probe.set(index + 0x200, 0, 2, 1)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*TPDO.cases,)

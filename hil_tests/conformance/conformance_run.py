@@ -18,9 +18,9 @@ from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.results import FAILED
-from starhil.hil_tests.scratch import scratch_folder
+from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.icd import InterfaceDefinition, load_icd
 
 DEFAULT_BAUD: Final = 115200
@@ -162,11 +162,11 @@ def _fallen(error: EmulatorProcessError) -> Outcome:
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, str | None]:
     """Start an emulator with the links that are asked for; return port and channel."""
-    folder = stack.enter_context(scratch_folder("starhil-conformance-"))
+    folder = stack.enter_context(temporary_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"
     if needs_bus:
-        channel = stack.enter_context(OwnBus()) if request.can in (None, "auto") else str(request.can)
+        channel = stack.enter_context(PrivateCanBus()) if request.can in (None, "auto") else str(request.can)
     extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
     if request.speed != 1.0:
         extra += ["--clock", f"scaled:{request.speed:g}"]
@@ -194,7 +194,7 @@ def _run_canopen(
 
     node = int(request.canopen_node or 0)
     text = _data_sheet(request.eds)
-    with scratch_folder("starhil-eds-") as folder:
+    with temporary_folder("starhil-eds-") as folder:
         path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
         try:

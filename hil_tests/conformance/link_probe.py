@@ -27,6 +27,8 @@ SEQUENCE: Final = 7
 FIRST_TELEMETRY: Final = 128
 BURST_ID: Final = 119
 
+LONG_PAUSE_S: Final = 0.8
+"""Longer than the device waits for the rest of a message (0.5 s)."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, for time-outs of the device to pass."""
 
@@ -109,6 +111,10 @@ class LinkProbe(ABC):
     @abstractmethod
     def post(self, identifier: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
+
+    @abstractmethod
+    def send_text(self, text: str) -> None:
+        """Send raw traffic: bytes in hexadecimal, or a CAN frame in which HH and DD stand for host and device."""
 
     @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
+from starhil.hil_tests.conformance.case import Case, CaseArea, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -21,7 +21,6 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import Parameter
 
 CODES: Final = "published error codes 0 to 4 (AlbertaSat, CTS)"
-IDENTIFIERS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
 PARTNERS: Final = {
     "max_star_pixels": ("min_star_pixels", 1.0),
     "min_star_pixels": ("max_star_pixels", 255.0),
@@ -35,6 +34,11 @@ UNSET: Final = frozenset({"unsolicited_rate"})
 """Parameters whose greatest value would flood the line."""
 
 
+IDENTIFIERS: Final = CaseArea[LinkProbe](
+    "identifiers", "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
+)
+
+
 def clause_of(row: Row) -> str:
     """Where a row is written."""
     return f"configs/icd {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
@@ -42,7 +46,7 @@ def clause_of(row: Row) -> str:
 
 def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
     """Make the cases of a definition."""
-    cases: list[Case[LinkProbe]] = list(_IDENTIFIER_CASES)
+    cases: list[Case[LinkProbe]] = list(IDENTIFIERS.cases)
     cases.extend(_telemetry_case(row) for row in icd.telemetry.values())
     for row in icd.telecommands.values():
         cases.extend(_length_cases(row))
@@ -54,15 +58,8 @@ def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
 
 # --- identifiers ---
 
-_IDENTIFIER_CASES: list[Case[LinkProbe]] = []
 
-
-@case(
-    _IDENTIFIER_CASES,
-    "identifiers.telemetry",
-    "each unknown telemetry identifier is refused with code 1",
-    IDENTIFIERS,
-)
+@IDENTIFIERS.case("telemetry", "each unknown telemetry identifier is refused with code 1")
 def unknown_telemetry(probe: LinkProbe) -> None:
     """All of them."""
     for identifier in range(128, 256):
@@ -70,13 +67,7 @@ def unknown_telemetry(probe: LinkProbe) -> None:
             probe.expect_refusal(identifier, b"", INVALID_ID)
 
 
-@case(
-    _IDENTIFIER_CASES,
-    "identifiers.telecommands",
-    "each unknown telecommand is refused with code 1",
-    IDENTIFIERS,
-    intrusive=True,
-)
+@IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
 def unknown_telecommands(probe: LinkProbe) -> None:
     """All of them, with and without data."""
     for identifier in range(128):
@@ -85,11 +76,8 @@ def unknown_telecommands(probe: LinkProbe) -> None:
             probe.expect_refusal(identifier, b"\x01\x02", INVALID_ID)
 
 
-@case(
-    _IDENTIFIER_CASES,
-    "identifiers.telemetry-with-data",
-    "a request of telemetry with data is refused for its length",
-    rule(5),
+@IDENTIFIERS.case(
+    "telemetry-with-data", "a request of telemetry with data is refused for its length", rule(5)
 )
 def telemetry_with_data(probe: LinkProbe) -> None:
     """Every row."""

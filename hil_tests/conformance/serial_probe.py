@@ -78,6 +78,10 @@ class SerialProbe(LinkProbe):
         self._note("->", data)
         self.port.send(data)
 
+    def send_text(self, text: str) -> None:
+        """Send bytes written in hexadecimal."""
+        self.send(bytes.fromhex(text))
+
     def _note(self, way: str, data: bytes) -> None:
         more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
         self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")

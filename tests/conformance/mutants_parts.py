@@ -17,7 +17,10 @@ from tests.conformance.simulated import SimulatedUnit
 
 @mutant("boots are not counted", "both", "reset.acknowledged")
 def boots_not_counted(unit: SimulatedUnit) -> None:
-    unit.store.save = lambda _content: None
+    def uncounted() -> None:
+        unit.device.boot_count -= 1
+
+    unit.device.on_reset.append(uncounted)
 
 
 @mutant("attitudes stay valid in standby", "both", "modes.standby")

@@ -13,9 +13,9 @@ from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.images import decode_bmp
 from starhil.hil_tests.png import encode_png, write_png
-from starhil.hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
+from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
-from starhil.hil_tests.truth_file import TruthFile
+from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import read_candump
@@ -33,7 +33,7 @@ def test_a_picture_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
 
 
 def test_a_picture_of_another_size_is_refused():
-    with pytest.raises(BenchError, match="4096 bytes, 10 given"):
+    with pytest.raises(BenchError, match="4096 bytes, not 10"):
         encode_png(bytes(10), 64, 64)
 
 
@@ -104,7 +104,7 @@ def test_the_truth_lies_between_the_rows_of_the_file_while_it_grows(tmp_path):
         for n in range(3)
     ]
     path.write_text(head + rows[0] + rows[1])
-    truth = TruthFile(path)
+    truth = TruthLogReader(path)
     assert attitude_error(truth.at(100.5), from_radec_roll(10.5, 0.0, 0.0)).total_arcsec < 1e-3
     with pytest.raises(BenchError, match=r"102\.000 s; it covers 100\.000 to 101\.000"):
         truth.at(102.0)
@@ -112,9 +112,9 @@ def test_the_truth_lies_between_the_rows_of_the_file_while_it_grows(tmp_path):
     assert attitude_error(truth.at(102.0), from_radec_roll(12.0, 0.0, 0.0)).total_arcsec < 1e-3
     path.write_text("time,qx\n1,2\n")
     with pytest.raises(BenchError, match="no column time_of_exposure_s"):
-        TruthFile(path).at(1.0)
+        TruthLogReader(path).at(1.0)
     with pytest.raises(BenchError, match="cannot be read"):
-        TruthFile(tmp_path / "none.csv").at(1.0)
+        TruthLogReader(tmp_path / "none.csv").at(1.0)
 
 
 @pytest.mark.parametrize("text", ["07360104#0001020304050601", "02360401#", "123#R", "7FF#00"])

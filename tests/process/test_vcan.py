@@ -16,7 +16,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.raw_exchange import format_frame
+from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.candump import parse_candump, read_candump
 from tests.process.conftest import needs_vcan0
 from tests.process.test_sessions import starhil
@@ -137,8 +137,8 @@ def test_commands_are_answered_while_cangen_floods_the_bus(obc):
     finally:
         flood.terminate()
         flood.wait()
-    assert obc.faults == []
-    assert obc.stray_replies == []
+    assert not obc.faults
+    assert not obc.stray_replies
 
 
 def test_the_kernel_sends_periodic_requests_and_each_is_answered(obc):

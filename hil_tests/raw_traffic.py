@@ -9,7 +9,7 @@ from typing import Final
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.links import CanLink, SerialLink
+from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 
@@ -97,14 +97,14 @@ async def _send_and_listen(
     timeout_s: float | None,
 ) -> tuple[str, ...]:
     link = client.core.link
-    if not isinstance(link, (SerialLink, CanLink)):
+    if not isinstance(link, (SerialHostLink, CanHostLink)):
         raise BenchError(f"{link.description}: cannot send as it stands")
     size = len("".join(wanted))
     end = time.monotonic() + (client.core.timeout_s if timeout_s is None else timeout_s)
     seen: list[bytes | CanFrame] = []
     before, link.on_raw = link.on_raw, seen.append
     try:
-        if isinstance(link, SerialLink):
+        if isinstance(link, SerialHostLink):
             for text in data:
                 link.send(bytes.fromhex(text))
         else:
@@ -118,9 +118,9 @@ async def _send_and_listen(
     return _texts(link, seen)
 
 
-def _texts(link: SerialLink | CanLink, seen: list[bytes | CanFrame]) -> tuple[str, ...]:
+def _texts(link: SerialHostLink | CanHostLink, seen: list[bytes | CanFrame]) -> tuple[str, ...]:
     """What came: one text of all bytes, or one of each frame of the device."""
-    if isinstance(link, SerialLink):
+    if isinstance(link, SerialHostLink):
         return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
     device = link.device_address
     frames = [item for item in seen if isinstance(item, CanFrame) and item.extended]

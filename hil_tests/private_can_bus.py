@@ -10,7 +10,7 @@ from starhil.protocol.hub import DEFAULT_BUS, CanHub
 from starhil.protocol.transports.can import kernel_can_is_up
 
 
-class OwnHub:
+class HubThread:
     """A TCP hub at a free port in a thread; a context manager. `channel` is what clients open."""
 
     def __init__(self) -> None:
@@ -51,16 +51,16 @@ class OwnHub:
         self.close()
 
 
-class OwnBus:
+class PrivateCanBus:
     """A bus that nobody else is on, as far as the machine allows: vcan0, or a hub of its own; a context manager."""
 
     def __init__(self) -> None:
-        self._hub: OwnHub | None = None
+        self._hub: HubThread | None = None
 
     def __enter__(self) -> str:
         if kernel_can_is_up(DEFAULT_BUS):
             return DEFAULT_BUS
-        self._hub = OwnHub().start()
+        self._hub = HubThread().start()
         return self._hub.channel
 
     def __exit__(

@@ -16,7 +16,7 @@ LOCK_NAME: Final = "owner.lock"
 
 
 @contextmanager
-def scratch_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
+def temporary_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
     """Make a temporary folder and remove it at the end, with those whose owner was killed.
 
     Parameters

@@ -20,7 +20,7 @@ SLACK_S: Final = 0.0005
 """A time that lies this little outside the file still counts: telemetry rounds."""
 
 
-class TruthFile:
+class TruthLogReader:
     """True attitudes over device time.
 
     Parameters
