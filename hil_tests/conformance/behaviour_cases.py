@@ -39,7 +39,6 @@ STORE: Final = CaseArea[LinkProbe]("store", rule(16), intrusive=True)
 
 @ACKNOWLEDGE.case("accepted", "after an accepted telecommand: its identifier, processed, no error")
 def acknowledge_accepted(probe: LinkProbe) -> None:
-    """Two different ones."""
     for name, values in (("select_parameter", {"parameter": 1}), ("clear_counters", {})):
         probe.command(name, **values)
         seen = probe.telemetry("acknowledge")
@@ -54,7 +53,6 @@ def acknowledge_accepted(probe: LinkProbe) -> None:
 
 @ACKNOWLEDGE.case("unknown", "after an unknown telecommand: its identifier and invalid_id")
 def acknowledge_unknown(probe: LinkProbe) -> None:
-    """Number 60."""
     probe.expect_refusal(60, b"", INVALID_ID)
     seen = probe.telemetry("acknowledge")
     check_equal(
@@ -64,7 +62,6 @@ def acknowledge_unknown(probe: LinkProbe) -> None:
 
 @ACKNOWLEDGE.case("kept", "reading telemetry does not change the acknowledge")
 def acknowledge_kept(probe: LinkProbe) -> None:
-    """It stays that of the last telecommand."""
     probe.expect_refusal(96, b"\x4d", INVALID_PARAMETER)
     first = probe.telemetry("acknowledge")
     for name in ("identification", "acknowledge", "device_status"):
@@ -74,7 +71,6 @@ def acknowledge_kept(probe: LinkProbe) -> None:
 
 @ACKNOWLEDGE.case("forgets", "a later success clears the error")
 def acknowledge_forgets(probe: LinkProbe) -> None:
-    """Error and index."""
     probe.expect_refusal(2, bytes.fromhex("00000000FFFF"), INVALID_PARAMETER)
     probe.command("clear_counters")
     seen = probe.telemetry("acknowledge")
@@ -91,7 +87,7 @@ def _counts(probe: LinkProbe) -> tuple[int, int]:
 
 @COUNTERS.case("telemetry", "each request of telemetry counts once, the reading of the counters too")
 def counters_telemetry(probe: LinkProbe) -> None:
-    """Thirty of them; telecommands do not count along."""
+    """The count of telecommands stays the same."""
     commands, before = _counts(probe)
     for _ in range(COUNTED):
         probe.telemetry("identification")
@@ -102,7 +98,6 @@ def counters_telemetry(probe: LinkProbe) -> None:
 
 @COUNTERS.case("refused-telemetry", "a refused request of telemetry counts as well")
 def counters_refused_telemetry(probe: LinkProbe) -> None:
-    """It was received."""
     _, before = _counts(probe)
     probe.expect_refusal(200, b"", INVALID_ID)
     check_equal((_counts(probe)[1] - before) % 65536, 2, "increase")
@@ -110,7 +105,7 @@ def counters_refused_telemetry(probe: LinkProbe) -> None:
 
 @COUNTERS.case("telecommands", "each telecommand counts once, accepted or refused", intrusive=True)
 def counters_telecommands(probe: LinkProbe) -> None:
-    """Accepted, of a wrong length, unknown, out of limits."""
+    """Accepted, wrong length, unknown, out of limits."""
     before, _ = _counts(probe)
     probe.command("select_parameter", parameter=1)
     probe.expect_refusal(60, b"", INVALID_ID)
@@ -121,7 +116,7 @@ def counters_telecommands(probe: LinkProbe) -> None:
 
 @COUNTERS.case("clear", "clear_counters sets both counts to zero", intrusive=True)
 def counters_clear(probe: LinkProbe) -> None:
-    """The command itself does not count any more, the reading does."""
+    """clear_counters itself is not counted, the reading afterwards is."""
     probe.command("clear_counters")
     check_equal(_counts(probe), (0, 1), "counts")
 
@@ -155,9 +150,8 @@ for _echo in ECHOES:
     _add_echo_case(*_echo)
 
 
-@DATA.case("parts", "the eight parts of the hole map are kept apart")
+@DATA.case("parts", "the eight parts of the hole map are independent")
 def parts(probe: LinkProbe) -> None:
-    """Each gets its own number."""
     for part in range(1, 9):
         probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{part}"].id, bytes([part]) * 16)
     for part in range(1, 9):
@@ -176,7 +170,7 @@ def _clock(probe: LinkProbe) -> float:
 
 @TIME.case("set", "the clock is what it was set to", intrusive=True)
 def time_set(probe: LinkProbe) -> None:
-    """Seconds and milliseconds, with bytes that have to be stuffed; the clock is put back afterwards."""
+    """The values include bytes that must be stuffed; the clock is set back afterwards."""
     with _kept_clock(probe):
         for seconds, milliseconds in ((CLOCK_STEP_S, 250), (0x1F1F1F1F, 31), (0, 0), (0xFFFFFFF0, 999)):
             probe.command("set_unix_time", seconds=seconds, milliseconds=milliseconds)
@@ -198,7 +192,7 @@ def _kept_clock(probe: LinkProbe) -> Iterator[None]:
 
 @TIME.case("runs", "the clock runs as fast as the tester's")
 def time_runs(probe: LinkProbe) -> None:
-    """Over one second, to 2 % and the time of the requests."""
+    """Over one second, with a tolerance of 2 % and the duration of the requests."""
     begin, first = probe.now(), _clock(probe)
     middle = probe.now()
     probe.sleep(1.0)
@@ -207,9 +201,8 @@ def time_runs(probe: LinkProbe) -> None:
     check(0.98 * (third - middle) <= last - first <= 1.02 * (end - begin) + 0.002, f"{third - middle:.3f} to {end - begin:.3f} s", f"{last - first:.3f} s")  # fmt: skip
 
 
-@TIME.case("flag", "device_status tells that the clock was set, and the same time", intrusive=True)
+@TIME.case("flag", "device_status reports that the clock was set, and the same time", intrusive=True)
 def time_flag(probe: LinkProbe) -> None:
-    """The two rows agree."""
     with _kept_clock(probe):
         probe.command("set_unix_time", seconds=CLOCK_STEP_S, milliseconds=0)
         status = probe.telemetry("device_status")
@@ -227,7 +220,7 @@ def time_flag(probe: LinkProbe) -> None:
     "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)",
 )
 def uptime(probe: LinkProbe) -> None:
-    """Identification wraps at 65536 s."""
+    """The runtime in identification wraps at 65536 s."""
     first = probe.telemetry("identification")
     status = probe.telemetry("device_status")
     runtime = int(first["runtime_s"]) + int(first["runtime_ms"]) / 1000.0
@@ -245,7 +238,7 @@ def uptime(probe: LinkProbe) -> None:
 
 @MODES.case("standby", "in standby no attitude is valid, and the rows agree on it")
 def standby(probe: LinkProbe) -> None:
-    """precise_attitude, device_status, star_performance_2."""
+    """The rows are precise_attitude, device_status and star_performance_2."""
     probe.standby()
     probe.wait_for("device_status", {"attitude_valid": False}, 2.0)
     attitude = probe.telemetry("precise_attitude")
@@ -256,7 +249,7 @@ def standby(probe: LinkProbe) -> None:
 
 @MODES.case("frames", "out of standby frames are made at the update rate, in standby none", rule(12))
 def frames(probe: LinkProbe) -> None:
-    """Two seconds at 5 Hz, with or without stars; the exposure must leave room for that rate."""
+    """Two seconds at 5 Hz, with or without stars; the exposure leaves room for that rate."""
     probe.standby()
     with probe.kept("update_rate", "exposure"):
         probe.set_parameter("exposure", 50.0)
@@ -276,7 +269,6 @@ def frames(probe: LinkProbe) -> None:
 
 @MODES.case("changes", "mode and its counter follow the command", rule(13))
 def changes(probe: LinkProbe) -> None:
-    """Standby to lost in space and back."""
     probe.standby()
     first = int(probe.telemetry("device_status")["mode_changes"])
     probe.command("set_mode", mode="lost_in_space")
@@ -294,7 +286,7 @@ def changes(probe: LinkProbe) -> None:
 
 @MODES.case("no-tracking", "tracking without an attitude to start from is refused with code 7", rule(14))
 def no_tracking(probe: LinkProbe) -> None:
-    """After a reset there is none."""
+    """After a reset there is no attitude to start from."""
     probe.reset()
     row = probe.icd.telecommands["set_mode"]
     probe.expect_refusal(row.id, row.encode({"mode": "tracking"}), SEQUENCE)
@@ -305,7 +297,7 @@ def no_tracking(probe: LinkProbe) -> None:
     "attitude", "with stars in view: valid, of unit length, its time just past, all rows agree", rule(15)
 )
 def attitude(probe: LinkProbe) -> None:
-    """Skipped where no attitude is found within 20 s."""
+    """Skipped if no attitude is found within 20 s."""
     probe.standby()
     probe.command("set_mode", mode="lost_in_space")
     end = probe.now() + 20.0
@@ -330,7 +322,7 @@ def attitude(probe: LinkProbe) -> None:
 
 @RESET.case("magic", "reset without its magic number is refused and does nothing")
 def reset_magic(probe: LinkProbe) -> None:
-    """CubeWheel's 0x55 among them."""
+    """The magic number of CubeWheel, 0x55, is among those refused."""
     before = probe.telemetry("boot_status")["boot_count"]
     row = probe.icd.telecommands["reset"]
     for magic in (0x00, 0x55, 0x59, 0x5B, 0xFF):
@@ -341,7 +333,7 @@ def reset_magic(probe: LinkProbe) -> None:
 
 @RESET.case("acknowledged", "reset is acknowledged, then the device restarts by command")
 def reset_acknowledged(probe: LinkProbe) -> None:
-    """Runtime from zero, one boot more, cause, counters at zero."""
+    """The runtime and the counters start from zero; boot count and reset cause are updated."""
     before = probe.telemetry("boot_status")
     began = probe.now()
     probe.reset()
@@ -360,7 +352,7 @@ def reset_acknowledged(probe: LinkProbe) -> None:
 
 @STORE.case("reset", "a parameter that is not saved is lost at a reset, a saved one is kept")
 def store_reset(probe: LinkProbe) -> None:
-    """What was stored before is stored again afterwards."""
+    """The parameters stored before are stored again afterwards."""
     before = float(probe.parameter("exposure")["value"])
     probe.set_parameter("exposure", TEST_VALUE)
     probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
@@ -376,7 +368,6 @@ def store_reset(probe: LinkProbe) -> None:
 
 @STORE.case("restore", "restore_parameters brings back what is stored", rule(17))
 def store_restore(probe: LinkProbe) -> None:
-    """Without a reset."""
     before = float(probe.parameter("exposure")["value"])
     save_parameters(probe)
     probe.set_parameter("exposure", TEST_VALUE)
@@ -384,9 +375,9 @@ def store_restore(probe: LinkProbe) -> None:
     check_equal(float(probe.parameter("exposure")["value"]), before, "exposure")
 
 
-@STORE.case("defaults", "default_parameters sets the defaults and leaves the store as it is", rule(18))
+@STORE.case("defaults", "default_parameters sets the defaults and leaves the store unchanged", rule(18))
 def store_defaults(probe: LinkProbe) -> None:
-    """Restored afterwards."""
+    """The stored value is restored afterwards."""
     save_parameters(probe)
     stored = float(probe.parameter("limiting_magnitude")["value"])
     probe.set_parameter("limiting_magnitude", 4.25)
@@ -406,7 +397,7 @@ def store_defaults(probe: LinkProbe) -> None:
     "CubeComputer TC 37, TLM 202 (AlbertaSat)",
 )
 def star_config(probe: LinkProbe) -> None:
-    """53 bytes there and back; one bad field changes nothing."""
+    """53 bytes there and back; one invalid field changes nothing."""
     row = probe.icd.telecommands["set_star_config"]
     before = probe.telemetry("star_config")
     wanted = {**before, "exposure": 140, "max_stars_matched": 40}

@@ -106,7 +106,6 @@ for _row in INTRUSIVE_EXCHANGES:
 
 @FRAMES.case("askers", "each asker gets the answer at its own address")
 def askers(probe: CanProbe) -> None:
-    """Two hosts at once."""
     for source in (OTHER_HOST, probe.host, 0xFF):
         probe.post_as(source, IDENTIFICATION)
     seen = [probe.next_answer() for _ in range(3)]
@@ -121,7 +120,6 @@ def askers(probe: CanProbe) -> None:
     "54 bytes come in 8 segments that count 7 to 0, the last with 5 bytes and its counter",
 )
 def segmented_reply(probe: CanProbe) -> None:
-    """All under one identifier of type 8."""
     probe.post(COMBINED)
     frames = [probe.next_frame() for _ in range(8)]
     identifier = identifier_of(8, COMBINED, probe.device, probe.host)
@@ -135,7 +133,7 @@ def segmented_reply(probe: CanProbe) -> None:
 
 @REPLY_SEGMENTS.case("all-rows", "every row goes in one frame up to 8 bytes, in segments above")
 def all_rows(probe: CanProbe) -> None:
-    """The type of the first frame tells."""
+    """The type of the first frame shows which."""
     for row in probe.icd.telemetry.values():
         probe.post(row.id)
         frame = probe.next_frame()
@@ -152,7 +150,7 @@ def all_rows(probe: CanProbe) -> None:
 
 @UNSOLICITED.case("segments", "a long row comes unsolicited as first, body and last, counters down to 0")
 def unsolicited_segments(probe: CanProbe) -> None:
-    """star_tracker, 54 bytes: 8 frames."""
+    """star_tracker has 54 bytes, so 8 frames."""
     probe.command("set_unsolicited", telemetry=COMBINED, rate=5.0)
     try:
         probe.unasked(1.0)
@@ -194,7 +192,7 @@ def _expect_one_refusal(probe: CanProbe) -> None:
 
 @SEGMENTS.case("lost", "a message with a lost segment has no effect, the next one has")
 def lost_segment(probe: CanProbe) -> None:
-    """Each of the segments in turn."""
+    """Each of the segments is left out in turn."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     for lost in range(len(frames)):
         _send(probe, frames[:lost] + frames[lost + 1 :])
@@ -233,16 +231,15 @@ def swapped_segments(probe: CanProbe) -> None:
 
 @SEGMENTS.case("empty", "a segment without a counter has no effect")
 def empty_segment(probe: CanProbe) -> None:
-    """No data at all."""
     probe.send(CanFrame(identifier_of(TELECOMMAND_SEGMENT, UNKNOWN, probe.host, probe.device)))
     probe.expect_silence("there was no counter")
     _send(probe, _segment_frames(probe, UNKNOWN, LONG))
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("half", "half a message is given up after a while", rule(2))
+@SEGMENTS.case("half", "an incomplete message is dropped after a time-out", rule(2))
 def half_message(probe: CanProbe) -> None:
-    """The last segment, when it comes too late, has no effect (two of them would be a message of their own)."""
+    """The last segment arrives too late (the last two would form a message)."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:-1])
     probe.sleep(LONG_PAUSE_S)
@@ -254,16 +251,14 @@ def half_message(probe: CanProbe) -> None:
 
 @SEGMENTS.case("pause", "a pause of 0.1 s between segments does no harm", rule(1))
 def pause_between(probe: CanProbe) -> None:
-    """As slow hosts send."""
     for frame in _segment_frames(probe, UNKNOWN, LONG):
         probe.send(frame)
         probe.sleep(0.1)
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("anew", "a message may begin anew before it was ended", rule(8))
+@SEGMENTS.case("anew", "a message may restart before its end", rule(8))
 def begun_anew(probe: CanProbe) -> None:
-    """Two segments, then all of them."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:2] + frames)
     _expect_one_refusal(probe)
@@ -275,7 +270,7 @@ def begun_anew(probe: CanProbe) -> None:
     "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)",
 )
 def two_hosts(probe: CanProbe) -> None:
-    """One from each in turn; both messages are complete."""
+    """The segments alternate; both messages are complete."""
     ours, theirs = _segment_frames(probe, UNKNOWN, LONG), _segment_frames(probe, UNKNOWN, LONG, OTHER_HOST)
     for one, other in zip(ours, theirs, strict=True):
         _send(probe, [one, other])
@@ -289,7 +284,7 @@ def two_hosts(probe: CanProbe) -> None:
     "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)",
 )
 def request_between(probe: CanProbe) -> None:
-    """Telemetry after the second of five segments."""
+    """Telemetry is requested after the second of five segments."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:2])
     probe.expect_alive()
@@ -299,7 +294,7 @@ def request_between(probe: CanProbe) -> None:
 
 @SEGMENTS.case("overlong", "a message that is too long has no effect, the next one has", rule(4))
 def overlong(probe: CanProbe) -> None:
-    """1750 bytes; the published host's buffer has 512."""
+    """1750 bytes; the buffer of the published host software has 512."""
     _send(probe, _segment_frames(probe, UNKNOWN, bytes(250 * 7)))
     probe.expect_silence("the message was too long")
     _send(probe, _segment_frames(probe, UNKNOWN, LONG))
@@ -308,7 +303,7 @@ def overlong(probe: CanProbe) -> None:
 
 @SEGMENTS.case("long", "a message of 500 bytes is taken and refused for its length", rule(4))
 def long_message(probe: CanProbe) -> None:
-    """set_star_config has 53."""
+    """set_star_config has 53 bytes."""
     row = probe.icd.telecommands["set_star_config"]
     probe.expect_refusal(row.id, bytes(500), INVALID_LENGTH)
 
@@ -329,7 +324,7 @@ add_flag_cases(ERRORS, FLAGS)
 
 @ERRORS.case("none", "good requests, and frames for others, set no flag")
 def no_flag(probe: CanProbe) -> None:
-    """11-bit, remote and foreign frames are nobody's error."""
+    """11-bit, remote and foreign frames are not errors."""
     probe.command("clear_counters")
     for text in ("0480HHFE#", "1F80HHFE#00", "480#0102", "0480HHDD#R", "073CHHFE#00"):
         probe.send_text(text)
@@ -345,7 +340,7 @@ def no_flag(probe: CanProbe) -> None:
 
 @TIMING.case("burst", "two hundred requests back to back are all answered")
 def many_at_once(probe: CanProbe) -> None:
-    """In order, none lost."""
+    """In order."""
     identifier = identifier_of(TELEMETRY_REQUEST, IDENTIFICATION, probe.host, probe.device)
     _send(probe, [CanFrame(identifier)] * 200)
     for _ in range(200):

@@ -39,14 +39,13 @@ def _file(probe: CanopenProbe) -> configparser.RawConfigParser:
 
 @EDS.case("mandatory", "mandatory objects are described", "CiA 301 7.5.1")
 def mandatory(probe: CanopenProbe) -> None:
-    """1000h, 1001h and 1018h are in every data sheet."""
     missing = [f"{index:04X}h" for index in MANDATORY if index not in probe.od]
     check(not missing, "1000h, 1001h and 1018h", f"missing {', '.join(missing)}")
 
 
 @EDS.case("lists", "object lists and sections agree", "CiA 306 4.6.2")
 def lists(probe: CanopenProbe) -> None:
-    """Each listed object has a section, each section is listed, in the list of its range, once."""
+    """Each listed object has a section, and each section is listed once, in the list of its range."""
     parser = _file(probe)
     listed: list[int] = []
     for name in LISTS:
@@ -78,7 +77,7 @@ def types(probe: CanopenProbe) -> None:
 
 @EDS.case("limits", "limits and defaults fit each other and their type", "CiA 306 4.6.3")
 def limits(probe: CanopenProbe) -> None:
-    """Low limit, default and high limit are in order and in the range of the type."""
+    """Low limit, default and high limit are in ascending order and within the range of the type."""
     for item in probe.variables():
         if not is_integer(item):
             continue
@@ -92,9 +91,9 @@ def limits(probe: CanopenProbe) -> None:
             check(low <= item.default <= high, f"default of {item.qualname} in {low} to {high}", item.default)
 
 
-@EDS.case("sub-index-0", "sub-index 0 tells the highest sub-index", "CiA 301 7.4.3")
+@EDS.case("sub-index-0", "sub-index 0 holds the highest sub-index", "CiA 301 7.4.3")
 def sub_index_0(probe: CanopenProbe) -> None:
-    """Records and arrays have a sub-index 0, an UNSIGNED8, whose constant is the highest sub-index."""
+    """Sub-index 0 of records and arrays is an UNSIGNED8; a constant one equals the highest sub-index."""
     for index in sorted(probe.od.indices):
         item = probe.od.indices[index]
         if not isinstance(item, ODRecord | ODArray):
@@ -119,7 +118,7 @@ def pdo_count(probe: CanopenProbe) -> None:
 
 @EDS.case("mapping", "default mappings name objects that can be mapped", "CiA 301 7.5.2.36")
 def mapping(probe: CanopenProbe) -> None:
-    """Object, length, mappability, direction, and 64 bits at most."""
+    """Existence, length, mappability, direction, and 64 bits at most."""
     for first in (0x1600, 0x1A00):
         for index in probe.pdo_indices(first):
             record = probe.od.indices[index]
@@ -145,7 +144,7 @@ def mapping(probe: CanopenProbe) -> None:
 
 @EDS.case("cob-ids", "default identifiers are free, allowed and distinct", "CiA 301 7.3.5")
 def cob_ids(probe: CanopenProbe) -> None:
-    """Identifiers of valid PDOs, SYNC, TIME and EMCY are not restricted, and no two messages share one."""
+    """Valid PDOs, SYNC, TIME and EMCY use no restricted CAN-ID, and no two of them share one."""
     used: dict[int, str] = {}
     for index in (0x1005, 0x1012, 0x1014, *probe.pdo_indices(0x1400), *probe.pdo_indices(0x1800)):
         item = probe.od.get_variable(index, 0 if index < 0x1400 else 1)
@@ -160,7 +159,7 @@ def cob_ids(probe: CanopenProbe) -> None:
 
 @EDS.case("identity", "device information agrees with the identity object")
 def identity(probe: CanopenProbe) -> None:
-    """Vendor, product and revision stand in both places."""
+    """Vendor, product and revision number."""
     information = probe.od.device_information
     told = (information.vendor_number, information.product_number, information.revision_number)
     for subindex, number in enumerate(told, 1):
@@ -171,13 +170,12 @@ def identity(probe: CanopenProbe) -> None:
 
 @EDS.case("bit-rates", "at least one bit rate is supported")
 def bit_rates(probe: CanopenProbe) -> None:
-    """BaudRate_... entries."""
     check(probe.od.device_information.allowed_baudrates, "a supported bit rate", "none")
 
 
-@EDS.case("stored", "the data sheet that the node serves is the one given", "CiA 301 7.5.2.21")
+@EDS.case("stored", "the EDS that the node serves is the one under test", "CiA 301 7.5.2.21")
 def stored(probe: CanopenProbe) -> None:
-    """1021h, if there is one, gives the text of the file."""
+    """1021h, if present, serves the text of the file."""
     item = probe.od.get_variable(0x1021)
     if item is None:
         raise CaseSkipped("the data sheet has no object 1021h")

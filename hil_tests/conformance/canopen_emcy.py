@@ -65,7 +65,7 @@ class Provocation:
 
 @EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
 def emcy_format(probe: CanopenProbe) -> None:
-    """The register is that of 1001h, with the generic bit."""
+    """The register equals 1001h and has the generic bit set."""
     error = Provocation(probe)
     error.cause()
     data = probe.expect(error.emergency, "EMCY")
@@ -74,9 +74,9 @@ def emcy_format(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1001), data[2], "1001h")
 
 
-@EMCY.case("once", "one EMCY an error", "CiA 301 7.2.7.1")
+@EMCY.case("once", "one EMCY per error", "CiA 301 7.2.7.1")
 def emcy_once(probe: CanopenProbe) -> None:
-    """The same error again while it is there sends nothing."""
+    """The same error sends nothing while it persists."""
     error = Provocation(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
@@ -86,7 +86,7 @@ def emcy_once(probe: CanopenProbe) -> None:
 
 @EMCY.case("gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
-    """The error register is clear again, the history keeps the error."""
+    """The error register is clear again; the history keeps the error."""
     error = Provocation(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
@@ -101,7 +101,7 @@ def emcy_gone(probe: CanopenProbe) -> None:
 
 @EMCY.case("history", "the error history has the newest first")
 def emcy_history(probe: CanopenProbe) -> None:
-    """Its count grows by one an error up to its length; sub-index 1 has the newest code; writing 0 clears it."""
+    """The count grows with each error up to the length; sub-index 1 holds the newest code; writing 0 clears it."""
     probe.require(0x1003)
     error = Provocation(probe)
     probe.set(0x1003, 0, 0, 1)
@@ -119,7 +119,7 @@ def emcy_history(probe: CanopenProbe) -> None:
 
 @EMCY.case("history-order", "older errors move up")
 def emcy_history_order(probe: CanopenProbe) -> None:
-    """A second, other error: a watched node that falls silent."""
+    """The second error is another one: the heartbeat of a watched node stops."""
     probe.require(0x1003)
     probe.require(0x1016)
     error = Provocation(probe)
@@ -145,7 +145,7 @@ def emcy_history_write(probe: CanopenProbe) -> None:
 
 @EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
-    """Another identifier while it is on is refused, as are restricted ones."""
+    """A new CAN-ID is refused while EMCY is on; restricted ones always are."""
     error = Provocation(probe)
     probe.expect_refusal(0x1014, 0, 0x91, 4, *REFUSED)
     probe.set(0x1014, 0, PDO_OFF | error.emergency)
@@ -162,7 +162,7 @@ def emcy_switch(probe: CanopenProbe) -> None:
 
 @EMCY.case("inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16")
 def emcy_inhibit(probe: CanopenProbe) -> None:
-    """With 100 ms the second comes 100 ms after the first."""
+    """With 100 ms the second EMCY follows 100 ms after the first."""
     probe.require(0x1015)
     error = Provocation(probe)
     probe.set(0x1015, 0, 1000, 2)
@@ -178,7 +178,7 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
 
 @EMCY.case("stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5")
 def emcy_stopped(probe: CanopenProbe) -> None:
-    """A watched node falls silent in STOPPED: nothing until the node leaves it."""
+    """The heartbeat of a watched node stops in STOPPED: no EMCY until the node leaves that state."""
     probe.require(0x1016)
     error = Provocation(probe)
     probe.set(0x1016, 1, 0x0005_0032)

@@ -37,9 +37,9 @@ def _state(probe: CanopenProbe) -> int:
     return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]
 
 
-@NMT.case("boot-up", "boot-up message, then PRE-OPERATIONAL by itself", "CiA 301 7.3.2.2.1")
+@NMT.case("boot-up", "boot-up message, then PRE-OPERATIONAL without a command", "CiA 301 7.3.2.2.1")
 def boot_up(probe: CanopenProbe) -> None:
-    """After each reset one frame 700h + node-ID with one byte 00, and SDO works."""
+    """After each reset: one frame 700h + node-ID with data 00; then SDO works."""
     for command in (RESET_COMMUNICATION, RESET_NODE):
         probe.drain()
         probe.command(command)
@@ -48,9 +48,8 @@ def boot_up(probe: CanopenProbe) -> None:
         check_equal(_state(probe), 0x7F, "state")
 
 
-@NMT.case("boot-up-once", "one boot-up message a reset", "CiA 301 7.2.8.3.3")
+@NMT.case("boot-up-once", "one boot-up message per reset", "CiA 301 7.2.8.3.3")
 def boot_up_once(probe: CanopenProbe) -> None:
-    """No second frame 00."""
     probe.reset_communication()
     data = probe.wait_for(0x700 + probe.node, 0.2, lambda data: data == b"\0")
     check(data is None, "one boot-up message", "two")
@@ -58,7 +57,7 @@ def boot_up_once(probe: CanopenProbe) -> None:
 
 @NMT.case("commands", "start, stop and enter PRE-OPERATIONAL from every state")
 def commands(probe: CanopenProbe) -> None:
-    """All nine changes, addressed to the node."""
+    """All nine transitions, addressed to the node."""
     _prepare(probe)
     for before in STATE_OF:
         for command, state in STATE_OF.items():
@@ -69,22 +68,21 @@ def commands(probe: CanopenProbe) -> None:
 
 @NMT.case("broadcast", "commands to all nodes", "CiA 301 7.2.8.3")
 def broadcast(probe: CanopenProbe) -> None:
-    """Node-ID 0 stands for every node; only for a bus with nothing else in operation."""
+    """Node-ID 0 addresses every node; only for a bus on which nothing else is in operation."""
     _prepare(probe)
     for command, state in STATE_OF.items():
         probe.command(command, 0)
         check_equal(_state(probe), state, f"state after command {command} to all:")
 
 
-@NMT.case("other-node", "commands to another node are not obeyed")
+@NMT.case("other-node", "commands to another node are ignored")
 def other_node(probe: CanopenProbe) -> None:
-    """Start for the next node-ID."""
     _prepare(probe)
     probe.command(START, probe.node % 127 + 1)
     check_equal(_state(probe), 0x7F, "state")
 
 
-@NMT.case("malformed", "frames that are no NMT command are not obeyed")
+@NMT.case("malformed", "frames that are no NMT command are ignored")
 def malformed(probe: CanopenProbe) -> None:
     """Unknown specifier, one byte, three bytes, extended frame."""
     _prepare(probe)
@@ -118,7 +116,6 @@ def reset_communication(probe: CanopenProbe) -> None:
 
 @NMT.case("sdo-states", "SDO in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED", "CiA 301 7.3.2.2.5")
 def sdo_states(probe: CanopenProbe) -> None:
-    """As the table of states and communication objects has it."""
     for command, answered in ((PRE_OPERATIONAL, True), (START, True), (STOP, False)):
         probe.command(command)
         answer = probe.ask("40 00 10 00", 0.2)
@@ -130,7 +127,7 @@ def sdo_states(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("heartbeat", "heartbeat at its period with the state")
 def heartbeat(probe: CanopenProbe) -> None:
-    """One byte, bit 7 clear; period within a fifth over five heartbeats of 100 ms."""
+    """One byte with bit 7 clear; mean period within 20 % over five heartbeats of 100 ms."""
     _prepare(probe, 100)
     probe.drain()
     found = probe.count(0x700 + probe.node, 0.75)
@@ -142,7 +139,6 @@ def heartbeat(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("heartbeat-off", "no heartbeat with time 0")
 def heartbeat_off(probe: CanopenProbe) -> None:
-    """1017h set to 0."""
     _prepare(probe, 50)
     _prepare(probe, 0)
     probe.drain()
@@ -151,7 +147,6 @@ def heartbeat_off(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("heartbeat-stopped", "heartbeat goes on in STOPPED", "CiA 301 7.3.2.2.5")
 def heartbeat_stopped(probe: CanopenProbe) -> None:
-    """With state 04."""
     _prepare(probe)
     probe.command(STOP)
     check_equal(_state(probe), 0x04, "state")
@@ -173,7 +168,7 @@ def _prepare_guarding(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("guarding", "node guarding with toggle bit", "CiA 301 7.2.8.3.1")
 def guarding(probe: CanopenProbe) -> None:
-    """The toggle bit begins at 0 after a reset and alternates; the state is right."""
+    """The toggle bit starts at 0 after a reset and alternates; the state is correct."""
     _prepare_guarding(probe)
     check_equal([_guard(probe) for _ in range(3)], [0x7F, 0xFF, 0x7F], "answers")
     probe.command(START)
@@ -192,7 +187,7 @@ def guarding(probe: CanopenProbe) -> None:
     "guarding-or-heartbeat", "no node guarding while the heartbeat is on", "CiA 301 7.2.8.3.1"
 )
 def guarding_or_heartbeat(probe: CanopenProbe) -> None:
-    """A remote request is not answered with 1017h set."""
+    """A remote request is not answered while 1017h is not 0."""
     probe.require(0x100C)
     _prepare(probe, 5000)
     probe.drain()
@@ -202,7 +197,7 @@ def guarding_or_heartbeat(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("life-guarding", "life guarding", "CiA 301 7.2.8.3.1")
 def life_guarding(probe: CanopenProbe) -> None:
-    """It begins with the first request; when they end, EMCY 8130h comes and OPERATIONAL is left."""
+    """It starts with the first request; when requests stop, EMCY 8130h is sent and the node leaves OPERATIONAL."""
     _prepare_guarding(probe)
     probe.require(0x100D)
     probe.set(0x100C, 0, 50, 2)
@@ -235,14 +230,14 @@ def _watch(probe: CanopenProbe) -> int:
 
 @ERROR_CONTROL.case("consumer-start", "a watch begins with the first heartbeat")
 def consumer_start(probe: CanopenProbe) -> None:
-    """No EMCY while the watched node was never heard."""
+    """No EMCY before the watched node has sent its first heartbeat."""
     emergency = _watch(probe)
     probe.expect_silence(emergency, "EMCY", 0.4)
 
 
-@ERROR_CONTROL.case("consumer", "a watched node falls silent and comes back")
+@ERROR_CONTROL.case("consumer", "the heartbeat of a watched node stops and returns")
 def consumer(probe: CanopenProbe) -> None:
-    """EMCY 8130h after the time, not before; error register set; EMCY 0000h when it is heard again."""
+    """EMCY 8130h after the consumer time, not before; the error register is set; EMCY 0000h at the next heartbeat."""
     emergency = _watch(probe)
     for _ in range(3):
         probe.send(0x700 + OTHER_NODE, b"\x05")
@@ -256,9 +251,11 @@ def consumer(probe: CanopenProbe) -> None:
     check_equal(data[:3], bytes(3), "error code and register")
 
 
-@ERROR_CONTROL.case("behaviour", "error behaviour when a watched node falls silent", "CiA 301 7.5.2.32")
+@ERROR_CONTROL.case(
+    "behaviour", "error behaviour when the heartbeat of a watched node stops", "CiA 301 7.5.2.32"
+)
 def behaviour(probe: CanopenProbe) -> None:
-    """1029h:01h at 0 leads to PRE-OPERATIONAL, at 1 to no change, at 2 to STOPPED."""
+    """1029h:01h = 0 leads to PRE-OPERATIONAL, 1 to no change, 2 to STOPPED."""
     probe.require(0x1029)
     for value, state in ((0, 0x7F), (1, 0x05), (2, 0x04)):
         probe.command(PRE_OPERATIONAL)
@@ -273,7 +270,7 @@ def behaviour(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("consumer-twice", "one node is watched by one entry", "CiA 301 7.5.2.18")
 def consumer_twice(probe: CanopenProbe) -> None:
-    """A second entry for the same node is refused by 0604 0043h."""
+    """A second entry for the same node is refused with 0604 0043h."""
     _watch(probe)
     item = probe.od.get_variable(0x1016, 2)
     if item is None:
@@ -284,7 +281,7 @@ def consumer_twice(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("consumer-off", "a watch with time 0 is off", "CiA 301 7.5.2.18")
 def consumer_off(probe: CanopenProbe) -> None:
-    """Heard once, then switched off: no EMCY."""
+    """The watch is switched off after the first heartbeat: no EMCY."""
     emergency = _watch(probe)
     probe.send(0x700 + OTHER_NODE, b"\x05")
     probe.set(0x1016, 1, 0)

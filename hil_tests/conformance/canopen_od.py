@@ -49,25 +49,25 @@ def _readable(probe: CanopenProbe, indices: range) -> None:
     "communication", "every object of the communication profile can be read", "CiA 301 7.5.2", intrusive=False
 )
 def communication(probe: CanopenProbe) -> None:
-    """1000h to 1FFFh, each in the length of its type."""
+    """1000h to 1FFFh, each with the length of its type."""
     _readable(probe, range(0x1000, 0x2000))
 
 
 @OD.case("manufacturer", "every object of the manufacturer can be read", "CiA 301 7.4.1", intrusive=False)
 def manufacturer(probe: CanopenProbe) -> None:
-    """2000h to 5FFFh, each in the length of its type."""
+    """2000h to 5FFFh, each with the length of its type."""
     _readable(probe, range(0x2000, 0x6000))
 
 
 @OD.case("profile", "every object of the device profile area can be read", "CiA 301 7.4.1", intrusive=False)
 def profile(probe: CanopenProbe) -> None:
-    """6000h to 9FFFh, each in the length of its type."""
+    """6000h to 9FFFh, each with the length of its type."""
     _readable(probe, range(0x6000, 0xA000))
 
 
-@OD.case("defaults", "after a reset the defaults are those of the data sheet", "CiA 301 7.5.2")
+@OD.case("defaults", "after a reset the defaults are those of the EDS", "CiA 301 7.5.2")
 def defaults(probe: CanopenProbe) -> None:
-    """Communication profile, integers, in a node whose parameters were not stored."""
+    """Integers of the communication profile, after `load` has cleared stored parameters."""
     if 0x1011 in probe.od:
         probe.set(0x1011, 1, b"load")
     probe.reset_communication()
@@ -84,9 +84,9 @@ def defaults(probe: CanopenProbe) -> None:
             )
 
 
-@OD.case("texts", "names and versions are those of the data sheet", "CiA 301 7.5.2.7", intrusive=False)
+@OD.case("texts", "names and versions are those of the EDS", "CiA 301 7.5.2.7", intrusive=False)
 def texts(probe: CanopenProbe) -> None:
-    """1008h to 100Ah, as far as the data sheet gives them."""
+    """1008h to 100Ah, if the EDS has them."""
     for index in (0x1008, 0x1009, 0x100A):
         item = probe.od.get_variable(index)
         if item is not None and item.default is not None:
@@ -95,7 +95,7 @@ def texts(probe: CanopenProbe) -> None:
             )
 
 
-@OD.case("identity", "identity is that of the data sheet", "CiA 301 7.5.2.19", intrusive=False)
+@OD.case("identity", "identity is that of the EDS", "CiA 301 7.5.2.19", intrusive=False)
 def identity(probe: CanopenProbe) -> None:
     """1000h and 1018h."""
     for index, subindex in ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3)):
@@ -115,7 +115,7 @@ def sub_index_0(probe: CanopenProbe) -> None:
 
 @OD.case("write-only", "write-only objects are not read", intrusive=False)
 def write_only(probe: CanopenProbe) -> None:
-    """All of them, abort 0601 0001h."""
+    """Abort 0601 0001h for each of them."""
     probe.find("write-only object", lambda item: item.access_type == "wo")
     for item in probe.variables():
         if item.access_type == "wo":
@@ -124,7 +124,7 @@ def write_only(probe: CanopenProbe) -> None:
 
 @OD.case("read-only", "read-only and constant objects are not written")
 def read_only(probe: CanopenProbe) -> None:
-    """All of them, abort 0601 0002h."""
+    """Abort 0601 0002h for each of them."""
     for item in probe.variables():
         if item.access_type in {"ro", "const"}:
             size = min(size_of(item) or 1, 4)
@@ -133,9 +133,9 @@ def read_only(probe: CanopenProbe) -> None:
                 probe.expect_abort(command + multiplexer(item.index, item.subindex), ABORT_READ_ONLY)
 
 
-@OD.case("no-object", "objects that the data sheet does not have do not exist")
+@OD.case("no-object", "objects that are not in the EDS do not exist")
 def no_object(probe: CanopenProbe) -> None:
-    """The gaps at both ends of each run of objects, abort 0602 0000h, reading and writing."""
+    """The gaps at both ends of each run of objects: abort 0602 0000h for reading and writing."""
     present = {index for index in probe.od.indices if index >= 0x1000}
     gaps = sorted({near for index in present for near in (index - 1, index + 1) if near >= 0x1000} - present)
     for index in [0x0000, 0x0005, *gaps, 0xFFFF]:
@@ -144,9 +144,9 @@ def no_object(probe: CanopenProbe) -> None:
             probe.expect_abort(b"\x2f" + multiplexer(index, 0), ABORT_NO_OBJECT)
 
 
-@OD.case("no-sub-index", "sub-indices beyond the data sheet do not exist")
+@OD.case("no-sub-index", "sub-indices that are not in the EDS do not exist")
 def no_sub_index(probe: CanopenProbe) -> None:
-    """The first beyond each record and sub-index 1 of each variable, abort 0609 0011h."""
+    """The first beyond each record, and sub-index 1 of each variable: abort 0609 0011h."""
     for index in sorted(probe.od.indices):
         if index < 0x1000:
             continue
@@ -159,7 +159,7 @@ def no_sub_index(probe: CanopenProbe) -> None:
 
 @OD.case("length-high", "too long a value is refused")
 def length_high(probe: CanopenProbe) -> None:
-    """Expedited writes with one byte too many, abort 0607 0010h or 0607 0012h."""
+    """Expedited writes with one byte too many: abort 0607 0010h or 0607 0012h."""
     for item in probe.variables():
         size = size_of(item)
         if item.writable and size is not None and size < 4 and item.index not in {0x1010, 0x1011}:
@@ -171,7 +171,7 @@ def length_high(probe: CanopenProbe) -> None:
 
 @OD.case("length-low", "too short a value is refused")
 def length_low(probe: CanopenProbe) -> None:
-    """Expedited writes with one byte too few, abort 0607 0010h or 0607 0013h."""
+    """Expedited writes with one byte too few: abort 0607 0010h or 0607 0013h."""
     for item in probe.variables():
         size = size_of(item)
         if item.writable and size is not None and 1 < size <= 5:
@@ -192,7 +192,7 @@ def _bounded(probe: CanopenProbe) -> list[ODVariable]:
 
 @OD.case("value-high", "values above the limit are refused")
 def value_high(probe: CanopenProbe) -> None:
-    """One above each high limit that the type can hold, abort 0609 0031h or 0609 0030h."""
+    """One above each high limit that the type can hold: abort 0609 0031h or 0609 0030h."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
@@ -204,7 +204,7 @@ def value_high(probe: CanopenProbe) -> None:
 
 @OD.case("value-low", "values below the limit are refused")
 def value_low(probe: CanopenProbe) -> None:
-    """One below each low limit that the type can hold, abort 0609 0032h or 0609 0030h."""
+    """One below each low limit that the type can hold: abort 0609 0032h or 0609 0030h."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
@@ -216,7 +216,7 @@ def value_low(probe: CanopenProbe) -> None:
 
 @OD.case("write-back", "what is written is read back", "CiA 301 7.2.4.3")
 def write_back(probe: CanopenProbe) -> None:
-    """Limits and default of a writable application object, then its old value again."""
+    """Both limits of each writable application object, then its previous value."""
     found = 0
     for item in probe.variables():
         size = size_of(item)

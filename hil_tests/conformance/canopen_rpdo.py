@@ -31,7 +31,6 @@ RPDO: Final = CaseArea[CanopenProbe]("canopen.rpdo", "CiA 301 7.2.2.2", intrusiv
 
 @RPDO.case("event", "event-driven RPDO acts at once")
 def rpdo_event(probe: CanopenProbe) -> None:
-    """The object has the value that was sent."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
@@ -45,7 +44,7 @@ def rpdo_event(probe: CanopenProbe) -> None:
 
 @RPDO.case("gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def rpdo_gate(probe: CanopenProbe) -> None:
-    """In PRE-OPERATIONAL and in STOPPED the object keeps its value."""
+    """The object keeps its value in PRE-OPERATIONAL and in STOPPED."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     data = next(
@@ -63,7 +62,7 @@ def rpdo_gate(probe: CanopenProbe) -> None:
 
 @RPDO.case("synchronous", "synchronous RPDO acts at the next SYNC")
 def rpdo_synchronous(probe: CanopenProbe) -> None:
-    """The old value before it, the latest received after it."""
+    """The object keeps its value until the SYNC, then takes the last one received."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
@@ -93,7 +92,7 @@ def rpdo_short(probe: CanopenProbe) -> None:
 
 @RPDO.case("long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_long(probe: CanopenProbe) -> None:
-    """EMCY 8220h, and EMCY 0000h after one of the right length."""
+    """EMCY 8220h, then EMCY 0000h after a PDO of the correct length."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
@@ -106,9 +105,9 @@ def rpdo_long(probe: CanopenProbe) -> None:
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
 
 
-@RPDO.case("place-holder", "place holders skip bytes of an RPDO", "CiA 301 7.4.7")
+@RPDO.case("place-holder", "dummy entries skip bytes of an RPDO", "CiA 301 7.4.7")
 def place_holder(probe: CanopenProbe) -> None:
-    """UNSIGNED16 mapped by its type before the object."""
+    """A dummy UNSIGNED16 is mapped before the object."""
     if 0x0006 not in probe.od:
         raise CaseSkipped("the data sheet allows no place holder of 16 bits")
     item = writable(probe)
@@ -123,7 +122,7 @@ def place_holder(probe: CanopenProbe) -> None:
 
 @RPDO.case("deadline", "deadline of an RPDO", "CiA 301 7.5.2.35")
 def deadline(probe: CanopenProbe) -> None:
-    """With an event timer of 100 ms EMCY 8250h comes 100 ms after the last message, not before the first."""
+    """With an event timer of 100 ms, EMCY 8250h follows 100 ms after the last message, not before the first."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255, event_ms=100)
@@ -143,7 +142,7 @@ def deadline(probe: CanopenProbe) -> None:
 
 @RPDO.case("refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35")
 def rpdo_refused(probe: CanopenProbe) -> None:
-    """Restricted identifiers, another identifier in use, types 241 to 253, read-only objects."""
+    """Restricted CAN-IDs, another CAN-ID while in use, types 241 to 253, read-only objects."""
     index, item = first(probe, 0x1400), writable(probe)
     set_up(probe, index, [entry(item)], 255)
     probe.expect_refusal(index, 1, 0x3F3, 4, *FIXED)

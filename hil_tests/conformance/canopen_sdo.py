@@ -63,9 +63,9 @@ def expect_no_transfer(probe: CanopenProbe) -> None:
     probe.check_abort(probe.ask("60"), ABORT_COMMAND, multiplexer="")
 
 
-@SDO.case("expedited-upload", "expedited upload tells its size", "CiA 301 7.2.4.3.6")
+@SDO.case("expedited-upload", "expedited upload states its size", "CiA 301 7.2.4.3.6")
 def expedited_upload(probe: CanopenProbe) -> None:
-    """Objects of 1, 2 and 4 bytes: e and s set, n right."""
+    """Objects of 1, 2 and 4 bytes: e and s are set, n is correct."""
     for size, command in ((1, 0x4F), (2, 0x4B), (4, 0x43)):
         fitting = [
             item for item in probe.variables() if item.readable and is_integer(item) and size_of(item) == size
@@ -78,7 +78,7 @@ def expedited_upload(probe: CanopenProbe) -> None:
 
 @SDO.case("expedited-download", "expedited download is confirmed", "CiA 301 7.2.4.3.3", intrusive=True)
 def expedited_download(probe: CanopenProbe) -> None:
-    """60h, the multiplexer, four zeros; the value has changed."""
+    """The answer is 60h, the multiplexer and four zeros; the value has changed."""
     item = writable_number(probe)
     probe.expect_answer(
         b"\x2b" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
@@ -88,7 +88,7 @@ def expedited_download(probe: CanopenProbe) -> None:
 
 @SDO.case("no-size", "expedited download without a size", "CiA 301 7.2.4.3.3", intrusive=True)
 def no_size(probe: CanopenProbe) -> None:
-    """With s cleared the object's own size counts."""
+    """With s = 0 the size of the object counts."""
     item = writable_number(probe)
     probe.expect_answer(
         b"\x22" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
@@ -98,7 +98,7 @@ def no_size(probe: CanopenProbe) -> None:
 
 @SDO.case("segmented-upload", "segmented upload: size, toggle, last segment", "CiA 301 7.2.4.3.7")
 def segmented_upload(probe: CanopenProbe) -> None:
-    """Size in the first answer, toggle bit alternating from 0, c in the last segment only, n right."""
+    """The first answer has the size; the toggle bit starts at 0; c is set in the last segment only; n is correct."""
     item, value = long_text(probe)
     probe.expect_answer(upload(item), f"41 {mux(item)} {len(value).to_bytes(4, 'little').hex()}")
     toggle, data = 0, b""
@@ -128,7 +128,7 @@ def upload_toggle(probe: CanopenProbe) -> None:
 
 @SDO.case("segmented-download", "segmented download of a number", "CiA 301 7.2.4.3.4", intrusive=True)
 def segmented_download(probe: CanopenProbe) -> None:
-    """A 16-bit number in one segment, with its size announced and without."""
+    """A 16-bit number in one segment, with and without an announced size."""
     item = writable_number(probe)
     for command, size, value in ((0x21, 2, b"\x39\x30"), (0x20, 0, b"\x38\x30")):
         request = bytes([command]) + multiplexer(item.index, item.subindex) + size.to_bytes(4, "little")
@@ -139,7 +139,7 @@ def segmented_download(probe: CanopenProbe) -> None:
 
 @SDO.case("download-in-parts", "segmented download in two segments", "CiA 301 7.2.4.3.4", intrusive=True)
 def download_in_parts(probe: CanopenProbe) -> None:
-    """One byte a segment: toggle bit echoed, nothing written before the end."""
+    """One byte per segment: the toggle bit is echoed, nothing is written before the end."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     value = bytes([before[0] ^ 0x55, before[1] ^ 0x01])
@@ -204,7 +204,7 @@ def announced_differs(probe: CanopenProbe) -> None:
 
 @SDO.case("unknown-command", "unknown command specifier")
 def unknown_command(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for 7."""
+    """Abort 0504 0001h for specifier 7."""
     probe.check_abort(probe.ask("e0 00 10 00"), ABORT_COMMAND, multiplexer="")
 
 
@@ -238,7 +238,6 @@ def client_abort(probe: CanopenProbe) -> None:
 
 @SDO.case("new-request", "a new request replaces the transfer under way", "CiA 301 7.2.4.3.6")
 def new_request(probe: CanopenProbe) -> None:
-    """A client that has restarted is served."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.ask("60")
@@ -246,9 +245,9 @@ def new_request(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@SDO.case("time-out", "a transfer whose client falls silent ends")
+@SDO.case("time-out", "a transfer whose client stops sending times out")
 def time_out(probe: CanopenProbe) -> None:
-    """Abort 0504 0000h in some seconds."""
+    """Abort 0504 0000h within 12 s."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.check_abort(
@@ -267,28 +266,25 @@ def wrong_length(probe: CanopenProbe) -> None:
 
 @SDO.case("extended", "frames with a 29-bit identifier are no SDO", "CiA 301 7.3.5")
 def extended(probe: CanopenProbe) -> None:
-    """No answer to the same number as an extended identifier."""
     probe.send(0x600 + probe.node, "40 00 10 00 00 00 00 00", extended=True)
     probe.expect_silence(0x580 + probe.node, "answer to an extended frame")
 
 
 @SDO.case("remote", "remote frames are no SDO", "CiA 301 7.2.4")
 def remote(probe: CanopenProbe) -> None:
-    """No answer."""
     probe.send(0x600 + probe.node, remote=True)
     probe.expect_silence(0x580 + probe.node, "answer to a remote frame")
 
 
 @SDO.case("other-node", "requests to another node are not answered", "CiA 301 7.3.5")
 def other_node(probe: CanopenProbe) -> None:
-    """No answer under this node's identifier."""
     probe.send(0x600 + (probe.node % 127 + 1), "40 00 10 00 00 00 00 00")
     probe.expect_silence(0x580 + probe.node, "answer to another node's request")
 
 
 @SDO.case("stopped", "no SDO in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
 def stopped(probe: CanopenProbe) -> None:
-    """Neither to a new request nor within a transfer that was under way."""
+    """No answer to a new request, nor to a segment of a transfer in progress."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.command(STOP)
@@ -296,7 +292,7 @@ def stopped(probe: CanopenProbe) -> None:
         raise CaseFailed("no SDO answer in STOPPED", "an answer")
 
 
-@SDO.case("server-parameter", "1200h tells the identifiers in use", "CiA 301 7.5.2.33")
+@SDO.case("server-parameter", "1200h holds the identifiers in use", "CiA 301 7.5.2.33")
 def server_parameter(probe: CanopenProbe) -> None:
     """600h and 580h plus the node-ID."""
     probe.require(0x1200)

@@ -111,7 +111,7 @@ def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: boo
 
 @SDO_BLOCK.case("upload", "block upload with CRC", "CiA 301 7.2.4.3.13")
 def upload_with_crc(probe: CanopenProbe) -> None:
-    """Numbers from 1, last bit, unused bytes, size and CRC; the same data as by segments."""
+    """Segment numbers from 1, last bit, unused bytes, size and CRC; the same data as a segmented upload."""
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127), value, "value")
     expect_no_transfer(probe)
@@ -119,7 +119,7 @@ def upload_with_crc(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-sizes", "block upload in blocks of 1, 2 and 5 segments", "CiA 301 7.2.4.3.13")
 def upload_sizes(probe: CanopenProbe) -> None:
-    """The block size is the client's."""
+    """The client sets the block size."""
     item, value = long_text(probe)
     for block in (1, 2, 5):
         check_equal(upload_blocks(probe, item, block), value, "value")
@@ -127,7 +127,7 @@ def upload_sizes(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-without-crc", "block upload without CRC", "CiA 301 7.2.4.3.13")
 def upload_without_crc(probe: CanopenProbe) -> None:
-    """A client that does not support the CRC is served."""
+    """For a client that does not support the CRC."""
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127, crc=False), value, "value")
 
@@ -142,7 +142,7 @@ def upload_big(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-repeat", "segments that were not confirmed are sent again", "CiA 301 7.2.4.3.14")
 def upload_repeat(probe: CanopenProbe) -> None:
-    """Confirm the first of three, then none, then all."""
+    """Confirm the first of three segments, then none, then all."""
     item, value = long_text(probe)
     _begin(probe, item, 3)
     first = _segments(probe, b"\xa3", 3)
@@ -156,7 +156,7 @@ def upload_repeat(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-block-size", "block size 0 and above 127")
 def upload_block_size(probe: CanopenProbe) -> None:
-    """Abort 0504 0002h at the beginning and in a confirmation."""
+    """Abort 0504 0002h at the start and in a confirmation."""
     item, _ = long_text(probe)
     for size in (0, 128):
         probe.check_abort(_begin(probe, item, size), ABORT_BLOCK_SIZE, multiplexer=mux(item))
@@ -177,7 +177,7 @@ def upload_sequence(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-order", "requests of a block upload out of order")
 def upload_order(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for a confirmation before the start, an end before its time, a segment request."""
+    """Abort 0504 0001h for a confirmation before the start, an early end, a segment request."""
     item, _ = long_text(probe)
     for request in ("a2 01 01", "a1", "60"):
         _begin(probe, item, 1)
@@ -189,7 +189,7 @@ def upload_order(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("threshold", "protocol switch threshold", "CiA 301 7.2.4.3.13")
 def threshold(probe: CanopenProbe) -> None:
-    """An object not above the threshold comes by the upload protocol or by blocks, one above it by blocks."""
+    """At most as long as the threshold: segmented or block upload; longer: block upload."""
     item, value = long_text(probe)
     answer = _begin(probe, item, 127, threshold=min(255, len(value)))
     check(answer[0] in {0x41, 0xC6, 0xC4, 0xC2, 0xC0}, "answer 41h or C6h", answer)
@@ -199,7 +199,7 @@ def threshold(probe: CanopenProbe) -> None:
     probe.abandon_transfer()
 
 
-@SDO_BLOCK.case("upload-refused", "block upload of what cannot be read")
+@SDO_BLOCK.case("upload-refused", "block upload of objects that cannot be read")
 def upload_refused(probe: CanopenProbe) -> None:
     """Abort 0602 0000h and 0601 0001h."""
     probe.expect_abort("a4 05 00 00 7f 00", ABORT_NO_OBJECT)
@@ -207,9 +207,9 @@ def upload_refused(probe: CanopenProbe) -> None:
     probe.expect_abort(b"\xa4" + multiplexer(item.index, item.subindex) + b"\x7f\0", ABORT_WRITE_ONLY)
 
 
-@SDO_BLOCK.case("upload-time-out", "a block upload whose client falls silent ends")
+@SDO_BLOCK.case("upload-time-out", "a block upload whose client stops sending times out")
 def upload_time_out(probe: CanopenProbe) -> None:
-    """Abort 0504 0000h in some seconds."""
+    """Abort 0504 0000h within 12 s."""
     item, _ = long_text(probe)
     _begin(probe, item, 2)
     _segments(probe, b"\xa3", 2)
@@ -260,9 +260,9 @@ def download_crc(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@SDO_BLOCK.case("download-gap", "a lost segment is asked for again", "CiA 301 7.2.4.3.11", intrusive=True)
+@SDO_BLOCK.case("download-gap", "a lost segment is requested again", "CiA 301 7.2.4.3.11", intrusive=True)
 def download_gap(probe: CanopenProbe) -> None:
-    """The last segment with number 2 after none: A2h with number 0; then the block again."""
+    """The block begins with number 2: confirmation A2h with number 0; then the block is repeated."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x82\x39\x30")
@@ -275,7 +275,7 @@ def download_gap(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-zero", "segment number 0", intrusive=True)
 def download_zero(probe: CanopenProbe) -> None:
-    """Abort 0504 0003h, or the segment is passed over; no confirmation of it, and the node is not stuck."""
+    """Abort 0504 0003h, or no answer; afterwards the node serves requests."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x00\x39\x30")
@@ -288,7 +288,7 @@ def download_zero(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-length", "lengths of block downloads", intrusive=True)
 def download_length(probe: CanopenProbe) -> None:
-    """One byte too many, too few, and other than announced, each refused."""
+    """One byte too many, too few, and not as announced: each is refused."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     for size, unused in ((None, 4), (None, 6), (2, 6)):
@@ -300,7 +300,7 @@ def download_length(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@SDO_BLOCK.case("download-announced", "announced size that the object has not", intrusive=True)
+@SDO_BLOCK.case("download-announced", "announced size that differs from the object's", intrusive=True)
 def download_announced(probe: CanopenProbe) -> None:
     """Refused at once or at the end."""
     item = writable_number(probe)
@@ -313,7 +313,7 @@ def download_announced(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-abort", "an abort of the client ends a block download", intrusive=True)
 def download_abort(probe: CanopenProbe) -> None:
-    """80h is no segment."""
+    """80h is not a segment."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     probe.send(
@@ -323,7 +323,7 @@ def download_abort(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@SDO_BLOCK.case("download-refused", "block download to what cannot be written", intrusive=True)
+@SDO_BLOCK.case("download-refused", "block download to objects that cannot be written", intrusive=True)
 def download_refused(probe: CanopenProbe) -> None:
     """Abort 0601 0002h and 0602 0000h."""
     probe.expect_abort("c2 00 10 00 04 00 00 00", ABORT_READ_ONLY)

@@ -27,9 +27,9 @@ def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
     probe.expect_boot_up()
 
 
-@STORE.case("ability", "1010h and 1011h tell what they can do", intrusive=False)
+@STORE.case("ability", "1010h and 1011h describe their abilities", intrusive=False)
 def ability(probe: CanopenProbe) -> None:
-    """Bit 0: on command, bit 1: by itself; the others are zero."""
+    """Bit 0: on command; bit 1: autonomously; all others are 0."""
     for index in (0x1010, 0x1011):
         if index in probe.od:
             check(probe.number(index, 1) & ~0x03 == 0, f"{index:04X}h:01h 0 to 3", probe.number(index, 1))
@@ -47,7 +47,7 @@ def signature(probe: CanopenProbe) -> None:
 
 @STORE.case("save", "stored parameters are back after a reset")
 def save(probe: CanopenProbe) -> None:
-    """After reset node and reset communication; what was changed afterwards is not."""
+    """After reset node and reset communication; later changes are lost."""
     probe.require(0x1010)
     probe.set(0x1017, 0, 777, 2)
     probe.set(0x1010, 1, b"save")
@@ -63,7 +63,7 @@ def _restore(probe: CanopenProbe) -> None:
     _reset(probe)
 
 
-@STORE.case("restore", "defaults hold from the next reset on", "CiA 301 7.5.2.12")
+@STORE.case("restore", "defaults take effect at the next reset", "CiA 301 7.5.2.12")
 def restore(probe: CanopenProbe) -> None:
     """`load` changes nothing until then."""
     probe.require(0x1010)
@@ -77,9 +77,9 @@ def restore(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1017), 0 if default is None else default.default, "1017h after the reset")
 
 
-@STORE.case("groups", "communication and application are stored apart")
+@STORE.case("groups", "communication and application parameters are stored separately")
 def groups(probe: CanopenProbe) -> None:
-    """Storing the application's leaves the communication profile as it was stored."""
+    """Storing the application parameters does not store the communication parameters."""
     probe.require(0x1010)
     if probe.od.get_variable(0x1010, 3) is None:
         raise CaseSkipped("1010h has no sub-index 3")
@@ -93,7 +93,7 @@ def groups(probe: CanopenProbe) -> None:
 
 @STORE.case("pdo", "a stored PDO configuration is back after a reset")
 def pdo(probe: CanopenProbe) -> None:
-    """Transmission type of the first TPDO."""
+    """The transmission type of the first TPDO."""
     probe.require(0x1010)
     probe.require(0x1800)
     probe.set(0x1800, 2, 17, 1)
@@ -134,7 +134,7 @@ def _wait(probe: CanopenProbe) -> None:
 
 @LSS.case("selective", "switch state selective", "CiA 305 switch state selective")
 def selective(probe: CanopenProbe) -> None:
-    """The identity selects the node; any other does not."""
+    """The identity selects the node; no other identity does."""
     identity = _select(probe)
     check(_lss(probe, "5e") is not None, "configuration state", "waiting")
     _wait(probe)
@@ -148,7 +148,7 @@ def selective(probe: CanopenProbe) -> None:
 
 @LSS.case("global", "switch state global", "CiA 305 switch state global")
 def global_(probe: CanopenProbe) -> None:
-    """Into configuration and back, unanswered."""
+    """To configuration and back, without an answer."""
     _select(probe)
     check(_lss(probe, "04 00", 0.1) is None, "no answer to switch state global", "one")
     check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
@@ -168,7 +168,7 @@ def inquire(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@LSS.case("waiting", "a waiting node obeys no configuration")
+@LSS.case("waiting", "a waiting node obeys no configuration command")
 def waiting(probe: CanopenProbe) -> None:
     """Node-ID, bit timing, store and inquiries are not answered."""
     _select(probe)
@@ -180,7 +180,7 @@ def waiting(probe: CanopenProbe) -> None:
 
 @LSS.case("node-id", "configure node-ID", "CiA 305 configure node-ID")
 def node_id(probe: CanopenProbe) -> None:
-    """Numbers that are none are refused; a new one holds from the reset of the communication on, and back."""
+    """Invalid node-IDs are refused; a new one takes effect with the communication reset, and is then set back."""
     _select(probe)
     for value in (0, 128, 254):
         check_equal(_lss(probe, bytes([0x11, value])), b"\x11\x01" + bytes(6), f"answer to node-ID {value}")
@@ -205,7 +205,7 @@ def node_id(probe: CanopenProbe) -> None:
 
 @LSS.case("bit-timing", "configure bit timing", "CiA 305 configure bit timing")
 def bit_timing(probe: CanopenProbe) -> None:
-    """Rates of the data sheet are taken, index 5, 9 and other tables refused; nothing is activated."""
+    """The bit rates of the EDS are accepted, indices 5 and 255 and other tables refused; nothing is activated."""
     _select(probe)
     table = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
     rates = probe.od.device_information.allowed_baudrates
@@ -222,7 +222,7 @@ def bit_timing(probe: CanopenProbe) -> None:
 
 @LSS.case("identify", "identify remote slave", "CiA 305 identify remote slave")
 def identify(probe: CanopenProbe) -> None:
-    """Answered by 4Fh if the node is within the ranges, not otherwise."""
+    """Answered with 4Fh only if the identity is within the ranges."""
     _select(probe)
     _wait(probe)
     vendor, product, revision, serial = _identity(probe)
@@ -258,7 +258,7 @@ def configured(probe: CanopenProbe) -> None:
 
 @LSS.case("fastscan", "fastscan finds a node without a node-ID", "CiA 305 fastscan")
 def fastscan(probe: CanopenProbe) -> None:
-    """The node-ID is taken away, the identity found bit by bit, the node-ID given back; only without other such nodes."""
+    """The node-ID is removed, the identity found bit by bit, the node-ID set back; only without other such nodes."""
     identity = _select(probe)
     old = probe.node
     check_equal(_lss(probe, "11 ff"), b"\x11\0" + bytes(6), "answer to node-ID 255")
@@ -299,7 +299,7 @@ def _scan(probe: CanopenProbe) -> list[int]:
 
 @LSS.case("states", "LSS works in every NMT state")
 def states(probe: CanopenProbe) -> None:
-    """The node is selected in OPERATIONAL and asked in STOPPED."""
+    """The node is selected in OPERATIONAL and in STOPPED."""
     _select(probe)
     _wait(probe)
     for command in (START, STOP):

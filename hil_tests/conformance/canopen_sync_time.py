@@ -31,7 +31,7 @@ def _quiet(probe: CanopenProbe) -> None:
 
 @SYNC.case("identifier", "identifiers that SYNC may not have")
 def sync_identifier(probe: CanopenProbe) -> None:
-    """Restricted ones and the extended format are refused by 0609 0030h."""
+    """Restricted CAN-IDs and the extended format are refused with 0609 0030h."""
     probe.require(0x1005)
     for identifier in (*FORBIDDEN, 0x2000_0080):
         probe.expect_refusal(0x1005, 0, identifier, 4, *REFUSED)
@@ -40,7 +40,7 @@ def sync_identifier(probe: CanopenProbe) -> None:
 
 @SYNC.case("counter-range", "values of the counter overflow", "CiA 301 7.5.2.22")
 def sync_counter_range(probe: CanopenProbe) -> None:
-    """1 and 241 to 255 are refused by 0609 0030h, 2 to 240 taken."""
+    """1 and 241 to 255 are refused with 0609 0030h, 2 to 240 accepted."""
     probe.require(0x1019)
     for value in (1, 241, 255):
         probe.expect_refusal(0x1019, 0, value, 1, *REFUSED)
@@ -50,7 +50,7 @@ def sync_counter_range(probe: CanopenProbe) -> None:
 
 @SYNC.case("counter-fixed", "counter overflow is fixed while a period is set", "CiA 301 7.5.2.22")
 def sync_counter_fixed(probe: CanopenProbe) -> None:
-    """Abort 0800 0022h with 1006h set."""
+    """Abort 0800 0022h while 1006h is not 0."""
     probe.require(0x1019)
     probe.require(0x1006)
     probe.set(0x1006, 0, 100_000)
@@ -77,7 +77,7 @@ def sync_length(probe: CanopenProbe) -> None:
 
 @SYNC.case("producer", "SYNC producer")
 def sync_producer(probe: CanopenProbe) -> None:
-    """Bit 30 of 1005h and 1006h make SYNCs at their period with the counter from 1, or are refused by 0609 0030h."""
+    """Bit 30 of 1005h with 1006h produces SYNCs at that period, counted from 1, or is refused with 0609 0030h."""
     probe.require(0x1006)
     _quiet(probe)
     if 0x1019 in probe.od:
@@ -101,7 +101,7 @@ def sync_producer(probe: CanopenProbe) -> None:
 
 @TIME.case("identifier", "identifiers that TIME may not have")
 def time_identifier(probe: CanopenProbe) -> None:
-    """Restricted ones and the extended format are refused by 0609 0030h, a change while it is consumed too."""
+    """Restricted CAN-IDs, the extended format, and any change while in use are refused with 0609 0030h."""
     probe.require(0x1012)
     probe.set(0x1012, 0, 0x100)
     for identifier in (*FORBIDDEN, 0x2000_0100):
@@ -112,7 +112,7 @@ def time_identifier(probe: CanopenProbe) -> None:
 
 @TIME.case("malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3")
 def time_malformed(probe: CanopenProbe) -> None:
-    """Five and seven bytes, and more milliseconds than a day has; the node goes on."""
+    """Five and seven bytes, and more milliseconds than a day has."""
     for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
         probe.send(0x100, data)
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")

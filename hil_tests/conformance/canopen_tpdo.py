@@ -42,7 +42,7 @@ TPDO: Final = CaseArea[CanopenProbe]("canopen.tpdo", "CiA 301 7.5.2.37", intrusi
 
 @TPDO.case("cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2")
 def cyclic(probe: CanopenProbe) -> None:
-    """Types 1 and 3: the mapped value, at the SYNCs it has to come at, and at no other."""
+    """Types 1 and 3: the mapped value at every nth SYNC, and at no other."""
     index, item = first(probe, 0x1800), constant(probe)
     value = probe.read(item.index, item.subindex)
     for kind in (1, 3):
@@ -68,7 +68,7 @@ def not_without_sync(probe: CanopenProbe) -> None:
 
 @TPDO.case("acyclic", "acyclic TPDO at the SYNC after an event only")
 def acyclic(probe: CanopenProbe) -> None:
-    """Type 0: a write to the mapped object is the event; the next SYNC sends, the one after does not."""
+    """Type 0: a write to the mapped object is the event; the next SYNC sends the TPDO, the one after does not."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
     probe.command(START)
@@ -123,7 +123,7 @@ def event(probe: CanopenProbe) -> None:
 
 @TPDO.case("event-timer", "event timer")
 def event_timer(probe: CanopenProbe) -> None:
-    """With 50 ms the TPDO comes every 50 ms, within a fifth."""
+    """With 50 ms, a mean period within 20 %."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
     probe.command(START)
     probe.wait_for(identifier, 0.1)
@@ -135,7 +135,7 @@ def event_timer(probe: CanopenProbe) -> None:
 
 @TPDO.case("inhibit", "inhibit time")
 def inhibit(probe: CanopenProbe) -> None:
-    """Two events at once with 100 ms: the second is sent 100 ms after the first, with the newest value."""
+    """With 100 ms, the second of two events is sent 100 ms after the first, with the newest value."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
@@ -155,7 +155,7 @@ def inhibit(probe: CanopenProbe) -> None:
 
 @TPDO.case("gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def gate(probe: CanopenProbe) -> None:
-    """By SYNC and by timer, neither in PRE-OPERATIONAL nor in STOPPED, again in OPERATIONAL."""
+    """By SYNC and by timer: not in PRE-OPERATIONAL and STOPPED, again in OPERATIONAL."""
     index, item = first(probe, 0x1800), constant(probe)
     for kind, event_ms in ((SYNCHRONOUS, 0), (EVENT, 20)):
         identifier = set_up(probe, index, [entry(item)], kind, event_ms=event_ms)
@@ -169,9 +169,9 @@ def gate(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@TPDO.case("mapping", "remapping at run time", "CiA 301 7.5.2.38")
+@TPDO.case("mapping", "remapping while the node runs", "CiA 301 7.5.2.38")
 def mapping(probe: CanopenProbe) -> None:
-    """Two objects in one order and in the other."""
+    """Two objects in both orders."""
     index = first(probe, 0x1800)
     fitting = [
         item
@@ -193,7 +193,7 @@ def mapping(probe: CanopenProbe) -> None:
 
 @TPDO.case("identifier", "a TPDO under another identifier")
 def identifier_moves(probe: CanopenProbe) -> None:
-    """It is sent under the new identifier and not under the old one."""
+    """It is sent with the new CAN-ID and not with the old one."""
     index, item = first(probe, 0x1800), constant(probe)
     old = set_up(probe, index, [entry(item)], SYNCHRONOUS)
     new = set_up(probe, index, [entry(item)], SYNCHRONOUS, identifier=0x3F1)
@@ -206,7 +206,7 @@ def identifier_moves(probe: CanopenProbe) -> None:
 
 @TPDO.case("forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5")
 def forbidden(probe: CanopenProbe) -> None:
-    """Restricted ones and the extended format, abort 0609 0030h."""
+    """Restricted CAN-IDs and the extended format: abort 0609 0030h."""
     index = first(probe, 0x1800)
     set_up(probe, index, [entry(constant(probe))], SYNCHRONOUS)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
@@ -214,9 +214,9 @@ def forbidden(probe: CanopenProbe) -> None:
         probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *REFUSED)
 
 
-@TPDO.case("fixed", "what a TPDO in use does not let be changed")
+@TPDO.case("fixed", "settings of a TPDO in use that cannot be changed")
 def fixed(probe: CanopenProbe) -> None:
-    """Identifier, inhibit time, SYNC start value, mapping."""
+    """CAN-ID, inhibit time, SYNC start value, mapping."""
     index, item = first(probe, 0x1800), constant(probe)
     set_up(probe, index, [entry(item)], SYNCHRONOUS)
     record = probe.od.indices[index]
@@ -233,9 +233,9 @@ def fixed(probe: CanopenProbe) -> None:
     probe.set(index + 0x200, 1, entry(item))
 
 
-@TPDO.case("types", "transmission types that there are none of")
+@TPDO.case("types", "reserved transmission types")
 def types(probe: CanopenProbe) -> None:
-    """241 to 251 are reserved, abort 0609 0030h."""
+    """241 to 251 are reserved: abort 0609 0030h."""
     index = first(probe, 0x1800)
     for value in (241, 251):
         probe.expect_refusal(index, 2, value, 1, *REFUSED)
@@ -245,16 +245,16 @@ def types(probe: CanopenProbe) -> None:
 
 @TPDO.case("reserved", "sub-index 4 of a TPDO is not served", intrusive=False)
 def reserved(probe: CanopenProbe) -> None:
-    """Abort 0609 0011h unless the data sheet has it."""
+    """Abort 0609 0011h."""
     index = first(probe, 0x1800)
     if probe.od.get_variable(index, 4) is not None:
         raise CaseSkipped("the data sheet has it")
     probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), ABORT_NO_SUBINDEX)
 
 
-@TPDO.case("mapping-refused", "mapping of what cannot be mapped", "CiA 301 7.5.2.38")
+@TPDO.case("mapping-refused", "mapping of objects that cannot be mapped", "CiA 301 7.5.2.38")
 def mapping_refused(probe: CanopenProbe) -> None:
-    """No such object, not mappable, wrong length, more than 64 bits, too many objects."""
+    """Missing object, not mappable, wrong length, write-only."""
     index, item = first(probe, 0x1800), constant(probe)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
     probe.set(index + 0x200, 0, 0, 1)

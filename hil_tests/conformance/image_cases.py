@@ -30,7 +30,7 @@ def _save(probe: LinkProbe) -> None:
 
 @IMAGES.case("none", "without a stored image a download is refused with code 7")
 def no_image(probe: LinkProbe) -> None:
-    """After a reset."""
+    """The device has just been reset."""
     probe.reset()
     for name, values in (("init_image_download", {"image_size": "size_64"}), ("advance_image_download", {"next_frame": 0}), ("start_burst", {})):  # fmt: skip
         row = probe.icd.telecommands[name]
@@ -49,7 +49,7 @@ def other_camera(probe: LinkProbe) -> None:
 
 @IMAGES.case("frames", "an image comes in frames of 128 bytes, each with its number and checksum")
 def frames(probe: LinkProbe) -> None:
-    """All 32 frames of 64 x 64 pixels; a second look at a frame shows the same."""
+    """All 32 frames of 64 x 64 pixels; reading a frame twice gives the same data."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     for number in range(EDGE * EDGE // FRAME):
@@ -65,7 +65,7 @@ def frames(probe: LinkProbe) -> None:
 
 @IMAGES.case("beyond", "a frame beyond the last is refused with code 3")
 def beyond(probe: LinkProbe) -> None:
-    """The loaded frame stays."""
+    """The loaded frame stays the same."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     probe.command("advance_image_download", next_frame=31)
@@ -74,9 +74,8 @@ def beyond(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("image_frame_info")["frame"], 31, "loaded frame")
 
 
-@IMAGES.case("jump", "frames may be asked for in any order, and again")
+@IMAGES.case("jump", "frames may be requested in any order, and again")
 def jump(probe: LinkProbe) -> None:
-    """Forward, backward."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     first = probe.telemetry("image_frame")["data"]
@@ -116,7 +115,7 @@ def _burst(probe: LinkProbe, count: int, *, everything: bool) -> list[tuple[int,
 
 @BURSTS.case("block", "a block comes in numbered packets of 20 bytes with the right checksum")
 def block(probe: LinkProbe) -> None:
-    """990 bytes: 50 packets, the last filled up."""
+    """990 bytes: 50 packets, the last one padded."""
     _save(probe)
     _load(probe, 0, 990)
     wanted = probe.telemetry("file_block")["checksum"]
@@ -140,9 +139,8 @@ def holes(probe: LinkProbe) -> None:
     check_equal(again, {number: whole[number] for number in (0, 7, 49)}, "the same packets")
 
 
-@BURSTS.case("file", "the whole file is a picture of the size that was asked for")
+@BURSTS.case("file", "the whole file is an image of the requested size")
 def whole_file(probe: LinkProbe) -> None:
-    """Block after block."""
     _save(probe)
     _load(probe, 0, 54)
     size = bmp_file_size(b"".join(part for _, part in _burst(probe, 3, everything=True)))
@@ -154,7 +152,7 @@ def whole_file(probe: LinkProbe) -> None:
 
 @BURSTS.case("range", "a block outside the file is refused with code 3 and flagged")
 def out_of_range(probe: LinkProbe) -> None:
-    """Beyond the end; and a burst without a block is refused."""
+    """A burst without a block is refused too."""
     _save(probe)
     row = probe.icd.telecommands["load_file_block"]
     values: dict[str, Value] = {"file_type": "bmp", "file_counter": 0, "offset": 1 << 24, "length": 100}

@@ -61,7 +61,6 @@ def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
 
 @IDENTIFIERS.case("telemetry", "each unknown telemetry identifier is refused with code 1")
 def unknown_telemetry(probe: LinkProbe) -> None:
-    """All of them."""
     for identifier in range(128, 256):
         if identifier not in probe.icd.telemetry_by_id:
             probe.expect_refusal(identifier, b"", INVALID_ID)
@@ -69,7 +68,7 @@ def unknown_telemetry(probe: LinkProbe) -> None:
 
 @IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
 def unknown_telecommands(probe: LinkProbe) -> None:
-    """All of them, with and without data."""
+    """With and without data."""
     for identifier in range(128):
         if identifier not in probe.icd.telecommands_by_id:
             probe.expect_refusal(identifier, b"", INVALID_ID)
@@ -80,7 +79,6 @@ def unknown_telecommands(probe: LinkProbe) -> None:
     "telemetry-with-data", "a request of telemetry with data is refused for its length", rule(5)
 )
 def telemetry_with_data(probe: LinkProbe) -> None:
-    """Every row."""
     for row in probe.icd.telemetry.values():
         probe.expect_refusal(row.id, b"\x00", INVALID_LENGTH)
 

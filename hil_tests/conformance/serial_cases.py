@@ -73,7 +73,7 @@ LINES: Final = (
     Line("end-alone", "an end mark without a start is no message", ("1F FF",)),
     Line("end-before", "an end mark before a request is passed over", ("1F FF" + READ,), (128,)),
     Line("start-alone", "a start mark alone is no message", ("1F 7F",)),
-    Line("starts", "a second start mark begins the message anew", ("1F 7F" + READ,), (128,)),
+    Line("starts", "a second start mark restarts the message", ("1F 7F" + READ,), (128,)),
     Line("cut-off", "a message cut off by another is dropped, the other one answered", ("1F 7F E6" + READ,), (128,)),
     Line("cut-off-data", "a message with data cut off by another is dropped", ("1F 7F 02 11 22 33" + READ,), (128,)),
     Line("empty", "a message without an identifier is no request", ("1F 7F 1F FF",)),
@@ -110,7 +110,7 @@ for _line in LINES:
 
 @FRAMING.case("reply-form", "an answer has the form of its dialect, byte for byte", REPLIES)
 def reply_form(probe: SerialProbe) -> None:
-    """Start, identifier where the dialect has one, 8 bytes of data, end."""
+    """Start, row ID if the dialect has one, 8 bytes of data, end."""
     probe.send(bytes.fromhex(READ))
     probe.expecting(128)
     data = probe.expect_telemetry(128)
@@ -121,9 +121,9 @@ def reply_form(probe: SerialProbe) -> None:
     check_equal(seen, whole.hex().upper(), "bytes")
 
 
-@FRAMING.case("half", "half a message is given up after a while", rule(2))
+@FRAMING.case("half", "an incomplete message is dropped after a time-out", rule(2))
 def half(probe: SerialProbe) -> None:
-    """The rest of it, when it comes too late, is junk; the next request is answered."""
+    """The rest of it arrives too late; the next request is answered."""
     probe.send(bytes.fromhex("1F 7F 80"))
     probe.sleep(LONG_PAUSE_S)
     probe.send(bytes.fromhex("1F FF"))
@@ -141,7 +141,7 @@ def overlong(probe: SerialProbe) -> None:
 
 @FRAMING.case("longest", "a message of 512 bytes is still taken, and refused for its length", rule(4))
 def longest(probe: SerialProbe) -> None:
-    """Identifier and 511 bytes."""
+    """Row ID and 511 bytes."""
     probe.expect_refusal(0x80, bytes(LONGEST_MESSAGE - 1), INVALID_LENGTH)
 
 
@@ -203,7 +203,7 @@ add_flag_cases(ERRORS, FLAGS)
 
 @ERRORS.case("none", "good requests set no flag")
 def no_flag(probe: SerialProbe) -> None:
-    """Twenty of them, in one piece and with pauses."""
+    """In one piece and with pauses."""
     probe.command("clear_counters")
     for _ in range(20):
         probe.expect_alive()
@@ -219,7 +219,7 @@ def no_flag(probe: SerialProbe) -> None:
 
 @TIMING.case("pace", "a long reply takes its time on the line")
 def pace(probe: SerialProbe) -> None:
-    """Nothing is faster than the bit rate: telemetry 211 has 54 bytes."""
+    """Telemetry 211 has 54 bytes."""
     if probe.baud is None:
         raise CaseSkipped("the pace is not checked without --baud, the bit rate of the line")
     begin = probe.now()

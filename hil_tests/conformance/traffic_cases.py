@@ -28,7 +28,7 @@ RECOVERY: Final = CaseArea[LinkProbe]("recovery", rule(9))
 
 @TIMING.case("reply", "fifty requests are each answered within 300 ms")
 def reply_time(probe: LinkProbe) -> None:
-    """The longest of them counts."""
+    """The slowest of them counts."""
     worst = 0.0
     for _ in range(50):
         begin = probe.now()
@@ -82,7 +82,6 @@ def unsolicited_long(probe: LinkProbe) -> None:
     "refused", "unsolicited telemetry of a row that does not exist is refused", "published error codes"
 )
 def unsolicited_refused(probe: LinkProbe) -> None:
-    """Number 200."""
     row = probe.icd.telecommands["set_unsolicited"]
     probe.expect_refusal(row.id, row.encode({"telemetry": 200, "rate": 1.0}), INVALID_PARAMETER)
 
