@@ -1,4 +1,4 @@
-"""An OBC that asks a star sensor by the names of the interface definition, as plain calls."""
+"""A synchronous OBC client, which uses the names of the interface definition."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 class ObcClient:
-    """The same client as plain calls, for scripts, tests and the prompt; its event loop runs in a thread of its own.
+    """A synchronous OBC client for scripts, tests and the prompt; its event loop runs in a separate thread.
 
     Make one with `ObcClient.open(...)` and use it as a context manager:
 
@@ -97,7 +97,7 @@ class ObcClient:
         return self._loop.run(coroutine)
 
     def close(self) -> None:
-        """Close the link and end the thread; a second call does nothing."""
+        """Close the link and end the thread; may be called twice."""
         if self._loop.alive:
             self.run(self.core.close())
             self._loop.close()
@@ -131,7 +131,7 @@ class ObcClient:
         return self.core.stray_replies
 
     def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
-        """Ask for a telemetry row."""
+        """Read a telemetry row."""
         return self.run(self.core.read(name, timeout_s=timeout_s, retries=retries))
 
     def telemetry(
@@ -156,7 +156,7 @@ class ObcClient:
         )
 
     def request(self, identifier: int, data: bytes = b"", *, timeout_s: float | None = None) -> Reply:
-        """Send a request by number with parameters as they stand; return the reply to it."""
+        """Send a request by row ID with raw parameters; return the reply."""
         request = Request.of(identifier, data)
         row = self.icd.row_by_id(identifier)
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
@@ -185,5 +185,5 @@ class ObcClient:
     def download_image(
         self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
     ) -> Image:
-        """Have an image taken and stored, and download it."""
+        """Capture and store an image, and download it."""
         return self.run(self.core.download_image(size, method=method, within_s=within_s))

@@ -1,4 +1,4 @@
-"""The emulator as a process of its own: started, waited for until its ready line, ended, and its end checked."""
+"""The emulator as a process: start it, wait for its ready line, end it and check its exit status."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from typing import IO, Final, Self
 from starhil.hil_tests.errors import EmulatorProcessError
 
 READY_WITHIN_S: Final = 300.0
-"""A first start on a machine compiles for minutes; a warm one takes about 3 s."""
+"""The first start on a machine compiles for minutes, later ones take about 3 s."""
 STOP_WITHIN_S: Final = 15.0
 SHOWN_LINES: Final = 5
-"""Lines of the emulator's own output that an error message carries."""
+"""Last lines of the emulator's stderr in an error message."""
 
 
 def emulator_command(
@@ -36,7 +36,7 @@ def emulator_command(
     truth_log: Path | None = None,
     extra: Sequence[str] = (),
 ) -> list[str]:
-    """Return the command line that starts the emulator with this very Python, to end with this process."""
+    """Return the command line of an emulator that ends with this process."""
     command = [*_starhil_command(), "run"]
     if profile is not None:
         command.append(profile)
@@ -53,7 +53,7 @@ def emulator_command(
 
 
 def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
-    """Return the command line that starts a CAN hub, at a free port by default, to end with this process."""
+    """Return the command line of a CAN hub that ends with this process, at a free port by default."""
     command = [*_starhil_command(), "hub", "--port", str(port)]
     return command if log is None else [*command, "--log", str(log)]
 
@@ -83,28 +83,28 @@ def _starhil_command() -> list[str]:
 
 
 def parse_ready_line(line: str) -> dict[str, str]:
-    """Return the words `key=value` of a ready line.
+    """Return the `key=value` fields of a ready line.
 
     Raises
     ------
     EmulatorProcessError
         Not a ready line.
     """
-    words = line.split()
-    if not words or words[0] != "ready":
+    fields = line.split()
+    if not fields or fields[0] != "ready":
         raise EmulatorProcessError(f"not a ready line: {line.strip()!r}")
-    return dict(word.split("=", 1) for word in words[1:] if "=" in word)
+    return dict(field.split("=", 1) for field in fields[1:] if "=" in field)
 
 
 class EmulatorProcess:
-    """A running emulator. One that `emulator_command` starts also ends with the thread that called `start`.
+    """A running emulator; it also ends with the thread that called `start`.
 
     Parameters
     ----------
     command : sequence of str
-        As `emulator_command` makes it.
+        Command line, from `emulator_command`.
     ready_within_s : float
-        How long the ready line may take.
+        Time-out of the ready line, s.
     environment : mapping, optional
         Additions to the environment.
 
@@ -136,7 +136,7 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It ended, or said nothing in time; carries its last words.
+            It ended, or was not ready in time; quotes its last lines of stderr.
         """
         begin = time.monotonic()
         self._lines = queue.Queue()
@@ -162,9 +162,7 @@ class EmulatorProcess:
             reader.start()
         try:
             self.ready = self._wait_for_ready(begin + self._ready_within_s)
-        except (
-            BaseException
-        ):  # an interruption too: the process has a session of its own and no signal reaches it
+        except BaseException:  # on interruption too: no signal reaches the process, which has its own session
             self.kill()
             raise
         return self
@@ -174,12 +172,12 @@ class EmulatorProcess:
             try:
                 line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                text = f"the emulator was not ready within {self._ready_within_s:g} s{self._last_words()}"
+                text = f"the emulator was not ready within {self._ready_within_s:g} s{self._last_errors()}"
                 raise EmulatorProcessError(text) from None
             if line is None:
                 status = self.process.wait()
                 raise EmulatorProcessError(
-                    f"the emulator ended with status {status} before it was ready{self._last_words()}"
+                    f"the emulator ended with status {status} before it was ready{self._last_errors()}"
                 )
             if line.startswith("ready"):
                 return parse_ready_line(line)
@@ -192,7 +190,7 @@ class EmulatorProcess:
     def _read_errors(self, stream: IO[str]) -> None:
         self.errors.extend(line.rstrip() for line in stream)
 
-    def _last_words(self) -> str:
+    def _last_errors(self) -> str:
         for reader in self._readers:
             reader.join(timeout=0.5)
         return ": " + " | ".join(self.errors[-SHOWN_LINES:]) if self.errors else ""
@@ -221,13 +219,13 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It had ended before, did not end, or ended with another status.
+            It ended before, does not end, or ends with another status.
         """
         process = self.process
         if process.poll() is not None:
             self.kill()
             raise EmulatorProcessError(
-                f"the emulator had ended by itself with status {process.returncode}{self._last_words()}"
+                f"the emulator ended unexpectedly with status {process.returncode}{self._last_errors()}"
             )
         process.terminate()
         try:
@@ -235,13 +233,13 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             self.kill()
             raise EmulatorProcessError(f"the emulator did not end within {STOP_WITHIN_S:g} s") from None
-        words = self._last_words()
+        errors = self._last_errors()
         self.kill()
         if status != 0:
-            raise EmulatorProcessError(f"the emulator ended with status {status}{words}")
+            raise EmulatorProcessError(f"the emulator ended with status {status}{errors}")
 
     def kill(self) -> None:
-        """End the process and its workers at once (SIGKILL), and gather what is left of them."""
+        """Kill the process and its workers (SIGKILL), and release the resources."""
         process = self.process
         with contextlib.suppress(ProcessLookupError):  # the whole group has ended
             os.killpg(process.pid, signal.SIGKILL)

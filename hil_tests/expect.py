@@ -169,7 +169,7 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
     """Read what a script says of one field: a plain value, or a table of conditions."""
     if not isinstance(value, dict):
         return Expectation(field, equals=operand(value, reader, field, known))
-    table = TableReader(value, f"{reader.place}: {field}")
+    table = TableReader(value, f"{reader.location}: {field}")
 
     def part(key: str) -> Operand | None:
         return operand(table.value(key), table, key, known) if table.has(key) else None
@@ -191,11 +191,11 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
         one_of=tuple(operand(item, table, "one_of", known) for item in one_of),
         differs_from=part("not"),
     )
-    table.finish()
+    table.reject_unknown_keys()
     if not value:
-        table.fail("says nothing: give value, min, max, above, one_of, not or angle_deg")
+        table.fail("is empty: give value, min, max, above, one_of, not or angle_deg")
     if equals is None and ("within" in value or "plus" in value):
-        table.fail("'within' and 'plus' need 'value' or 'angle_deg' beside them")
+        table.fail("'within' and 'plus' need 'value' or 'angle_deg' as well")
     return expectation
 
 
@@ -274,7 +274,7 @@ def read_attitude_check(reader: TableReader) -> AttitudeCheck:
         reader.optional_number("total_within_arcsec", minimum=0.0),
         read_stated_attitude(reader),
     )
-    reader.finish()
+    reader.reject_unknown_keys()
     limits = (check.cross_arcsec, check.roll_arcsec, check.total_arcsec)
     if all(limit is None or math.isinf(limit) for limit in limits):
         reader.fail("needs a tolerance: within_arcsec, roll_within_arcsec or total_within_arcsec")

@@ -41,13 +41,13 @@ SETTLE_S: Final = 0.2
 
 
 class _Arrivals:
-    """Times at which frames of interest came."""
+    """Arrival times of the frames of interest."""
 
     def __init__(self, wanted: Callable[[CanFrame], bool]) -> None:
         self._wanted = wanted
         self.times: list[float] = []
 
-    def take(self, frame: CanFrame) -> None:
+    def on_frame(self, frame: CanFrame) -> None:
         if self._wanted(frame):
             self.times.append(time.perf_counter())
 
@@ -63,7 +63,7 @@ class _Arrivals:
 
 
 async def unsolicited_jitter(spec: str, seconds: float, rate_hz: float, *, device: int) -> Jitter:
-    """Have a device send its clock unasked at a rate, and measure the intervals."""
+    """Let a device send its clock unsolicited at a rate, and measure the intervals."""
     icd = load_icd()
     row = icd.telemetry["unix_time"]
     receiver = CanHostReceiver(HOST, device)
@@ -73,7 +73,7 @@ async def unsolicited_jitter(spec: str, seconds: float, rate_hz: float, *, devic
     def take(frame: CanFrame) -> None:
         for event in receiver.feed(frame, time.monotonic()):
             if isinstance(event, Reply) and event.kind is ReplyKind.UNSOLICITED and event.id == row.id:
-                arrivals.take(frame)
+                arrivals.on_frame(frame)
             elif isinstance(event, Reply):
                 answers.put_nowait(event)
 
@@ -115,15 +115,15 @@ async def _command(
 
 
 class _Node:
-    """Just enough of a CANopen master to set a node up."""
+    """A minimal CANopen master that configures a node."""
 
     def __init__(self, transport: CanTransport, node: int) -> None:
         self._transport = transport
         self._node = node
         self._answer: asyncio.Future[bytes] | None = None
 
-    def take(self, frame: CanFrame) -> None:
-        """Take a frame of the bus."""
+    def on_frame(self, frame: CanFrame) -> None:
+        """Process a frame from the bus."""
         waiting = self._answer is not None and not self._answer.done()
         if frame.id == SDO_REPLY + self._node and not frame.extended and waiting and self._answer is not None:
             self._answer.set_result(frame.data)
@@ -177,7 +177,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
 
     def receive(frame: CanFrame) -> None:
         take(frame)
-        master.take(frame)
+        master.on_frame(frame)
 
     await transport.start(receive)
     try:
@@ -192,7 +192,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
 async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
     """Set a node's heartbeat period and measure the intervals."""
     arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
-    async with _joined(spec, node, arrivals.take) as master:
+    async with _joined(spec, node, arrivals.on_frame) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
         arrivals.times.clear()
         await asyncio.sleep(seconds)
@@ -204,7 +204,7 @@ async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node:
     """Have a node send its first TPDO by the event timer, and measure the intervals."""
     pdo = -1
     arrivals = _Arrivals(lambda frame: frame.id == pdo and not frame.extended)
-    async with _joined(spec, node, arrivals.take) as master:
+    async with _joined(spec, node, arrivals.on_frame) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, 0, 2)
         pdo = await master.prepare_tpdo(EVENT_DRIVEN, period_ms)
         await asyncio.sleep(SETTLE_S)

@@ -1,4 +1,4 @@
-"""A CAN bus of the bench's own: vcan0 where the kernel has it, else a TCP hub at a free port for as long as it lives."""
+"""A CAN bus for one run: vcan0 if the kernel has it, else a TCP hub at a free port."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class HubThread:
 
     @property
     def port(self) -> int:
-        """The port that the hub listens at, 0 while it does not."""
+        """Port of the hub, 0 while it is stopped."""
         return 0 if self._hub is None else self._hub.port
 
     def stop(self) -> None:
@@ -52,7 +52,7 @@ class HubThread:
 
 
 class PrivateCanBus:
-    """A bus that nobody else is on, as far as the machine allows: vcan0, or a hub of its own; a context manager."""
+    """A context manager for a CAN bus: vcan0 if the kernel has it, else a private hub."""
 
     def __init__(self) -> None:
         self._hub: HubThread | None = None

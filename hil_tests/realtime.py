@@ -10,7 +10,7 @@ PRIORITY = 1
 
 
 def set_realtime_priority(process: int = 0) -> None:
-    """Let a process (0: this one) go before all ordinary ones, but not the processes that it starts later.
+    """Give a process (0: this one) real-time priority; its later children do not inherit it.
 
     Raises
     ------
@@ -22,5 +22,5 @@ def set_realtime_priority(process: int = 0) -> None:
         os.sched_setscheduler(process, policy, os.sched_param(PRIORITY))
     except OSError as error:
         raise BenchError(
-            f"real-time priority: {error.strerror}; run it as root or with CAP_SYS_NICE, or leave --realtime out"
+            f"real-time priority: {error.strerror}; run it as root or with CAP_SYS_NICE, or omit --realtime"
         ) from None

@@ -1,4 +1,4 @@
-"""Logs of every byte on the wire, with time stamps: readable for a serial line, candump's format for CAN."""
+"""Time-stamped logs of every byte on a link: text for serial, candump format for CAN."""
 
 from __future__ import annotations
 

@@ -181,7 +181,7 @@ def time_set(probe: LinkProbe) -> None:
 
 @contextmanager
 def _kept_clock(probe: LinkProbe) -> Iterator[None]:
-    """Put the clock back to what it would be, whatever happens."""
+    """Restore the clock afterwards."""
     before, began = _clock(probe), probe.now()
     try:
         yield
@@ -251,7 +251,7 @@ def standby(probe: LinkProbe) -> None:
 def frames(probe: LinkProbe) -> None:
     """Two seconds at 5 Hz, with or without stars; the exposure leaves room for that rate."""
     probe.standby()
-    with probe.kept("update_rate", "exposure"):
+    with probe.parameters_kept("update_rate", "exposure"):
         probe.set_parameter("exposure", 50.0)
         probe.set_parameter("update_rate", 5.0)
         probe.command("set_mode", mode="lost_in_space")

@@ -153,7 +153,7 @@ def unsolicited_segments(probe: CanProbe) -> None:
     """star_tracker has 54 bytes, so 8 frames."""
     probe.command("set_unsolicited", telemetry=COMBINED, rate=5.0)
     try:
-        probe.unasked(1.0)
+        probe.receive_unsolicited(1.0)
         seen = probe.unsolicited[:8]
     finally:
         probe.command("set_unsolicited", telemetry=COMBINED, rate=0.0)
@@ -196,7 +196,7 @@ def lost_segment(probe: CanProbe) -> None:
     frames = _segment_frames(probe, UNKNOWN, LONG)
     for lost in range(len(frames)):
         _send(probe, frames[:lost] + frames[lost + 1 :])
-        # a message without its first segment cannot be told from a shorter one
+        # a message without its first segment looks like a shorter one
         if lost == 0:
             probe.sleep(probe.times.quiet_s)
             probe.drain()
@@ -244,7 +244,7 @@ def half_message(probe: CanProbe) -> None:
     _send(probe, frames[:-1])
     probe.sleep(LONG_PAUSE_S)
     _send(probe, frames[-1:])
-    probe.expect_silence("the message had been given up")
+    probe.expect_silence("the message has timed out")
     _send(probe, frames)
     _expect_one_refusal(probe)
 
@@ -258,7 +258,7 @@ def pause_between(probe: CanProbe) -> None:
 
 
 @SEGMENTS.case("anew", "a message may restart before its end", rule(8))
-def begun_anew(probe: CanProbe) -> None:
+def restarted_message(probe: CanProbe) -> None:
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:2] + frames)
     _expect_one_refusal(probe)

@@ -1,4 +1,4 @@
-"""CANopen conformance: the data sheet by itself, whether it is complete and consistent (CiA 306)."""
+"""CANopen conformance: completeness and consistency of the EDS (CiA 306)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RESTRICTED: Final = (
 
 def _file(probe: CanopenProbe) -> configparser.RawConfigParser:
     if not probe.eds:
-        raise CaseSkipped("no data sheet as a file")
+        raise CaseSkipped("no EDS file")
     parser = configparser.RawConfigParser(inline_comment_prefixes=(";",), strict=True)
     try:
         parser.read_string(probe.eds)
@@ -109,9 +109,9 @@ def sub_index_0(probe: CanopenProbe) -> None:
 def pdo_count(probe: CanopenProbe) -> None:
     """NrOfRXPDO and NrOfTXPDO count the communication records, and each has its mapping record."""
     information = probe.od.device_information
-    for first, told in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
+    for first, stated in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
         indices = probe.pdo_indices(first)
-        check_equal(int(told or 0), len(indices), f"number of PDOs from {first:04X}h on")
+        check_equal(int(stated or 0), len(indices), f"number of PDOs from {first:04X}h on")
         missing = [f"{index + 0x200:04X}h" for index in indices if index + 0x200 not in probe.od]
         check(not missing, "a mapping record for each PDO", f"missing {missing}")
 
@@ -132,7 +132,7 @@ def mapping(probe: CanopenProbe) -> None:
                     continue
                 item = probe.od.get_variable(value >> 16, value >> 8 & 0xFF)
                 where = f"{index:04X}h:{number:02X}h"
-                check(item is not None, f"{where} names an object of the data sheet", f"{value:08X}")
+                check(item is not None, f"{where} names an object of the EDS", f"{value:08X}")
                 if item is not None:
                     usable = item.readable if first == 0x1A00 else item.writable
                     check(
@@ -153,7 +153,7 @@ def cob_ids(probe: CanopenProbe) -> None:
         identifier = item.default & 0x1FFFFFFF
         restricted = any(low <= identifier <= high for low, high in RESTRICTED)
         check(not restricted, f"identifier of {index:04X}h allowed", f"0x{identifier:03X}")
-        check(identifier not in used, f"identifier of {index:04X}h of its own", used.get(identifier))
+        check(identifier not in used, f"identifier of {index:04X}h is unique", used.get(identifier))
         used[identifier] = f"0x{identifier:03X} is that of {index:04X}h"
 
 
@@ -161,8 +161,8 @@ def cob_ids(probe: CanopenProbe) -> None:
 def identity(probe: CanopenProbe) -> None:
     """Vendor, product and revision number."""
     information = probe.od.device_information
-    told = (information.vendor_number, information.product_number, information.revision_number)
-    for subindex, number in enumerate(told, 1):
+    stated = (information.vendor_number, information.product_number, information.revision_number)
+    for subindex, number in enumerate(stated, 1):
         item = probe.od.get_variable(0x1018, subindex)
         if item is not None and item.default is not None and number is not None:
             check_equal(item.default, number, f"1018h:{subindex:02X}h")
@@ -178,7 +178,7 @@ def stored(probe: CanopenProbe) -> None:
     """1021h, if present, serves the text of the file."""
     item = probe.od.get_variable(0x1021)
     if item is None:
-        raise CaseSkipped("the data sheet has no object 1021h")
+        raise CaseSkipped("the EDS has no object 1021h")
     parser = _file(probe)
     served = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     try:

@@ -25,8 +25,8 @@ WATCHED: Final = 0x05
 """A node-ID that stands for a watched node; nobody else on the bus may have it."""
 
 
-class Provocation:
-    """An error that the tester can call forth and end: a SYNC of wrong length, else a watched node that falls silent."""
+class ProvokedError:
+    """An error that the tester can cause and clear: a SYNC of wrong length, else a missing heartbeat."""
 
     def __init__(self, probe: CanopenProbe) -> None:
         probe.require(0x1014)
@@ -38,25 +38,25 @@ class Provocation:
         self.cause()
         if probe.wait_for(self.emergency, 0.2) is None:
             if 0x1016 not in probe.od:
-                raise CaseSkipped("no error of this device can be called forth over the bus")
+                raise CaseSkipped("no error of this device can be caused over the bus")
             self._by_sync = False
             probe.set(0x1016, 1, WATCHED << 16 | 50)
             self.cause()
             probe.expect(self.emergency, "EMCY 8130h of a watched node", 0.5)
         self.code = 0x8240 if self._by_sync else 0x8130
-        self.end()
+        self.clear()
         probe.wait_for(self.emergency, 0.2)
         probe.drain()
 
     def cause(self) -> None:
-        """Call the error forth; with a watched node it comes 50 ms later."""
+        """Cause the error; with a watched node it occurs 50 ms later."""
         if self._by_sync:
             self._probe.send(0x080, b"\x01")
         else:
             self._probe.send(0x700 + WATCHED, b"\x05")
 
-    def end(self) -> None:
-        """End it."""
+    def clear(self) -> None:
+        """Clear the error."""
         if self._by_sync:
             self._probe.send(0x080)
         else:
@@ -66,7 +66,7 @@ class Provocation:
 @EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
 def emcy_format(probe: CanopenProbe) -> None:
     """The register equals 1001h and has the generic bit set."""
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     error.cause()
     data = probe.expect(error.emergency, "EMCY")
     check_equal(len(data), 8, "bytes")
@@ -77,7 +77,7 @@ def emcy_format(probe: CanopenProbe) -> None:
 @EMCY.case("once", "one EMCY per error", "CiA 301 7.2.7.1")
 def emcy_once(probe: CanopenProbe) -> None:
     """The same error sends nothing while it persists."""
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
     error.cause()
@@ -87,11 +87,11 @@ def emcy_once(probe: CanopenProbe) -> None:
 @EMCY.case("gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
     """The error register is clear again; the history keeps the error."""
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
     count = probe.number(0x1003, 0) if 0x1003 in probe.od else 0
-    error.end()
+    error.clear()
     data = probe.expect(error.emergency, "EMCY 0000h")
     check_equal(data[:3], bytes(3), "error code and register")
     check_equal(probe.number(0x1001), 0, "1001h")
@@ -103,7 +103,7 @@ def emcy_gone(probe: CanopenProbe) -> None:
 def emcy_history(probe: CanopenProbe) -> None:
     """The count grows with each error up to the length; sub-index 1 holds the newest code; writing 0 clears it."""
     probe.require(0x1003)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)
     check_equal(probe.number(0x1003, 0), 0, "errors after the clear")
     probe.expect_abort(b"\x40" + multiplexer(0x1003, 1), ABORT_NO_DATA, ABORT_GENERAL, ABORT_NO_SUBINDEX)
@@ -113,7 +113,7 @@ def emcy_history(probe: CanopenProbe) -> None:
         probe.expect(error.emergency, "EMCY")
         check_equal(probe.number(0x1003, 0), min(number, length), "errors")
         check_equal(probe.number(0x1003, 1) & 0xFFFF, error.code, "newest error")
-        error.end()
+        error.clear()
         probe.expect(error.emergency, "EMCY 0000h")
 
 
@@ -122,7 +122,7 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     """The second error is another one: the heartbeat of a watched node stops."""
     probe.require(0x1003)
     probe.require(0x1016)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)
     error.cause()
     probe.expect(error.emergency, "EMCY")
@@ -131,7 +131,7 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     register = probe.expect(error.emergency, "EMCY 8130h", 0.5)[2]
     codes = [probe.number(0x1003, subindex) & 0xFFFF for subindex in (1, 2)]
     check_equal(codes, [0x8130, error.code], "errors")
-    error.end()
+    error.clear()
     data = probe.expect(error.emergency, "EMCY 0000h")
     check_equal(data[2], register, "error register with the error that remains")
 
@@ -146,14 +146,14 @@ def emcy_history_write(probe: CanopenProbe) -> None:
 @EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
     """A new CAN-ID is refused while EMCY is on; restricted ones always are."""
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.expect_refusal(0x1014, 0, 0x91, 4, *REFUSED)
     probe.set(0x1014, 0, PDO_OFF | error.emergency)
     for identifier in (0x2000_0091, 0x701, 0x000):
         probe.expect_refusal(0x1014, 0, identifier, 4, *REFUSED)
     error.cause()
     probe.expect_silence(error.emergency, "EMCY while it is off")
-    error.end()
+    error.clear()
     probe.set(0x1014, 0, 0x91)
     probe.drain()
     error.cause()
@@ -164,12 +164,12 @@ def emcy_switch(probe: CanopenProbe) -> None:
 def emcy_inhibit(probe: CanopenProbe) -> None:
     """With 100 ms the second EMCY follows 100 ms after the first."""
     probe.require(0x1015)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1015, 0, 1000, 2)
     error.cause()
     probe.expect(error.emergency, "EMCY")
     start = probe.bus.now()
-    error.end()
+    error.clear()
     probe.expect(error.emergency, "EMCY 0000h")
     check(
         0.08 <= probe.bus.now() - start <= 0.15, "0.1 s between two EMCY", f"{probe.bus.now() - start:.3f} s"
@@ -180,7 +180,7 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
 def emcy_stopped(probe: CanopenProbe) -> None:
     """The heartbeat of a watched node stops in STOPPED: no EMCY until the node leaves that state."""
     probe.require(0x1016)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1016, 1, 0x0005_0032)
     probe.command(STOP)
     probe.send(0x705, b"\x05")

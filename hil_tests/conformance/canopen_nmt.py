@@ -31,7 +31,7 @@ def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
 
 
 def _state(probe: CanopenProbe) -> int:
-    """Return the state that the next heartbeat tells, once what was under way has come."""
+    """Return the state in the next heartbeat, after the frames in transit have arrived."""
     probe.wait_for(NOBODY, SETTLING_S)
     probe.drain()
     return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]

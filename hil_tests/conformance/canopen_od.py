@@ -1,4 +1,4 @@
-"""CANopen conformance: the object dictionary that the node serves against its data sheet."""
+"""CANopen conformance: the object dictionary of the node compared with its EDS."""
 
 from __future__ import annotations
 

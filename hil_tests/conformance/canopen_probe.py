@@ -66,7 +66,7 @@ ABORT_NO_DATA: Final = 0x08000024
 
 
 class FrameBus(Protocol):
-    """A CAN bus as the cases use it: synchronous, with its own time."""
+    """A synchronous CAN bus with its own clock."""
 
     def send(self, frame: CanFrame) -> None:
         """Send a frame."""
@@ -88,9 +88,9 @@ class CanopenProbe:
     node
         Its node-ID.
     od
-        Its object dictionary, from its data sheet.
+        Its object dictionary, from its EDS.
     eds
-        Text of the data sheet; empty if there is none.
+        Text of the EDS; empty if there is none.
     timeout_s
         Longest time for an answer.
     """
@@ -147,7 +147,7 @@ class CanopenProbe:
         """
         if not self._found:
             return
-        self.begin_anew()
+        self.reset_to_stored_values()
         changed = {item: value for item, value in self._found.items() if self.read(*item) != value}
         refused = {item: value for item, value in changed.items() if self.write(*item, value)}
         for item, value in refused.items():  # one that another one bounds
@@ -160,14 +160,14 @@ class CanopenProbe:
     def begin(self, *, intrusive: bool) -> None:
         """Start a case: an intrusive one begins with the communication reset."""
         if intrusive:
-            self.begin_anew()
+            self.reset_to_stored_values()
         else:
             self.abandon_transfer()
 
     def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same after any case)
         """End a case: an intrusive one ends with the communication reset."""
         if intrusive:
-            self.begin_anew()
+            self.reset_to_stored_values()
 
     def recover(self) -> None:
         """Nothing is left to pass: the next case begins by abandoning what was under way."""
@@ -191,7 +191,7 @@ class CanopenProbe:
         return frame
 
     def drain(self) -> None:
-        """Let go of what has already come; fail if there is no end of it."""
+        """Discard everything received; fail if the node floods the bus."""
         for _ in range(MOST_WAITING):
             if self.receive(0.0) is None:
                 return
@@ -351,7 +351,7 @@ class CanopenProbe:
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
 
     def command_and_settle(self, specifier: int) -> None:
-        """Send an NMT command, and let go of what the node had sent before it obeyed."""
+        """Send an NMT command, and discard what the node sent before it obeyed."""
         self.command(specifier)
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
@@ -362,7 +362,7 @@ class CanopenProbe:
         self.command(RESET_COMMUNICATION)
         self.expect_boot_up()
 
-    def begin_anew(self) -> None:
+    def reset_to_stored_values(self) -> None:
         """Bring the node to PRE-OPERATIONAL with its stored values, as far as it can be brought there.
 
         That a node does not boot up is for the cases about booting up to find; all others go on without it.
@@ -386,7 +386,7 @@ class CanopenProbe:
             self.set(index, 1, self.number(index, 1) | PDO_OFF)
 
     def expect_state(self, state: int) -> None:
-        """Fail unless the node is in a state: it tells by a heartbeat, switched on for it if it must be."""
+        """Fail unless the heartbeat reports a state; the heartbeat is switched on if necessary."""
         if state == 0x04:
             data = self.wait_for(0x700 + self.node, 2.5)
         else:
@@ -399,7 +399,7 @@ class CanopenProbe:
     # What the dictionary has
 
     def variables(self) -> list[ODVariable]:
-        """Return all variables of the data sheet, without those that only describe data types."""
+        """Return all variables of the EDS, without those that only describe data types."""
         found: list[ODVariable] = []
         for index in sorted(self.od.indices):
             if index < 0x1000:
@@ -416,12 +416,12 @@ class CanopenProbe:
         for item in self.variables():
             if wanted(item):
                 return item
-        raise CaseSkipped(f"the data sheet has no {what}")
+        raise CaseSkipped(f"the EDS has no {what}")
 
     def require(self, index: int) -> None:
         """Skip the case if an object is not there."""
         if index not in self.od:
-            raise CaseSkipped(f"the data sheet has no object {index:04X}h")
+            raise CaseSkipped(f"the EDS has no object {index:04X}h")
 
     def pdo_indices(self, first: int) -> list[int]:
         """Return the indices of communication records from 1400h or 1800h on."""
@@ -440,7 +440,7 @@ def size_of(item: ODVariable) -> int | None:
 
 
 def is_integer(item: ODVariable) -> bool:
-    """Tell whether a variable is an integer."""
+    """Return whether a variable is an integer."""
     return item.data_type in datatypes.INTEGER_TYPES
 
 

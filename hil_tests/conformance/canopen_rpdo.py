@@ -109,7 +109,7 @@ def rpdo_long(probe: CanopenProbe) -> None:
 def place_holder(probe: CanopenProbe) -> None:
     """A dummy UNSIGNED16 is mapped before the object."""
     if 0x0006 not in probe.od:
-        raise CaseSkipped("the data sheet allows no place holder of 16 bits")
+        raise CaseSkipped("the EDS allows no dummy entry of 16 bits")
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     identifier = set_up(probe, first(probe, 0x1400), [0x0006_0010, entry(item)], 255)

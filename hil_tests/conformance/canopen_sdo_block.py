@@ -37,7 +37,7 @@ SEGMENT: Final = 7
 
 
 def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
-    """Return the longest readable text or bulk data of at most 200 kB that the data sheet has: many blocks if it can be."""
+    """Return the longest readable text or bulk data of at most 200 kB of the EDS, ideally many blocks."""
     best: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         if item.readable and item.data_type in {
@@ -69,7 +69,7 @@ def _begin(
 
 
 def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
-    """Send a request and return the segments of the block that it lets go, checking their numbers."""
+    """Send a request and return the segments of the next block, after a check of their numbers."""
     probe.send_request(request)
     found: list[bytes] = []
     while len(found) < block:

@@ -119,7 +119,7 @@ def _identity(probe: CanopenProbe) -> list[int]:
 def _select(probe: CanopenProbe) -> list[int]:
     """Select the node by its identity; skip the case if it has no LSS."""
     if not probe.od.device_information.LSS_supported:
-        raise CaseSkipped("the data sheet has no LSS")
+        raise CaseSkipped("the EDS has no LSS")
     identity = _identity(probe)
     answer = None
     for step, number in enumerate(identity):
@@ -139,7 +139,7 @@ def selective(probe: CanopenProbe) -> None:
     check(_lss(probe, "5e") is not None, "configuration state", "waiting")
     _wait(probe)
     for wrong in range(4):
-        parts = [number ^ (1 << 20 if place == wrong else 0) for place, number in enumerate(identity)]
+        parts = [number ^ (1 << 20 if part == wrong else 0) for part, number in enumerate(identity)]
         for step, number in enumerate(parts):
             answer = _lss(probe, bytes([0x40 + step]) + number.to_bytes(4, "little"), 0.05)
             check(answer is None, "no answer to another identity", answer)

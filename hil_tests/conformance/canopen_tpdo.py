@@ -248,7 +248,7 @@ def reserved(probe: CanopenProbe) -> None:
     """Abort 0609 0011h."""
     index = first(probe, 0x1800)
     if probe.od.get_variable(index, 4) is not None:
-        raise CaseSkipped("the data sheet has it")
+        raise CaseSkipped("the EDS has it")
     probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), ABORT_NO_SUBINDEX)
 
 

@@ -10,12 +10,12 @@ ProbeType = TypeVar("ProbeType")
 
 
 class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
-    """The device did something else than it has to.
+    """The device behaved differently from the rule.
 
     Attributes
     ----------
     expected, seen
-        What had to come and what came, one line each.
+        What was expected and what was seen, one line each.
     """
 
     def __init__(self, expected: str, seen: str) -> None:

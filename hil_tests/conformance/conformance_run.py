@@ -28,7 +28,7 @@ DEFAULT_BAUD: Final = 115200
 
 @dataclass(frozen=True)
 class ConformanceRequest:
-    """What a user asks for; see `starhil conformance --help`."""
+    """Options of the user; see `starhil conformance --help`."""
 
     serial: str | None = None
     can: str | None = None
@@ -84,7 +84,7 @@ def run_conformance(
     Raises
     ------
     BenchError, ProtocolError
-        A port, a bus or the emulator cannot be had.
+        A port, a bus or the emulator is not available.
     """
     icd = load_icd()
     cases = all_cases(request, icd)
@@ -186,27 +186,27 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
 def _run_canopen(
     request: ConformanceRequest, can: str, cases: Sequence[Case[Any]], on_outcome: Callable[[Outcome], None]
 ) -> None:
-    """Run the CANopen cases; the data sheet is the one given, else that of the product."""
+    """Run the CANopen cases with the EDS of the request, else that of the product."""
     import canopen
     from canopen.objectdictionary import import_od
 
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
     node = int(request.canopen_node or 0)
-    text = _data_sheet(request.eds)
+    text = _eds_text(request.eds)
     with temporary_folder("starhil-eds-") as folder:
         path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
         try:
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
-            raise BenchError(f"{request.eds}: not a data sheet that can be read: {error}") from None
+            raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
     with live_can(can, request.speed) as bus:
         probe = CanopenProbe(bus, node, dictionary, text)
         run_cases(probe, cases, on_outcome, port=f"{can} at node {node}")
 
 
-def _data_sheet(path: Path | None) -> str:
+def _eds_text(path: Path | None) -> str:
     if path is None:
         from starhil.protocol.canopen import build_dictionary, build_eds
 
@@ -214,4 +214,4 @@ def _data_sheet(path: Path | None) -> str:
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise BenchError(f"{path}: the data sheet cannot be read: {error.strerror}") from None
+        raise BenchError(f"{path}: the EDS cannot be read: {error.strerror}") from None

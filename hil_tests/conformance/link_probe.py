@@ -1,6 +1,7 @@
 """The tester's side of a device on a serial line or on CAN: requests, strict reading of the answers, and a log of both.
 
-The framing here is written anew from its public description; it shares no code with the codecs of the product.
+The framing is an independent implementation of the public description; it shares no code with the
+codecs of the product.
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malfor
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back.
+    """An answer of the device.
 
     Attributes
     ----------
     kind
-        Which form it had; `none` for nothing within the time-out, `malformed` for what has no form.
+        Kind of answer: `none` for no answer within the time-out, `malformed` for an undecodable one.
     code
         Error code of a refusal.
     data
@@ -118,19 +119,19 @@ class LinkProbe(ABC):
 
     @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next answer that was not yet looked at; unsolicited telemetry is passed over."""
+        """Return the next unread answer; skip unsolicited telemetry."""
 
     @abstractmethod
-    def surplus(self, quiet_s: float) -> Answer:
-        """Return what comes without having been asked for within a time."""
+    def unexpected_answer(self, quiet_s: float) -> Answer:
+        """Return an unexpected answer within a time."""
 
     @abstractmethod
-    def unasked(self, seconds: float) -> list[Answer]:
+    def receive_unsolicited(self, seconds: float) -> list[Answer]:
         """Return the messages of unsolicited telemetry that come within a time."""
 
     @abstractmethod
     def drain(self) -> None:
-        """Let go of all that has come."""
+        """Discard everything received."""
 
     @abstractmethod
     def now(self) -> float:
@@ -138,7 +139,7 @@ class LinkProbe(ABC):
 
     @abstractmethod
     def sleep(self, seconds: float) -> None:
-        """Let time pass; what comes meanwhile is kept."""
+        """Let time pass; received data are kept."""
 
     # --- requests ---
 
@@ -183,7 +184,7 @@ class LinkProbe(ABC):
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
         """Fail the case if anything comes within a time."""
-        answer = self.surplus(self.times.quiet_s if seconds is None else seconds)
+        answer = self.unexpected_answer(self.times.quiet_s if seconds is None else seconds)
         if answer.kind != "none":
             raise CaseFailed(f"nothing ({why})", str(answer))
 
@@ -237,8 +238,8 @@ class LinkProbe(ABC):
         self.command("set_parameter", parameter=self.icd.parameters[name].id, value=number)
 
     @contextmanager
-    def kept(self, *names: str) -> Iterator[None]:
-        """Put parameters back to what they were before, whatever happens."""
+    def parameters_kept(self, *names: str) -> Iterator[None]:
+        """Restore the values of parameters afterwards."""
         before = {name: float(self.parameter(name)["value"]) for name in names}
         try:
             yield
@@ -255,7 +256,7 @@ class LinkProbe(ABC):
     # --- around a run ---
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return what came in place of answers to three rows of telemetry; None if one of them was answered well.
+        """Read three telemetry rows; return the invalid answer, None if one of them is answered correctly.
 
         A unit that may be booting is asked again until it must have booted.
         """

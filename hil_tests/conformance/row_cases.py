@@ -207,7 +207,7 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
 
     def values(probe: LinkProbe) -> None:
         partner, room = PARTNERS.get(parameter.name, (parameter.name, None))
-        with probe.kept(parameter.name, partner):
+        with probe.parameters_kept(parameter.name, partner):
             if room is not None:
                 probe.set_parameter(partner, room)
             for good in _inside(parameter, float(probe.parameter(parameter.name)["value"])):

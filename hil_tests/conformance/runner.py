@@ -1,4 +1,4 @@
-"""Running conformance cases: which, in what order, and what came of each."""
+"""Selection and execution of conformance cases."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starhil.protocol.errors import ProtocolError
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """Outcome of a case.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Outcome:
     log: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON takes it; the log only where the case failed."""
+        """Return the outcome as JSON data, with the log of a failed case only."""
         value = dict(vars(self))
         value["seconds"] = round(self.seconds, 4)
         value["log"] = list(self.log) if self.status == FAILED else []
@@ -84,7 +84,7 @@ class Probe(Protocol):
     """What was sent and received."""
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return what comes in place of good answers; None if the device answers."""
+        """Return the invalid answer, or `nothing`; None if the device answers."""
 
     def prepare(self) -> None:
         """Note the settings of the device before cases that change them."""
@@ -136,7 +136,7 @@ def run_case(probe: Probe, case: Case[Any]) -> Outcome:
 
 @dataclass(frozen=True)
 class _Verdict:
-    """What came of one part of a case."""
+    """Outcome of one part of a case."""
 
     status: str
     expected: str = ""

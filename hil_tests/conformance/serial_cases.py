@@ -127,7 +127,7 @@ def half(probe: SerialProbe) -> None:
     probe.send(bytes.fromhex("1F 7F 80"))
     probe.sleep(LONG_PAUSE_S)
     probe.send(bytes.fromhex("1F FF"))
-    probe.expect_silence("the message had been given up")
+    probe.expect_silence("the message has timed out")
     probe.expect_alive()
 
 

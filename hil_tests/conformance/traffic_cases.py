@@ -40,12 +40,12 @@ def reply_time(probe: LinkProbe) -> None:
 # --- unsolicited telemetry ---
 
 
-def _unasked(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[Answer]:
-    """Return what comes of a row within a time; nothing may come in a serial dialect that has none."""
+def _unsolicited_rows(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[Answer]:
+    """Return the unsolicited telemetry of a row within a time."""
     row = probe.icd.telemetry[name]
     probe.command("set_unsolicited", telemetry=row.id, rate=rate)
     try:
-        return probe.unasked(seconds)
+        return probe.receive_unsolicited(seconds)
     finally:
         probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
 
@@ -54,13 +54,13 @@ def _unasked(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[A
 def unsolicited(probe: LinkProbe) -> None:
     """identification, 8 bytes, at 10 Hz for two seconds."""
     row = probe.icd.telemetry["identification"]
-    seen = _unasked(probe, "identification", 10.0, 2.0)
+    seen = _unsolicited_rows(probe, "identification", 10.0, 2.0)
     if isinstance(probe, SerialProbe) and probe.dialect != "c":
         check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
         return
     check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
     check_equal({(item.identifier, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
-    after = probe.unasked(0.5)
+    after = probe.receive_unsolicited(0.5)
     check(len(after) <= 1, "no more", f"{len(after)} messages")
 
 
@@ -68,7 +68,7 @@ def unsolicited(probe: LinkProbe) -> None:
 def unsolicited_long(probe: LinkProbe) -> None:
     """star_tracker, 54 bytes, with all values within their limits."""
     row = probe.icd.telemetry["star_tracker"]
-    seen = _unasked(probe, "star_tracker", 5.0, 1.0)
+    seen = _unsolicited_rows(probe, "star_tracker", 5.0, 1.0)
     if isinstance(probe, SerialProbe) and probe.dialect != "c":
         check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
         return

@@ -62,7 +62,7 @@ class UnitSettings:
         save_parameters(probe)
         if self.running != self.stored:
             set_parameters(probe, self.running)
-        if self.mode != "standby":  # tracking comes by itself once there is an attitude again
+        if self.mode != "standby":  # the device resumes tracking after its next attitude
             probe.command("set_mode", mode="lost_in_space" if self.mode == "tracking" else self.mode)
 
     def __str__(self) -> str:
@@ -82,7 +82,7 @@ def _read_parameters(probe: LinkProbe) -> dict[str, dict[str, float]]:
 
 
 def set_parameters(probe: LinkProbe, values: Mapping[str, float]) -> None:
-    """Set parameters, in any order: one that another one bounds is set in a second round."""
+    """Set parameters, in any order: those that another parameter bounds are set in a second pass."""
     refused: list[str] = []
     for name, value in values.items():
         try:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from starhil.emulator.device.device import Device
-from starhil.protocol.messages import FaultKind, Reply, Request
+from starhil.protocol.messages import FaultKind, Reply, ReplyKind, Request
 from tests.conformance.simulated import SimulatedUnit
 
 Damage = Callable[[SimulatedUnit], None]
@@ -110,3 +110,14 @@ def without_faults(*kinds: FaultKind) -> Damage:
         device.fault = lambda event: None if event.kind in kinds else fault(event)
 
     return damage
+
+
+def only_acknowledged(row_id: int, data: bytes | None = None) -> Damage:
+    """Acknowledge a telecommand, or only one with these parameters, without carrying it out."""
+
+    def change(_device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+        if request.id == row_id and data in (None, request.data):
+            return [Reply(ReplyKind.ACK, row_id, destination=request.source)]
+        return handle(request)
+
+    return handling(change)

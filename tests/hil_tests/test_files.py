@@ -1,4 +1,4 @@
-"""Files that the bench writes and reads: pictures, wire logs, JUnit, truth."""
+"""Files that the bench writes and reads: images, wire logs, JUnit, truth."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import read_candump
 
 
-def picture(height: int, width: int) -> np.ndarray:
+def random_image(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (height, width), dtype=np.uint8)
 
 
-def test_a_picture_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
-    image = picture(37, 64)
+def test_an_image_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
+    image = random_image(37, 64)
     write_png(tmp_path / "a.png", image.tobytes(), 64, 37)
     assert np.array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), image)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_a_picture_of_another_size_is_refused():
+def test_an_image_of_another_size_is_refused():
     with pytest.raises(BenchError, match="4096 bytes, not 10"):
         encode_png(bytes(10), 64, 64)
 
 
 @pytest.mark.parametrize("width", [64, 61])
 def test_a_bmp_file_is_read_as_opencv_wrote_it(width):
-    image = picture(40, width)
+    image = random_image(40, width)
     ok, data = cv2.imencode(".bmp", image)
     assert ok
     assert decode_bmp(data.tobytes()) == (image.tobytes(), width, 40)

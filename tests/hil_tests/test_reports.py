@@ -1,4 +1,4 @@
-"""Reports of the commands: refused before the run, and written whatever becomes of the emulator."""
+"""Reports of the commands: refused before the run, and written even if the emulator fails."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_repo
     assert outcome.exit_code == 1, outcome.output
     *_, end = json.loads(outcome.stdout)["results"]
     assert (end["step"], end["status"]) == (2, "failed")
-    assert "by itself with status 7: no more sky" in end["detail"]
+    assert "unexpectedly with status 7: no more sky" in end["detail"]
     assert ET.parse(junit).getroot().get("failures") == "1"
 
 

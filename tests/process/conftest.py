@@ -1,4 +1,4 @@
-"""Emulators that run as processes of their own, for the tests of this folder."""
+"""Emulator processes for the tests of this folder."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Expected:
     source: int = 0
 
     def fits(self, body: bytes) -> bool:
-        """Tell whether a reply body (data or the code) is right."""
+        """Return whether a reply body (data or the code) is right."""
         if self.size is not None:
             return len(body) == self.size
         return len(body) == 1 and body[0] in self.codes
@@ -57,7 +57,7 @@ def answer_to(identifier: int, data: bytes, source: int = 0) -> Expected:
 
 
 def is_dangerous(identifier: int, data: bytes) -> bool:
-    """Tell whether a request might be accepted and change how the device answers."""
+    """Return whether a request might be accepted and change how the device answers."""
     row = ICD.telecommands_by_id.get(identifier)
     return row is not None and row.name in STATE_CHANGING and answer_to(identifier, data).codes >= OK_OR_STATE
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.process
 
 
 SPEED = 0.5
-"""Run time in a second: slow motion gives each rule about time the same meaning and a busy machine twice the patience."""
+"""Simulation time per second: slow motion gives each rule about time the same meaning and a busy machine twice the patience."""
 SLOW_MOTION = ["--speed", str(SPEED)]
 TIME_OUT_S = 400.0
 
@@ -35,8 +35,8 @@ def run_cases(words: tuple) -> tuple[list[dict], list[str]]:
 def conform(*words: str, reports: tuple = ()) -> list[dict]:
     """Run cases and return their outcomes; none may have failed.
 
-    Rules about time are not loosened, and a machine that stalls breaks them: cases that failed are run once more, by
-    themselves, and named in a warning.
+    The rules on timing are those of real hardware, so a stall of a busy test machine breaks them, and longer time-outs
+    would loosen them. Cases that failed are therefore run once more, alone, and named in a warning.
     """
     outcomes, failed = run_cases((*words, *reports))
     if failed:

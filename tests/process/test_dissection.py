@@ -23,7 +23,7 @@ BOOT_UP = 0
 
 
 def read_by_blocks(node: canopen.RemoteNode, index: int) -> bytes:
-    """Upload an object; anew after a reset where the device took a process's pause for the end of the transfer."""
+    """Upload an object; again after a reset if the transfer timed out because a process was paused."""
     states: queue.Queue[int] = queue.Queue()
     node.nmt.add_heartbeat_callback(states.put)
     for _ in range(TRIES):

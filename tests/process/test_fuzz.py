@@ -163,7 +163,7 @@ class BusWatch:
         self._mark_source = mark_source
         self._open: dict[int, bytes] = {}
 
-    def take(self, frame: CanFrame) -> None:
+    def on_frame(self, frame: CanFrame) -> None:
         """Take a frame from the bus; only replies of the device are of interest."""
         kind, number, source, destination = (
             frame.id >> 24,

@@ -97,7 +97,7 @@ SAVE = int.from_bytes(b"save", "little")
 
 @contextlib.contextmanager
 def canopen_master(channel: str):
-    """A master of the `canopen` library, and its view of the node without a data sheet."""
+    """A master of the `canopen` library, and its view of the node without an EDS."""
     host, _, port = channel.removeprefix("socketcand:").partition("/")[0].rpartition(":")
     network = canopen.Network()
     network.connect(interface="socketcand", host=host, port=int(port), channel="vcan0")

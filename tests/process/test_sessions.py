@@ -1,4 +1,4 @@
-"""The sessions that come along, each against an emulator process of its own, as a user would run them."""
+"""The shipped sessions, each run against a new emulator process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The README and the walk-through typed as they stand, into a shell on a machine with a vcan0 (elsewhere: in a guest)."""
+"""The README and the walk-through typed into a shell on a machine with a vcan0 (elsewhere: in a guest)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Typed:
         return self._lines.get(timeout=within_s)
 
     def skip_past(self, identifier: str) -> None:
-        """Let go of what candump has shown and will show until a frame, and of that frame."""
+        """Discard the output of candump up to and including a frame."""
         while self.next_line().split()[1] != identifier:
             pass
 
