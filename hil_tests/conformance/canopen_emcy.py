@@ -8,21 +8,17 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_GENERAL,
     ABORT_NO_DATA,
     ABORT_NO_SUBINDEX,
-    ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
     PDO_OFF,
     PRE_OPERATIONAL,
     STOP,
+    VALUE_ABORTS,
+    WATCHED_NODE,
     CanopenProbe,
     multiplexer,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
 EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusive=True)
-REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
-WATCHED: Final = 0x05
-"""A node-ID that stands for a watched node; nobody else on the bus may have it."""
 
 
 class ProvokedError:
@@ -40,7 +36,7 @@ class ProvokedError:
             if 0x1016 not in probe.od:
                 raise CaseSkipped("no error of this device can be caused over the bus")
             self._by_sync = False
-            probe.set(0x1016, 1, WATCHED << 16 | 50)
+            probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
             self.cause()
             probe.expect(self.emergency, "EMCY 8130h of a watched node", 0.5)
         self.code = 0x8240 if self._by_sync else 0x8130
@@ -53,14 +49,14 @@ class ProvokedError:
         if self._by_sync:
             self._probe.send(0x080, b"\x01")
         else:
-            self._probe.send(0x700 + WATCHED, b"\x05")
+            self._probe.send_watched_heartbeat()
 
     def clear(self) -> None:
         """Clear the error."""
         if self._by_sync:
             self._probe.send(0x080)
         else:
-            self._probe.send(0x700 + WATCHED, b"\x05")
+            self._probe.send_watched_heartbeat()
 
 
 @EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
@@ -126,8 +122,8 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     probe.set(0x1003, 0, 0, 1)
     error.cause()
     probe.expect(error.emergency, "EMCY")
-    probe.set(0x1016, 1, 0x0005_0032)
-    probe.send(0x705, b"\x05")
+    probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
+    probe.send_watched_heartbeat()
     register = probe.expect(error.emergency, "EMCY 8130h", 0.5)[2]
     codes = [probe.number(0x1003, subindex) & 0xFFFF for subindex in (1, 2)]
     check_equal(codes, [0x8130, error.code], "errors")
@@ -140,17 +136,17 @@ def emcy_history_order(probe: CanopenProbe) -> None:
 def emcy_history_write(probe: CanopenProbe) -> None:
     """Any other number is refused by 0609 0030h."""
     probe.require(0x1003)
-    probe.expect_refusal(0x1003, 0, 1, 1, *REFUSED)
+    probe.expect_refusal(0x1003, 0, 1, 1, *VALUE_ABORTS)
 
 
 @EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
     """A new CAN-ID is refused while EMCY is on; restricted ones always are."""
     error = ProvokedError(probe)
-    probe.expect_refusal(0x1014, 0, 0x91, 4, *REFUSED)
+    probe.expect_refusal(0x1014, 0, 0x91, 4, *VALUE_ABORTS)
     probe.set(0x1014, 0, PDO_OFF | error.emergency)
     for identifier in (0x2000_0091, 0x701, 0x000):
-        probe.expect_refusal(0x1014, 0, identifier, 4, *REFUSED)
+        probe.expect_refusal(0x1014, 0, identifier, 4, *VALUE_ABORTS)
     error.cause()
     probe.expect_silence(error.emergency, "EMCY while it is off")
     error.clear()
@@ -181,9 +177,9 @@ def emcy_stopped(probe: CanopenProbe) -> None:
     """The heartbeat of a watched node stops in STOPPED: no EMCY until the node leaves that state."""
     probe.require(0x1016)
     error = ProvokedError(probe)
-    probe.set(0x1016, 1, 0x0005_0032)
+    probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
     probe.command(STOP)
-    probe.send(0x705, b"\x05")
+    probe.send_watched_heartbeat()
     probe.expect_silence(error.emergency, "EMCY in STOPPED", 0.3)
     probe.command(PRE_OPERATIONAL)
     check(probe.number(0x1001) & 0x10, "communication error in 1001h", probe.number(0x1001))

@@ -13,6 +13,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     SETTLING_S,
     START,
     STOP,
+    WATCHED_NODE,
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
@@ -22,8 +23,6 @@ ERROR_CONTROL: Final = CaseArea[CanopenProbe]("canopen.error-control", "CiA 301 
 NMT_CLAUSE: Final = "CiA 301 7.3.2.2"
 CONTROL_CLAUSE: Final = "CiA 301 7.2.8.3"
 STATE_OF: Final = {START: 0x05, STOP: 0x04, PRE_OPERATIONAL: 0x7F}
-OTHER_NODE: Final = 0x05
-"""A node-ID that stands for a watched node; nobody else on the bus may have it."""
 
 
 def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
@@ -224,7 +223,7 @@ def _emergency(probe: CanopenProbe) -> int:
 def _watch(probe: CanopenProbe) -> int:
     probe.require(0x1016)
     _prepare(probe, 0)
-    probe.set(0x1016, 1, OTHER_NODE << 16 | 100)
+    probe.set(0x1016, 1, WATCHED_NODE << 16 | 100)
     return _emergency(probe)
 
 
@@ -240,13 +239,13 @@ def consumer(probe: CanopenProbe) -> None:
     """EMCY 8130h after the consumer time, not before; the error register is set; EMCY 0000h at the next heartbeat."""
     emergency = _watch(probe)
     for _ in range(3):
-        probe.send(0x700 + OTHER_NODE, b"\x05")
+        probe.send_watched_heartbeat()
         probe.expect_silence(emergency, "EMCY while it is heard", 0.07)
     data = probe.expect(emergency, "EMCY 8130h", 0.3)
     check_equal(data[:2], b"\x30\x81", "error code")
     check(data[2] & 0x11 == 0x11, "error register with generic and communication", data[2])
     check_equal(probe.number(0x1001), data[2], "1001h")
-    probe.send(0x700 + OTHER_NODE, b"\x05")
+    probe.send_watched_heartbeat()
     data = probe.expect(emergency, "EMCY 0000h", 0.3)
     check_equal(data[:3], bytes(3), "error code and register")
 
@@ -263,7 +262,7 @@ def behaviour(probe: CanopenProbe) -> None:
         probe.set(0x1029, 1, value, 1)
         _prepare(probe)
         probe.command(START)
-        probe.send(0x700 + OTHER_NODE, b"\x05")
+        probe.send_watched_heartbeat()
         probe.wait_for(NOBODY, 0.2)
         check_equal(_state(probe), state, f"state with 1029h:01h at {value}:")
 
@@ -275,15 +274,15 @@ def consumer_twice(probe: CanopenProbe) -> None:
     item = probe.od.get_variable(0x1016, 2)
     if item is None:
         raise CaseSkipped("1016h has one entry")
-    probe.expect_refusal(0x1016, 2, OTHER_NODE << 16 | 200, 4, ABORT_INCOMPATIBLE)
-    probe.set(0x1016, 2, (OTHER_NODE + 1) << 16 | 200)
+    probe.expect_refusal(0x1016, 2, WATCHED_NODE << 16 | 200, 4, ABORT_INCOMPATIBLE)
+    probe.set(0x1016, 2, (WATCHED_NODE + 1) << 16 | 200)
 
 
 @ERROR_CONTROL.case("consumer-off", "a watch with time 0 is off", "CiA 301 7.5.2.18")
 def consumer_off(probe: CanopenProbe) -> None:
     """The watch is switched off after the first heartbeat: no EMCY."""
     emergency = _watch(probe)
-    probe.send(0x700 + OTHER_NODE, b"\x05")
+    probe.send_watched_heartbeat()
     probe.set(0x1016, 1, 0)
     data = probe.wait_for(emergency, 0.4)
     if data is not None:

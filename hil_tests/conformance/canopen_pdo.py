@@ -11,8 +11,6 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_ACCESS,
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
     NO_RTR,
     PDO_OFF,
     CanopenProbe,
@@ -21,10 +19,8 @@ from starhil.hil_tests.conformance.canopen_probe import (
 )
 from starhil.hil_tests.conformance.case import CaseSkipped
 
-REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
 FIXED: Final = (ABORT_ACCESS, ABORT_DEVICE_STATE, ABORT_VALUE)
 """Aborts by which stacks refuse a change of the mapping of a PDO in use; CiA 301 names none."""
-FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 SYNCHRONOUS: Final = 1
 EVENT: Final = 255
 

@@ -64,6 +64,13 @@ ABORT_NOT_STORED: Final = 0x08000020
 ABORT_DEVICE_STATE: Final = 0x08000022
 ABORT_NO_DATA: Final = 0x08000024
 
+VALUE_ABORTS: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
+"""Abort codes with which a node may refuse a value."""
+RESTRICTED_IDS: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
+"""CAN-IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
+WATCHED_NODE: Final = 0x05
+"""Node-ID of a simulated watched node; no other node on the bus may have it."""
+
 
 class FrameBus(Protocol):
     """A synchronous CAN bus with its own clock."""
@@ -355,6 +362,10 @@ class CanopenProbe:
         self.command(specifier)
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
+
+    def send_watched_heartbeat(self) -> None:
+        """Send a heartbeat of the watched node, in OPERATIONAL."""
+        self.send(0x700 + WATCHED_NODE, b"\x05")
 
     def reset_communication(self) -> None:
         """Reset the communication and wait for the boot-up message, so that all is at its stored values."""

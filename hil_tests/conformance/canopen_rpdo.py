@@ -6,8 +6,6 @@ from typing import Final
 
 from starhil.hil_tests.conformance.canopen_pdo import (
     FIXED,
-    FORBIDDEN,
-    REFUSED,
     SYNCHRONOUS,
     entry,
     first,
@@ -19,8 +17,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_NOT_MAPPABLE,
     PDO_OFF,
     PRE_OPERATIONAL,
+    RESTRICTED_IDS,
     START,
     STOP,
+    VALUE_ABORTS,
     CanopenProbe,
     size_of,
 )
@@ -147,11 +147,11 @@ def rpdo_refused(probe: CanopenProbe) -> None:
     set_up(probe, index, [entry(item)], 255)
     probe.expect_refusal(index, 1, 0x3F3, 4, *FIXED)
     for value in (241, 252, 253):
-        probe.expect_refusal(index, 2, value, 1, *REFUSED)
+        probe.expect_refusal(index, 2, value, 1, *VALUE_ABORTS)
     probe.expect_refusal(index + 0x200, 0, 0, 1, *FIXED)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
-    for identifier in FORBIDDEN:
-        probe.expect_refusal(index, 1, identifier, 4, *REFUSED)
+    for identifier in RESTRICTED_IDS:
+        probe.expect_refusal(index, 1, identifier, 4, *VALUE_ABORTS)
     probe.set(index + 0x200, 0, 0, 1)
     constant_ = probe.find(
         "mappable read-only object", lambda item: item.pdo_mappable and item.access_type == "ro"

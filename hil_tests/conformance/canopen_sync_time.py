@@ -7,18 +7,16 @@ from typing import Final
 from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
     NO_RTR,
+    RESTRICTED_IDS,
     STOP,
+    VALUE_ABORTS,
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 
 SYNC: Final = CaseArea[CanopenProbe]("canopen.sync", "CiA 301 7.5.2.5", intrusive=True)
 TIME: Final = CaseArea[CanopenProbe]("canopen.time", "CiA 301 7.5.2.13", intrusive=True)
-REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
-FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 
 
 def _quiet(probe: CanopenProbe) -> None:
@@ -33,8 +31,8 @@ def _quiet(probe: CanopenProbe) -> None:
 def sync_identifier(probe: CanopenProbe) -> None:
     """Restricted CAN-IDs and the extended format are refused with 0609 0030h."""
     probe.require(0x1005)
-    for identifier in (*FORBIDDEN, 0x2000_0080):
-        probe.expect_refusal(0x1005, 0, identifier, 4, *REFUSED)
+    for identifier in (*RESTRICTED_IDS, 0x2000_0080):
+        probe.expect_refusal(0x1005, 0, identifier, 4, *VALUE_ABORTS)
     check_equal(probe.number(0x1005) & 0x7FF, 0x80, "1005h as before")
 
 
@@ -43,7 +41,7 @@ def sync_counter_range(probe: CanopenProbe) -> None:
     """1 and 241 to 255 are refused with 0609 0030h, 2 to 240 accepted."""
     probe.require(0x1019)
     for value in (1, 241, 255):
-        probe.expect_refusal(0x1019, 0, value, 1, *REFUSED)
+        probe.expect_refusal(0x1019, 0, value, 1, *VALUE_ABORTS)
     for value in (2, 240, 0):
         probe.set(0x1019, 0, value, 1)
 
@@ -104,10 +102,10 @@ def time_identifier(probe: CanopenProbe) -> None:
     """Restricted CAN-IDs, the extended format, and any change while in use are refused with 0609 0030h."""
     probe.require(0x1012)
     probe.set(0x1012, 0, 0x100)
-    for identifier in (*FORBIDDEN, 0x2000_0100):
-        probe.expect_refusal(0x1012, 0, identifier, 4, *REFUSED)
+    for identifier in (*RESTRICTED_IDS, 0x2000_0100):
+        probe.expect_refusal(0x1012, 0, identifier, 4, *VALUE_ABORTS)
     probe.set(0x1012, 0, 0x8000_0100)
-    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *REFUSED)
+    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *VALUE_ABORTS)
 
 
 @TIME.case("malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3")

@@ -9,8 +9,6 @@ from canopen.objectdictionary import ODVariable
 from starhil.hil_tests.conformance.canopen_pdo import (
     EVENT,
     FIXED,
-    FORBIDDEN,
-    REFUSED,
     SYNCHRONOUS,
     after_event,
     constant,
@@ -29,8 +27,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     NOBODY,
     PDO_OFF,
     PRE_OPERATIONAL,
+    RESTRICTED_IDS,
     START,
     STOP,
+    VALUE_ABORTS,
     CanopenProbe,
     is_integer,
     size_of,
@@ -210,8 +210,8 @@ def forbidden(probe: CanopenProbe) -> None:
     index = first(probe, 0x1800)
     set_up(probe, index, [entry(constant(probe))], SYNCHRONOUS)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
-    for identifier in (*FORBIDDEN, 0x2000_0181):
-        probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *REFUSED)
+    for identifier in (*RESTRICTED_IDS, 0x2000_0181):
+        probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *VALUE_ABORTS)
 
 
 @TPDO.case("fixed", "settings of a TPDO in use that cannot be changed")
@@ -238,7 +238,7 @@ def types(probe: CanopenProbe) -> None:
     """241 to 251 are reserved: abort 0609 0030h."""
     index = first(probe, 0x1800)
     for value in (241, 251):
-        probe.expect_refusal(index, 2, value, 1, *REFUSED)
+        probe.expect_refusal(index, 2, value, 1, *VALUE_ABORTS)
     for value in (0, 1, 240, 254, 255):
         probe.set(index, 2, value, 1)
 
@@ -283,7 +283,7 @@ def mapping_length(probe: CanopenProbe) -> None:
     for position in (1, 2, 3):
         probe.set(index + 0x200, position, entry(wide))
     probe.expect_refusal(index + 0x200, 0, 3, 1, ABORT_PDO_LENGTH)
-    probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *REFUSED)
+    probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *VALUE_ABORTS)
     probe.set(index + 0x200, 0, 2, 1)
 
 
