@@ -106,12 +106,15 @@ class AsyncObcClient:
         checked: bool = True,
         **fields: Value,
     ) -> Ack:
-        """Send a telecommand and wait for its acknowledge; fields as a mapping, by keyword, or both.
+        """Send a telecommand and wait for its acknowledge.
+
+        Fields as a mapping, by keyword, or both.
 
         Parameters
         ----------
         checked
-            False also sends values outside the limits of the interface definition, for the device to refuse.
+            False also sends values outside the limits of the interface definition, for the device
+            to refuse.
 
         Raises
         ------
@@ -233,7 +236,10 @@ class AsyncObcClient:
         timeout_s: float | None = None,
         retries: int | None = None,
     ) -> tuple[Reply, float]:
-        """Send a request and return its reply and latency; the row ID need not be in the definition."""
+        """Send a request and return its reply and latency.
+
+        The row ID need not be in the definition.
+        """
         limit = self.timeout_s if timeout_s is None else timeout_s
         attempts = 1 + (self.retries if retries is None else retries)
         async with self._turn:

@@ -27,8 +27,8 @@ class LinkOptions:
     Attributes
     ----------
     serial, can : str or None
-        Port and channel; None where the link is not used. With an emulator that the bench started, `auto` takes what
-        its ready line says.
+        Port and channel; None where the link is not used. With an emulator that the bench started,
+        `auto` takes what its ready line says.
     """
 
     serial: str | None = None
@@ -44,7 +44,8 @@ class LinkOptions:
 class Bench:
     """Clients on one unit: a context manager that opens them on first use and closes them all.
 
-    Leaving it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end cleanly.
+    Leaving it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end
+    cleanly.
 
     Parameters
     ----------
@@ -162,7 +163,10 @@ class Bench:
             self._end_emulator(kind)
 
     def _end_emulator(self, kind: type[BaseException] | None) -> None:
-        """End the emulator; report one that ended unexpectedly, also when that caused the error under way."""
+        """End the emulator.
+
+        Report one that ended unexpectedly, also when that caused the error under way.
+        """
         if self.emulator is None or not self._started:
             return
         caused_by_emulator = kind is not None and issubclass(kind, BenchError | ProtocolError)

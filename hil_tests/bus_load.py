@@ -1,7 +1,7 @@
 """A CAN bus under full load, measured from the OBC's side: nothing lost, replies right, how late.
 
-It talks to a device over its links only, so it measures a real unit as well as the emulator. The other traffic comes from
-a separate process, which also counts the frames that arrive.
+It talks to a device over its links only, so it measures a real unit as well as the emulator. The
+other traffic comes from a separate process, which also counts the frames that arrive.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ ASKED: Final = (
 )
 """Telemetry that is asked for in turn."""
 PAUSE_S: Final = 0.004
-"""Mean pause between two requests; the pauses are random, so that requests hit every phase of image processing."""
+"""Mean pause between two requests.
+
+The pauses are random, so that requests hit every phase of image processing.
+"""
 REPLY_WITHIN_S: Final = 2.0
 TICK_S: Final = 0.001
 """Time between two bunches of the other traffic."""
@@ -118,7 +121,10 @@ class OtherTraffic:
         self._pipe.send("go")
 
     def stop(self) -> tuple[float, int, int, int, int]:
-        """End the traffic; return seconds, frames sent, lost, out of order, and refused by the port."""
+        """End the traffic.
+
+        Return seconds, frames sent, lost, out of order, and refused by the port.
+        """
         self._pipe.send("stop")
         figures: tuple[float, int, int, int, int] = self._receive_report()
         self._process.join()

@@ -31,7 +31,9 @@ T = TypeVar("T")
 
 
 class ObcClient:
-    """A synchronous OBC client for scripts, tests and the prompt; its event loop runs in a separate thread.
+    """A synchronous OBC client for scripts, tests and the prompt.
+
+    Its event loop runs in a separate thread.
 
     Make one with `ObcClient.open(...)` and use it as a context manager:
 
@@ -150,7 +152,10 @@ class ObcClient:
         checked: bool = True,
         **fields: Value,
     ) -> Ack:
-        """Send a telecommand and wait for its acknowledge; `checked=False` sends values outside their limits too."""
+        """Send a telecommand and wait for its acknowledge.
+
+        `checked=False` sends values outside their limits too.
+        """
         return self.run(
             self.core.command(name, values, timeout_s=timeout_s, retries=retries, checked=checked, **fields)
         )
@@ -163,7 +168,10 @@ class ObcClient:
         return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
 
     def set_parameter(self, name: str, value: Value, *, checked: bool = True) -> Ack:
-        """Set a parameter by name, in its own unit; `checked=False` sends a value outside its limits too."""
+        """Set a parameter by name, in its own unit.
+
+        `checked=False` sends a value outside its limits too.
+        """
         return self.run(self.core.set_parameter(name, value, checked=checked))
 
     def get_parameter(self, name: str) -> Value:

@@ -2,8 +2,8 @@
 
     python -m starhil.hil_tests.end_with_parent PARENT COMMAND [ARGUMENT…]
 
-PARENT is the process ID of the parent. The request to the kernel survives `exec`, so COMMAND needs no
-support for it. Linux only.
+PARENT is the process ID of the parent. The request to the kernel survives `exec`, so COMMAND needs
+no support for it. Linux only.
 """
 
 from __future__ import annotations

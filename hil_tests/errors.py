@@ -7,7 +7,10 @@ from collections.abc import Iterable
 
 
 class BenchError(Exception):
-    """A script, port or device that the bench cannot use; one line with what, where and the remedy."""
+    """A script, port or device that the bench cannot use.
+
+    One line with what, where and the remedy.
+    """
 
 
 class ScriptError(BenchError):

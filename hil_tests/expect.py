@@ -1,4 +1,7 @@
-"""What a session script expects: equal, near, within bounds, one of some; an attitude against the truth."""
+"""What a session script expects: equal, near, within bounds, one of some.
+
+An attitude against the truth.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,10 @@ WHOLE_DIGITS: Final = 1e4
 """Numbers from here on are shown with six decimals, as ten digits would cut the fraction of a Unix time off."""
 
 CLOCK_VARIABLES: Final = ("now", "now_s", "now_ms")
-"""Variables that every script has: the OBC's Unix time in seconds; its whole seconds; its milliseconds."""
+"""Variables that every script has: the OBC's Unix time in seconds; its whole seconds.
+
+Its milliseconds.
+"""
 
 
 @dataclass(frozen=True)
@@ -204,7 +210,9 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
 
 @dataclass(frozen=True)
 class AttitudeCheck:
-    """How far a measured attitude may be from the truth, in arcseconds; parts not given are not judged.
+    """How far a measured attitude may be from the truth, in arcseconds.
+
+    Parts not given are not judged.
 
     `truth` is the attitude that the step itself states, None to take the script's.
     """

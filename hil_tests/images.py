@@ -173,7 +173,10 @@ async def download_by_bursts(client: Downloader, size: str, *, within_s: float) 
 
 
 async def _download_block(client: Downloader, offset: int, length: int, within_s: float) -> tuple[bytes, int]:
-    """Load one block of the file and gather its packets; return it and how often packets were requested again."""
+    """Load one block of the file and gather its packets.
+
+    Return it and how often packets were requested again.
+    """
     await _when_not_busy(
         client,
         "load_file_block",

@@ -31,9 +31,12 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `Interrupted` in the main thread at the first SIGINT, SIGTERM or SIGHUP; ignore those that follow.
+    """Raise `Interrupted` in the main thread at the first SIGINT, SIGTERM or SIGHUP.
 
-    A signal that is ignored already (`nohup`) stays so. In another thread, which no signal reaches, nothing changes.
+    Ignore those that follow.
+
+    A signal that is ignored already (`nohup`) stays so. In another thread, which no signal reaches,
+    nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -52,7 +52,10 @@ class _Arrivals:
             self.times.append(time.perf_counter())
 
     def jitter(self, what: str, end: float = inf) -> Jitter:
-        """Sum up the intervals of what came before `end`. Raises BenchError if there are too few."""
+        """Sum up the intervals of what came before `end`.
+
+        Raises BenchError if there are too few.
+        """
         times = [moment for moment in self.times[WARM_UP:] if moment < end]
         if len(times) < 3:
             raise BenchError(f"jitter of {what}: only {len(self.times)} messages came; is it switched on?")
@@ -129,11 +132,17 @@ class _Node:
             self._answer.set_result(frame.data)
 
     async def write(self, index: int, subindex: int, value: int, size: int) -> None:
-        """Write an entry of up to four bytes. Raises BenchError if the node refuses or does not answer."""
+        """Write an entry of up to four bytes.
+
+        Raises BenchError if the node refuses or does not answer.
+        """
         await self._transfer(0x23 | (4 - size) << 2, index, subindex, value)
 
     async def read(self, index: int, subindex: int) -> int:
-        """Read an entry of up to four bytes. Raises BenchError if the node refuses or does not answer."""
+        """Read an entry of up to four bytes.
+
+        Raises BenchError if the node refuses or does not answer.
+        """
         return await self._transfer(0x40, index, subindex, 0)
 
     async def _transfer(self, command: int, index: int, subindex: int, value: int) -> int:
@@ -217,7 +226,8 @@ async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node:
 async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> Jitter:
     """Make a node's first TPDO synchronous, send SYNC, and measure how long the PDO takes.
 
-    `deviation` holds the delays themselves, `period_ms` their mean. Raises BenchError if a SYNC stays without a PDO.
+    `deviation` holds the delays themselves, `period_ms` their mean. Raises BenchError if a SYNC
+    stays without a PDO.
     """
     delays: list[float] = []
     sent_at: float | None = None

@@ -1,8 +1,8 @@
 """Latency of the links while images are rendered and solved, measured from the OBC's side.
 
-An emulator process is asked for telemetry over its pty and over a CAN hub, one request at a time, after
-random pauses. In between, the same bytes go to a process that only echoes them over a pty: its latency
-is that of the machine, with which the emulator's latency is compared.
+An emulator process is asked for telemetry over its pty and over a CAN hub, one request at a time,
+after random pauses. In between, the same bytes go to a process that only echoes them over a pty:
+its latency is that of the machine, with which the emulator's latency is compared.
 """
 
 from __future__ import annotations
@@ -82,7 +82,10 @@ class SerialRequester:
         self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
-        """Request a row; return the time until the last byte of the reply, s, or None without a reply."""
+        """Request a row.
+
+        Return the time until the last byte of the reply, s, or None without a reply.
+        """
         row = load_icd().telemetry[name]
         begin = time.perf_counter()
         os.write(self._fd, encode_request(Request.of(row.id)))
@@ -113,7 +116,10 @@ class HubRequester:
         self._receive_until(b"< ok >")
 
     def ask(self, name: str) -> float | None:
-        """Request a row; return the time until the last frame of the reply, s, or None without a reply."""
+        """Request a row.
+
+        Return the time until the last frame of the reply, s, or None without a reply.
+        """
         row = load_icd().telemetry[name]
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()

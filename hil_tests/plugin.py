@@ -5,8 +5,9 @@
         starhil_serial.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20)
 
 Without options an emulator process is started once per module and ended after it. With
-`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is connected there. The
-time-out of a reply is `--starhil-timeout` seconds; a test that needs another passes `timeout_s`.
+`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is
+connected there. The time-out of a reply is `--starhil-timeout` seconds; a test that needs another
+passes `timeout_s`.
 
 pytest loads this module in every run, so it imports the bench only when a fixture is used.
 """

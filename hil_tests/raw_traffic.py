@@ -71,7 +71,9 @@ def send_and_listen(
     wanted: tuple[str, ...] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
-    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames of the device.
+    """Send bytes (serial) or frames (CAN).
+
+    Return what came back as one text of bytes, or as frames of the device.
 
     Parameters
     ----------

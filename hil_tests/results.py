@@ -240,7 +240,10 @@ def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
 
 
 def percentile(values: Sequence[float], part: float) -> float:
-    """Return the value below which `part` (0 to 1) of the values lie (nearest rank); NaN for none."""
+    """Return the value below which `part` (0 to 1) of the values lie (nearest rank).
+
+    NaN for none.
+    """
     if not values:
         return math.nan
     ordered = sorted(values)

@@ -75,7 +75,10 @@ class _SerialPipeline:
         self._came.set()
 
     async def drain(self, left: int) -> bool:
-        """Wait until no more than `left` requests are under way; False if the line is silent for `REPLY_WITHIN_S` before."""
+        """Wait until no more than `left` requests are under way.
+
+        False if the line is silent for `REPLY_WITHIN_S` before.
+        """
         while self.under_way > left:
             self._came.clear()
             try:

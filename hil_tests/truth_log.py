@@ -26,7 +26,8 @@ class TruthLogReader:
     Parameters
     ----------
     path : Path
-        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four of the quaternion.
+        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four of
+        the quaternion.
     """
 
     def __init__(self, path: Path) -> None:

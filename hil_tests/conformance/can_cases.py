@@ -42,7 +42,10 @@ TIMING: Final = CaseArea[CanProbe]("timing", rule(10))
 
 @dataclass(frozen=True)
 class Exchange:
-    """A row of the frame table; HH and DD stand for the addresses of host and device, `..` for any byte."""
+    """A row of the frame table.
+
+    HH and DD stand for the addresses of host and device, `..` for any byte.
+    """
 
     id: str
     title: str

@@ -183,7 +183,10 @@ class CanProbe(LinkProbe):
                 return Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
 
     def _segmented(self, first: CanFrame, number: int, other: int) -> Answer:
-        """Join the segments of one message; another counter or a short one in between is malformed."""
+        """Join the segments of one message.
+
+        Another counter or a short one in between is malformed.
+        """
         data = b""
         frame: CanFrame | None = first
         left = first.data[-1] if first.data else 0

@@ -93,7 +93,10 @@ def limits(probe: CanopenProbe) -> None:
 
 @EDS.case("sub-index-0", "sub-index 0 holds the highest sub-index", "CiA 301 7.4.3")
 def sub_index_0(probe: CanopenProbe) -> None:
-    """Sub-index 0 of records and arrays is an UNSIGNED8; a constant one equals the highest sub-index."""
+    """Sub-index 0 of records and arrays is an UNSIGNED8.
+
+    A constant one equals the highest sub-index.
+    """
     for index in sorted(probe.od.indices):
         item = probe.od.indices[index]
         if not isinstance(item, ODRecord | ODArray):

@@ -97,7 +97,10 @@ def emcy_gone(probe: CanopenProbe) -> None:
 
 @EMCY.case("history", "the error history has the newest first")
 def emcy_history(probe: CanopenProbe) -> None:
-    """The count grows with each error up to the length; sub-index 1 holds the newest code; writing 0 clears it."""
+    """The count grows with each error up to the length; sub-index 1 holds the newest code.
+
+    Writing 0 clears it.
+    """
     probe.require(0x1003)
     error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)

@@ -196,7 +196,10 @@ def guarding_or_heartbeat(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("life-guarding", "life guarding", "CiA 301 7.2.8.3.1")
 def life_guarding(probe: CanopenProbe) -> None:
-    """It starts with the first request; when requests stop, EMCY 8130h is sent and the node leaves OPERATIONAL."""
+    """It starts with the first request.
+
+    When requests stop, EMCY 8130h is sent and the node leaves OPERATIONAL.
+    """
     _prepare_guarding(probe)
     probe.require(0x100D)
     probe.set(0x100C, 0, 50, 2)
@@ -236,7 +239,10 @@ def consumer_start(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("consumer", "the heartbeat of a watched node stops and returns")
 def consumer(probe: CanopenProbe) -> None:
-    """EMCY 8130h after the consumer time, not before; the error register is set; EMCY 0000h at the next heartbeat."""
+    """EMCY 8130h after the consumer time, not before; the error register is set.
+
+    EMCY 0000h at the next heartbeat.
+    """
     emergency = _watch(probe)
     for _ in range(3):
         probe.send_watched_heartbeat()

@@ -71,7 +71,10 @@ def set_up(
     event_ms: int = 0,
     start: int | None = None,
 ) -> int:
-    """Configure a PDO by the procedure of CiA 301 and return its identifier; other PDOs and the heartbeat are off."""
+    """Configure a PDO by the procedure of CiA 301 and return its identifier.
+
+    Other PDOs and the heartbeat are off.
+    """
     probe.quiet()
     transmit = index >= 0x1800
     number = index & 0x1FF
@@ -99,7 +102,10 @@ def set_up(
 
 
 def first(probe: CanopenProbe, kind: int) -> int:
-    """Return the index of the first RPDO (1400h) or TPDO (1800h); skip the case if there is none."""
+    """Return the index of the first RPDO (1400h) or TPDO (1800h).
+
+    Skip the case if there is none.
+    """
     indices = probe.pdo_indices(kind)
     if not indices:
         raise CaseSkipped(f"no PDO from {kind:04X}h on")
@@ -112,7 +118,10 @@ def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
 
 
 def after_event(probe: CanopenProbe, identifier: int, timeout_s: float | None = None) -> bytes:
-    """Return the TPDO that a write to a mapped object has caused; skip the case if such a write is no event here."""
+    """Return the TPDO that a write to a mapped object has caused.
+
+    Skip the case if such a write is no event here.
+    """
     data = probe.wait_for(identifier, timeout_s)
     if data is None:
         raise CaseSkipped("a write to a mapped object is no event of this device")

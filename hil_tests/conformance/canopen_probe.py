@@ -120,7 +120,8 @@ class CanopenProbe:
     def silence(self, *, booting: bool) -> str | None:
         """Return `nothing` if the node answers no reading of its device type, None if it does.
 
-        A node that may be booting or stopped is asked again, with its boot-up message as an answer too.
+        A node that may be booting or stopped is asked again, with its boot-up message as an answer
+        too.
         """
         if booting:
             self.drain()
@@ -288,7 +289,10 @@ class CanopenProbe:
         )
 
     def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str) -> None:
-        """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer stands for any."""
+        """Fail unless an SDO answer is an abort with one of the codes.
+
+        An empty multiplexer stands for any.
+        """
         expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
         if seen is None:
             raise CaseFailed(expected, "nothing")

@@ -98,7 +98,10 @@ def no_size(probe: CanopenProbe) -> None:
 
 @SDO.case("segmented-upload", "segmented upload: size, toggle, last segment", "CiA 301 7.2.4.3.7")
 def segmented_upload(probe: CanopenProbe) -> None:
-    """The first answer has the size; the toggle bit starts at 0; c is set in the last segment only; n is correct."""
+    """The first answer has the size; the toggle bit starts at 0; c is set in the last segment only.
+
+    N is correct.
+    """
     item, value = long_text(probe)
     probe.expect_answer(upload(item), f"41 {mux(item)} {len(value).to_bytes(4, 'little').hex()}")
     toggle, data = 0, b""

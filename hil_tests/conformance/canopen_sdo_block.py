@@ -111,7 +111,10 @@ def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: boo
 
 @SDO_BLOCK.case("upload", "block upload with CRC", "CiA 301 7.2.4.3.13")
 def upload_with_crc(probe: CanopenProbe) -> None:
-    """Segment numbers from 1, last bit, unused bytes, size and CRC; the same data as a segmented upload."""
+    """Segment numbers from 1, last bit, unused bytes, size and CRC.
+
+    The same data as a segmented upload.
+    """
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127), value, "value")
     expect_no_transfer(probe)
@@ -236,7 +239,10 @@ def _end(probe: CanopenProbe, unused: int, crc: int) -> bytes | None:
 
 @SDO_BLOCK.case("download", "block download with CRC", "CiA 301 7.2.4.3.9", intrusive=True)
 def download(probe: CanopenProbe) -> None:
-    """A 16-bit number in one segment: A4h, A2h with number 1, A1h; with and without size and CRC."""
+    """A 16-bit number in one segment: A4h, A2h with number 1, A1h.
+
+    With and without size and CRC.
+    """
     item = writable_number(probe)
     for size, crc, value in ((2, True, b"\x39\x30"), (None, True, b"\x38\x30"), (2, False, b"\x37\x30")):
         _begin_download(probe, item, size, crc=crc)
@@ -262,7 +268,10 @@ def download_crc(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-gap", "a lost segment is requested again", "CiA 301 7.2.4.3.11", intrusive=True)
 def download_gap(probe: CanopenProbe) -> None:
-    """The block begins with number 2: confirmation A2h with number 0; then the block is repeated."""
+    """The block begins with number 2: confirmation A2h with number 0.
+
+    Then the block is repeated.
+    """
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x82\x39\x30")

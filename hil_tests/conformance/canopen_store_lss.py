@@ -180,7 +180,10 @@ def waiting(probe: CanopenProbe) -> None:
 
 @LSS.case("node-id", "configure node-ID", "CiA 305 configure node-ID")
 def node_id(probe: CanopenProbe) -> None:
-    """Invalid node-IDs are refused; a new one takes effect with the communication reset, and is then set back."""
+    """Invalid node-IDs are refused.
+
+    A new one takes effect with the communication reset, and is then set back.
+    """
     _select(probe)
     for value in (0, 128, 254):
         check_equal(_lss(probe, bytes([0x11, value])), b"\x11\x01" + bytes(6), f"answer to node-ID {value}")
@@ -205,7 +208,10 @@ def node_id(probe: CanopenProbe) -> None:
 
 @LSS.case("bit-timing", "configure bit timing", "CiA 305 configure bit timing")
 def bit_timing(probe: CanopenProbe) -> None:
-    """The bit rates of the EDS are accepted, indices 5 and 255 and other tables refused; nothing is activated."""
+    """The bit rates of the EDS are accepted, indices 5 and 255 and other tables refused.
+
+    Nothing is activated.
+    """
     _select(probe)
     table = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
     rates = probe.od.device_information.allowed_baudrates
@@ -258,7 +264,10 @@ def configured(probe: CanopenProbe) -> None:
 
 @LSS.case("fastscan", "fastscan finds a node without a node-ID", "CiA 305 fastscan")
 def fastscan(probe: CanopenProbe) -> None:
-    """The node-ID is removed, the identity found bit by bit, the node-ID set back; only without other such nodes."""
+    """The node-ID is removed, the identity found bit by bit, the node-ID set back.
+
+    Only without other such nodes.
+    """
     identity = _select(probe)
     old = probe.node
     check_equal(_lss(probe, "11 ff"), b"\x11\0" + bytes(6), "answer to node-ID 255")

@@ -68,7 +68,10 @@ def not_without_sync(probe: CanopenProbe) -> None:
 
 @TPDO.case("acyclic", "acyclic TPDO at the SYNC after an event only")
 def acyclic(probe: CanopenProbe) -> None:
-    """Type 0: a write to the mapped object is the event; the next SYNC sends the TPDO, the one after does not."""
+    """Type 0: a write to the mapped object is the event.
+
+    The next SYNC sends the TPDO, the one after does not.
+    """
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
     probe.command(START)

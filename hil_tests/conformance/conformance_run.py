@@ -79,7 +79,9 @@ class ConformanceResult:
 def run_conformance(
     request: ConformanceRequest, on_outcome: Callable[[Outcome], None] = lambda _outcome: None
 ) -> ConformanceResult:
-    """Run the cases on the links that are asked for; those that an interruption leaves are marked as not run.
+    """Run the cases on the links that are asked for.
+
+    Those that an interruption leaves are marked as not run.
 
     Raises
     ------
@@ -145,7 +147,10 @@ def _run_on_links(
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:
-    """Return the outcome that says that the emulator did not last; what was found until then stays."""
+    """Return the outcome that says that the emulator did not last.
+
+    What was found until then stays.
+    """
     return Outcome(
         "emulator.end",
         "emulator",

@@ -46,7 +46,8 @@ class Answer:
     Attributes
     ----------
     kind
-        Kind of answer: `none` for no answer within the time-out, `malformed` for an undecodable one.
+        Kind of answer: `none` for no answer within the time-out, `malformed` for an undecodable
+        one.
     code
         Error code of a refusal.
     data
@@ -200,7 +201,10 @@ class LinkProbe(ABC):
     # --- state of the device ---
 
     def wait_for(self, name: str, wanted: Mapping[str, Value], within_s: float) -> dict[str, Value]:
-        """Read a row until its fields have the wanted values; the case fails if they do not get them in time."""
+        """Read a row until its fields have the wanted values.
+
+        The case fails if they do not get them in time.
+        """
         end = self.now() + within_s
         while True:
             answer = self.ask(self.icd.telemetry[name].id)
@@ -256,7 +260,9 @@ class LinkProbe(ABC):
     # --- around a run ---
 
     def silence(self, *, booting: bool) -> str | None:
-        """Read three telemetry rows; return the invalid answer, None if one of them is answered correctly.
+        """Read three telemetry rows.
+
+        Return the invalid answer, None if one of them is answered correctly.
 
         A unit that may be booting is asked again until it must have booted.
         """
@@ -269,7 +275,10 @@ class LinkProbe(ABC):
                 return next((text for text in seen if text != "nothing"), "nothing")
 
     def _bad_answer(self, name: str) -> Answer | None:
-        """Ask for a row; return the answer unless it is telemetry of the row's length or a published refusal."""
+        """Ask for a row.
+
+        Return the answer unless it is telemetry of the row's length or a published refusal.
+        """
         self.drain()
         row = self.icd.telemetry[name]
         answer = self.ask(row.id)

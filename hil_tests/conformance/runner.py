@@ -96,7 +96,10 @@ class Probe(Protocol):
         """Get ready for a case."""
 
     def end(self, *, intrusive: bool, passed: bool) -> None:
-        """Check what must hold after a case, and leave the device to the next one; `CaseFailed` if it is not so."""
+        """Check what must hold after a case, and leave the device to the next one.
+
+        `CaseFailed` if it is not so.
+        """
 
     def recover(self) -> None:
         """Let what a failed case has left pass."""
@@ -147,7 +150,8 @@ class _Verdict:
 def _attempt(probe: Probe, act: Callable[[], None]) -> _Verdict:
     """Do a part of a case.
 
-    Frames that no case has thought of, such as an empty heartbeat, show as errors of the code that takes them apart.
+    Frames that no case has thought of, such as an empty heartbeat, show as errors of the code that
+    takes them apart.
     """
     try:
         act()
@@ -174,9 +178,10 @@ def run_cases(
 ) -> list[Outcome]:
     """Run the cases of one link in order.
 
-    A device that answers nothing ends the run: a failed outcome names the port, and the cases that are left are not run.
-    Before the first case that changes settings these are noted; after the last one they are put back, also when the run is
-    interrupted. An outcome is added only if that fails.
+    A device that answers nothing ends the run: a failed outcome names the port, and the cases that
+    are left are not run. Before the first case that changes settings these are noted; after the
+    last one they are put back, also when the run is interrupted. An outcome is added only if that
+    fails.
     """
     waiting = list(cases)
     outcomes: list[Outcome] = []
@@ -240,7 +245,10 @@ def _outcome_of_run(link: str, what: str, title: str, verdict: _Verdict, log: tu
 
 
 def _mute(probe: Probe, port: str, *, booting: bool) -> _Verdict | None:
-    """Return the verdict on a device that does not answer; None if it answers, or if the link itself is gone."""
+    """Return the verdict on a device that does not answer.
+
+    None if it answers, or if the link itself is gone.
+    """
     seen: str | None = None
 
     def listen() -> None:

@@ -111,7 +111,10 @@ class SerialProbe(LinkProbe):
         return self._malformed() if self._buffer else Answer("none")
 
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that come within a time; anything else fails the case."""
+        """Return the messages of unsolicited telemetry that come within a time.
+
+        Anything else fails the case.
+        """
         self.sleep(seconds)
         found = []
         while (packet := self._packet()) is not None:
@@ -147,7 +150,10 @@ class SerialProbe(LinkProbe):
         return Answer("malformed", data=data)
 
     def _packet(self) -> tuple[int, bytes] | None:
-        """Take a whole packet off the buffer: its start byte and its body without stuffing; None if none is whole."""
+        """Take a whole packet off the buffer: its start byte and its body without stuffing.
+
+        None if none is whole.
+        """
         if len(self._buffer) < 2 or not self._starts_well():
             return None
         body = bytearray()

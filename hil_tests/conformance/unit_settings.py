@@ -39,7 +39,10 @@ class UnitSettings:
 
     @staticmethod
     def read(probe: LinkProbe) -> UnitSettings:
-        """Read the settings; where stored parameters differ from those in use, they are in use afterwards."""
+        """Read the settings.
+
+        Where stored parameters differ from those in use, they are in use afterwards.
+        """
         status = probe.telemetry("device_status")
         rows = _read_parameters(probe)
         running = {name: row["value"] for name, row in rows.items()}

@@ -1,7 +1,7 @@
 """Mutants of the device: what a mutant is, and the seams at which a defect is put in.
 
-A defect is put at a seam of the healthy device, just before it is switched on: into what its links receive, what they
-send, how requests are handled, or into one of its parts.
+A defect is put at a seam of the healthy device, just before it is switched on: into what its links
+receive, what they send, how requests are handled, or into one of its parts.
 """
 
 from __future__ import annotations

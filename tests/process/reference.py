@@ -16,7 +16,10 @@ STATE_CHANGING = frozenset(
     {"reset", "set_parameter", "set_unsolicited", "set_mode", "set_update_rate", "set_star_config", "clear_counters",
      "save_image", "default_parameters", "restore_parameters"}
 )  # fmt: skip
-"""Telecommands that, if they were accepted, would change how the device answers; the fuzzers leave them out."""
+"""Telecommands that, if they were accepted, would change how the device answers.
+
+The fuzzers leave them out.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,9 @@ def frame_request(identifier: int, data: bytes = b"") -> bytes:
 def requests_in(stream: bytes) -> list[tuple[int, bytes]]:
     """Find the requests in a stream of bytes, whatever else is in it.
 
-    Outside a message everything but `1F 7F` is passed over. Inside, `1F 1F` is a byte 1F, `1F FF` the end, `1F 7F`
-    the start of another message, and `1F` before anything else ends the message without effect, save that an
-    identifier 1F may stand alone.
+    Outside a message everything but `1F 7F` is passed over. Inside, `1F 1F` is a byte 1F, `1F FF`
+    the end, `1F 7F` the start of another message, and `1F` before anything else ends the message
+    without effect, save that an identifier 1F may stand alone.
     """
     found = []
     position = 0

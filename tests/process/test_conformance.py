@@ -1,4 +1,7 @@
-"""The conformance command against the emulator as a process: pty, bus, CANopen; reports; choice of cases."""
+"""The conformance command against the emulator as a process: pty, bus, CANopen; reports.
+
+Choice of cases.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +38,9 @@ def run_cases(words: tuple) -> tuple[list[dict], list[str]]:
 def conform(*words: str, reports: tuple = ()) -> list[dict]:
     """Run cases and return their outcomes; none may have failed.
 
-    The rules on timing are those of real hardware, so a stall of a busy test machine breaks them, and longer time-outs
-    would loosen them. Cases that failed are therefore run once more, alone, and named in a warning.
+    The rules on timing are those of real hardware, so a stall of a busy test machine breaks them,
+    and longer time-outs would loosen them. Cases that failed are therefore run once more, alone,
+    and named in a warning.
     """
     outcomes, failed = run_cases((*words, *reports))
     if failed:

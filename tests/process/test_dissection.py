@@ -23,7 +23,10 @@ BOOT_UP = 0
 
 
 def read_by_blocks(node: canopen.RemoteNode, index: int) -> bytes:
-    """Upload an object; again after a reset if the transfer timed out because a process was paused."""
+    """Upload an object.
+
+    Again after a reset if the transfer timed out because a process was paused.
+    """
     states: queue.Queue[int] = queue.Queue()
     node.nmt.add_heartbeat_callback(states.put)
     for _ in range(TRIES):

@@ -56,7 +56,10 @@ def wait_until(condition, what: str) -> None:
 
 
 def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
-    """Start a command, send it a signal once a line of its run is out; return its exit status when all is over."""
+    """Start a command, send it a signal once a line of its run is out.
+
+    Return its exit status when all is over.
+    """
     command = [installed_command(), *map(str, words)]
     environment = {**os.environ, "TMPDIR": str(folder)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:

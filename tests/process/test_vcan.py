@@ -52,7 +52,10 @@ def obc(unit):
 
 @pytest.fixture
 def dump():
-    """A candump process; call it to get what it has seen since, heartbeats of the CANopen node left out."""
+    """A candump process.
+
+    Call it to get what it has seen since, heartbeats of the CANopen node left out.
+    """
     process = subprocess.Popen(
         [shutil.which("candump"), "-L", "vcan0"], stdout=subprocess.PIPE, text=True, bufsize=1
     )

@@ -90,7 +90,10 @@ def emulator_and_dump(lines: list[str], environment: dict[str, str]) -> Iterator
 
 
 def check(found: list[Exchange], dump: Typed, environment: dict[str, str]) -> None:
-    """Type each cansend line; candump must show what the text shows, but for what depends on time and noise."""
+    """Type each cansend line.
+
+    Candump must show what the text shows, but for what depends on time and noise.
+    """
     for exchange in found:
         subprocess.run(["sh", "-c", exchange.typed], check=True, env=environment)
         for shown in (exchange.sent, *exchange.answers):
