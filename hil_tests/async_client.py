@@ -25,7 +25,7 @@ UNSOLICITED_KEPT: Final = 1000
 HISTORY_LENGTH: Final = 10_000
 """Newest transactions, faults and stray replies that a client keeps."""
 SETTLE_S: Final = 0.05
-"""Pause after a time-out, in which a late reply is discarded, so that no later request receives it."""
+"""Pause after a time-out, in which a late reply is discarded."""
 
 
 class AsyncObcClient:

@@ -1,6 +1,6 @@
-"""Attitudes as the bench compares them: quaternions (x, y, z, w) from ICRS into the sensor frame, in plain Python.
+"""Quaternions (x, y, z, w) from ICRS to the sensor frame, and attitude errors, in plain Python.
 
-The bench holds its own few lines of quaternion algebra so that the unit under test and its judge share no numerics.
+The bench has its own quaternion algebra, so that it shares no numerics with the unit under test.
 Conventions (roll, sensor axes, scalar last) are those of the interface definition's attitude rows.
 """
 

@@ -1,4 +1,4 @@
-"""A bench set up: the unit under test, the clients on its links, their logs, and the emulator if the bench started it."""
+"""The unit under test, with clients and logs on its links, and the emulator if there is one."""
 
 from __future__ import annotations
 

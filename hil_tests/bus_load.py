@@ -36,7 +36,7 @@ TALKER: Final = 0x20
 """CAN address of the other traffic's sender; it speaks to LISTENER, an address nobody has."""
 LISTENER: Final = 0x21
 ECHO: Final = 0x22
-"""CAN address at which the process of the other traffic answers at once: what the machine itself takes."""
+"""CAN address at which the traffic process echoes requests, for the latency of the machine."""
 
 ECHO_ROW: Final = 133
 """Telemetry identifier of the other traffic."""
@@ -66,7 +66,7 @@ SETTLE_S: Final = 5.0
 
 
 def _talk(spec: str, rate: float, pipe: Connection) -> None:
-    """Send numbered frames at a rate until stopped, count them at another port of the bus, and report."""
+    """Send numbered frames at a rate until stopped; report how many arrived at another port."""
     asyncio.run(_talk_until_stopped(spec, rate, pipe))
 
 
@@ -143,7 +143,7 @@ class OtherTraffic:
 
 
 class _CanAsker:
-    """Requests telemetry of one node over CAN, one request at a time, and measures the latency of the replies."""
+    """Requests telemetry over CAN, one row at a time, and measures the latency of the replies."""
 
     def __init__(self, node: int, send: Callable[[CanFrame], bool]) -> None:
         self._node = node

@@ -83,7 +83,7 @@ class ObcClient:
         retries: int = 0,
         log: WireLog | None = None,
     ) -> Self:
-        """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel, one of the two."""
+        """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel."""
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
 
@@ -187,7 +187,7 @@ class ObcClient:
     def wait_unsolicited(
         self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
     ) -> Reading:
-        """Return the next unsolicited telemetry of a row received after a time on `time.monotonic`."""
+        """Return the next unsolicited telemetry of a row; see `AsyncObcClient`."""
         return self.run(self.core.wait_unsolicited(name, timeout_s=timeout_s, since_s=since_s))
 
     def download_image(

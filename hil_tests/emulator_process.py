@@ -1,4 +1,4 @@
-"""The emulator as a process: start it, wait for its ready line, end it and check its exit status."""
+"""The emulator as a process: start, ready line, end and exit status."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def emulator_command(
 
 
 def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
-    """Return the command line of a CAN hub that ends with this process, at a free port by default."""
+    """Return the command line of a CAN hub that ends with this process; port 0 is a free one."""
     command = [*_starhil_command(), "hub", "--port", str(port)]
     return command if log is None else [*command, "--log", str(log)]
 
@@ -78,7 +78,7 @@ def installed_command() -> str:
 
 
 def _starhil_command() -> list[str]:
-    """Return the beginning of a command line for `starhil`, which SIGTERM ends when this process has ended."""
+    """Return the start of a command line for a `starhil` that ends with this process."""
     return [sys.executable, "-m", "starhil.hil_tests.end_with_parent", str(os.getpid()), installed_command()]
 
 
@@ -259,7 +259,7 @@ class EmulatorProcess:
         self.start()
 
     def memory_bytes(self) -> int:
-        """Return the resident memory of the process and its workers, in bytes (shared pages counted in each)."""
+        """Return the resident memory of the process and its workers, bytes."""
         group = self.process.pid
         total = 0
         for folder in Path("/proc").iterdir():

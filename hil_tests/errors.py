@@ -65,7 +65,7 @@ class EmulatorProcessError(BenchError):
 
 
 def near_matches(name: str, known: Iterable[str]) -> str:
-    """Return a clause such as `; did you mean 'quaternion'?`, empty if nothing known is near `name`."""
+    """Return a hint such as `; did you mean 'quaternion'?`, empty without a near match."""
     near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.55)
     if not near:
         return ""

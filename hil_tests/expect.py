@@ -28,7 +28,7 @@ RELATIVE_ROUNDING: Final = 1e-6
 """Numbers given without a tolerance may differ by the rounding of a 32-bit float."""
 
 WHOLE_DIGITS: Final = 1e4
-"""Numbers from here on are shown with six decimals, as ten digits would cut the fraction of a Unix time off."""
+"""Numbers from here on are shown with six decimals, to keep the fraction of a Unix time."""
 
 CLOCK_VARIABLES: Final = ("now", "now_s", "now_ms")
 """Variables that every script has: the OBC's Unix time in seconds; its whole seconds.
@@ -225,7 +225,7 @@ class AttitudeCheck:
     def judge(
         self, values: Mapping[str, Value], truth: Quaternion
     ) -> tuple[AttitudeError | None, str | None]:
-        """Return the error of the attitude in telemetry `values`, and what is wrong, None if nothing is."""
+        """Return the attitude error of telemetry `values`, and the problem, None if it passed."""
         try:
             measured = measured_attitude(values)
         except BenchError as refusal:
@@ -275,7 +275,7 @@ def read_stated_attitude(reader: TableReader) -> Quaternion | None:
 
 
 def read_attitude_check(reader: TableReader) -> AttitudeCheck:
-    """Read the table `attitude` of a step: its tolerances and, if it has one, the attitude itself."""
+    """Read the table `attitude` of a step: tolerances and, optionally, the true attitude."""
     check = AttitudeCheck(
         reader.optional_number("within_arcsec", minimum=0.0),
         reader.optional_number("roll_within_arcsec", minimum=0.0),

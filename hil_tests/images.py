@@ -97,7 +97,7 @@ async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
 
 
 async def download_by_frames(client: Downloader, size: str, *, within_s: float) -> Image:
-    """Save an image and download it in frames of 128 bytes (init, read, advance), each with its checksum.
+    """Save an image and download it in frames of 128 bytes, each with a checksum.
 
     Raises
     ------
@@ -155,7 +155,7 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 
 
 async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
-    """Save an image and download its file by bursts: blocks of up to 1024 numbered packets, missing ones requested again.
+    """Save an image and download its file in bursts of up to 1024 numbered packets.
 
     The header of the file, loaded first, holds its length.
     """
@@ -247,7 +247,7 @@ def bmp_file_size(header: bytes) -> int:
 
 
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
-    """Return pixels (row by row from the top), width and height of an uncompressed grey BMP file of 8 bits a pixel.
+    """Return pixels (row by row from the top), width and height of an 8-bit grey BMP file.
 
     Raises
     ------

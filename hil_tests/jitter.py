@@ -1,4 +1,4 @@
-"""How regularly periodic messages come over CAN, measured from the OBC's side: unsolicited telemetry, heartbeat, TPDOs, SYNC."""
+"""Jitter of periodic CAN messages at the OBC: unsolicited telemetry, heartbeat, TPDO, SYNC."""
 
 from __future__ import annotations
 

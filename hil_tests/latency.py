@@ -35,7 +35,7 @@ PAUSE_S: Final = 0.004
 
 REPLY_WITHIN_S: Final = 1.0
 BAUD: Final = 921_600
-"""High, so that the time of the bytes on the line (1 ms for the longest reply) does not hide the device's."""
+"""High, so that the transmission time (1 ms for the longest reply) is short against the latency."""
 
 ECHO: Final = (
     "import os,sys\nf=int(sys.argv[1])\ntry:\n while d:=os.read(f,4096): os.write(f,d)\nexcept OSError: pass"

@@ -1,4 +1,4 @@
-"""The OBC's end of a link: a transport and the host side of its framing behind one small interface."""
+"""The OBC's end of a link: a transport and the host side of its framing."""
 
 from __future__ import annotations
 

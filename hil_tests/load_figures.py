@@ -39,10 +39,10 @@ class CanLoad:
     requests: int
     unanswered: int
     wrong: int
-    """Replies that were refusals, had a wrong length or a value outside its limits, and faults of the framing."""
+    """Refusals, replies with a wrong length or value, and framing faults."""
     latency: Spread
     machine: Spread
-    """Latency of a process on the same bus that does nothing but answer: what the machine itself takes."""
+    """Latency of an echo process on the same bus, which is that of the machine."""
 
     @property
     def good(self) -> bool:
@@ -63,7 +63,7 @@ class SerialLoad:
     received_share: float
     exchanges: int
     wrong: int
-    """Replies out of turn, refusals, wrong bytes, faults of the framing, and error flags that the device reports."""
+    """Wrong replies, framing faults, and error flags that the device reports."""
 
     @property
     def good(self) -> bool:

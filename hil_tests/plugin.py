@@ -46,10 +46,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def starhil_emulator(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[EmulatorProcess]:
-    """Return an emulator that runs as a process on a pty and on a CAN bus (vcan0, else a private hub).
+    """Start an emulator on a pty and on a CAN bus (vcan0, else a private hub).
 
-    `.ready` holds its ready line. SIGTERM ends it after the last test of the module; an exit status other
-    than 0 is an error.
+    `.ready` holds its ready line. SIGTERM ends it after the last test of the module; an exit status
+    other than 0 is an error.
     """
     from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
     from starhil.hil_tests.private_can_bus import PrivateCanBus

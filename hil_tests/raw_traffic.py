@@ -60,7 +60,7 @@ def pattern(text: str) -> str:
 
 
 def matches(expected: str, seen: str) -> bool:
-    """Compare a text of hexadecimal bytes or a frame with a pattern, in which `..` stands for any byte."""
+    """Return whether hexadecimal bytes or a frame match a pattern; `..` stands for any byte."""
     return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
 
 

@@ -1,4 +1,4 @@
-"""Real-time priority for the processes of a link, so that a busy machine does not make them late."""
+"""Real-time priority for the processes of a link on a busy machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The session script: a TOML file of telecommands, reads, waits and expectations, validated completely before it runs.
+"""Session scripts: TOML files of telecommands, reads and expectations, validated before the run.
 
     title = "First light"
 
@@ -26,8 +26,9 @@
     within_s = 20                   # ask again until the expectations hold
     attitude = { within_arcsec = 30, roll_within_arcsec = 120 }
 
-Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names are those of the
-interface definition; the error for an unknown one names file, step and near matches.
+Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names
+are those of the interface definition; the error for an unknown one names file, step and near
+matches.
 """
 
 from __future__ import annotations

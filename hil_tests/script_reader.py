@@ -1,4 +1,4 @@
-"""Reader of the tables of a session script, with errors that name file, table, key and near matches."""
+"""Reader of the tables of a session script; errors name file, table, key and near matches."""
 
 from __future__ import annotations
 

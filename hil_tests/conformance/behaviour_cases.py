@@ -1,4 +1,4 @@
-"""Conformance of what the device does, on any link: acknowledge, counters, echo, time, modes, reset, store."""
+"""Conformance on any link: acknowledge, counters, data, time, modes, reset, parameter store."""
 
 from __future__ import annotations
 

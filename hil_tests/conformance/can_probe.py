@@ -1,4 +1,4 @@
-"""The tester's side of a device on CAN with the CubeSpace identifier layout: strict about every frame."""
+"""The tester's side of a CAN link with the CubeSpace layout of CAN IDs; checks every frame."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class CanProbe(LinkProbe):
         self.bus.send(frame)
 
     def send_text(self, text: str) -> None:
-        """Send a frame written as for `cansend`, with HH and DD for the addresses of host and device."""
+        """Send a frame in the format of `cansend`, with HH and DD for the addresses."""
         self.send(parse_frame(self.with_addresses(text)))
 
     def with_addresses(self, text: str) -> str:

@@ -45,7 +45,7 @@ def mandatory(probe: CanopenProbe) -> None:
 
 @EDS.case("lists", "object lists and sections agree", "CiA 306 4.6.2")
 def lists(probe: CanopenProbe) -> None:
-    """Each listed object has a section, and each section is listed once, in the list of its range."""
+    """Each object is listed once, in the list of its range, and has a section."""
     parser = _file(probe)
     listed: list[int] = []
     for name in LISTS:

@@ -22,7 +22,7 @@ EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusiv
 
 
 class ProvokedError:
-    """An error that the tester can cause and clear: a SYNC of wrong length, else a missing heartbeat."""
+    """An error caused by the tester: a SYNC of wrong length, else a missing heartbeat."""
 
     def __init__(self, probe: CanopenProbe) -> None:
         probe.require(0x1014)
@@ -177,7 +177,7 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
 
 @EMCY.case("stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5")
 def emcy_stopped(probe: CanopenProbe) -> None:
-    """The heartbeat of a watched node stops in STOPPED: no EMCY until the node leaves that state."""
+    """A missing heartbeat in STOPPED causes no EMCY until the node leaves that state."""
     probe.require(0x1016)
     error = ProvokedError(probe)
     probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)

@@ -1,4 +1,4 @@
-"""The tester's side of a CANopen node: frames and short SDO requests, with a log of all that was sent and seen."""
+"""The tester's side of a CANopen node: frames and SDO requests, with a log of the traffic."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ class CanopenProbe:
         timeout_s: float | None = None,
         accept: Callable[[bytes], bool] = lambda _data: True,
     ) -> bytes | None:
-        """Return the data of the next frame with one of the identifiers that is accepted, None if none comes."""
+        """Return the data of the next accepted frame with one of the CAN IDs, else None."""
         wanted = {identifiers} if isinstance(identifiers, int) else identifiers
         end = self.bus.now() + (self.timeout_s if timeout_s is None else timeout_s)
         while (left := end - self.bus.now()) >= 0:
@@ -372,15 +372,15 @@ class CanopenProbe:
         self.send(0x700 + WATCHED_NODE, b"\x05")
 
     def reset_communication(self) -> None:
-        """Reset the communication and wait for the boot-up message, so that all is at its stored values."""
+        """Reset the communication to its stored values and wait for the boot-up message."""
         self.drain()
         self.command(RESET_COMMUNICATION)
         self.expect_boot_up()
 
     def reset_to_stored_values(self) -> None:
-        """Bring the node to PRE-OPERATIONAL with its stored values, as far as it can be brought there.
+        """Bring the node to PRE-OPERATIONAL with its stored values, if it boots.
 
-        That a node does not boot up is for the cases about booting up to find; all others go on without it.
+        Other cases than those of the boot-up go on without a boot-up message.
         """
         self.abandon_transfer()
         self.command(RESET_COMMUNICATION)
@@ -394,7 +394,7 @@ class CanopenProbe:
         self.expect(0x700 + self.node, "boot-up message 00", 5.0, _is_boot_up)
 
     def quiet(self) -> None:
-        """Switch off the heartbeat and all PDOs, so that only what a case provokes is on the bus."""
+        """Switch off the heartbeat and all PDOs, so that the case alone causes traffic."""
         if 0x1017 in self.od:
             self.set(0x1017, 0, 0, 2)
         for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):

@@ -122,7 +122,7 @@ def place_holder(probe: CanopenProbe) -> None:
 
 @RPDO.case("deadline", "deadline of an RPDO", "CiA 301 7.5.2.35")
 def deadline(probe: CanopenProbe) -> None:
-    """With an event timer of 100 ms, EMCY 8250h follows 100 ms after the last message, not before the first."""
+    """EMCY 8250h comes 100 ms (event timer) after the last message, not before the first."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255, event_ms=100)

@@ -37,7 +37,7 @@ def long_text(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
 
 
 def writable_number(probe: CanopenProbe) -> ODVariable:
-    """Return a 16-bit number that can be written without effect: the heartbeat time, else another."""
+    """Return a writable 16-bit number without side effects: the heartbeat time, else another."""
     if 0x1017 in probe.od:
         item = probe.od.get_variable(0x1017)
         if item is not None:

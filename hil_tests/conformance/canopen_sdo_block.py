@@ -37,7 +37,7 @@ SEGMENT: Final = 7
 
 
 def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
-    """Return the longest readable text or bulk data of at most 200 kB of the EDS, ideally many blocks."""
+    """Return the longest readable text or domain of at most 200 kB, ideally many blocks."""
     best: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         if item.readable and item.data_type in {

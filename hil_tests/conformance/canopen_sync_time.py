@@ -75,7 +75,7 @@ def sync_length(probe: CanopenProbe) -> None:
 
 @SYNC.case("producer", "SYNC producer")
 def sync_producer(probe: CanopenProbe) -> None:
-    """Bit 30 of 1005h with 1006h produces SYNCs at that period, counted from 1, or is refused with 0609 0030h."""
+    """Bit 30 of 1005h starts SYNCs with the period 1006h, counted from 1; else abort 0609 0030h."""
     probe.require(0x1006)
     _quiet(probe)
     if 0x1019 in probe.od:
@@ -99,7 +99,7 @@ def sync_producer(probe: CanopenProbe) -> None:
 
 @TIME.case("identifier", "identifiers that TIME may not have")
 def time_identifier(probe: CanopenProbe) -> None:
-    """Restricted CAN-IDs, the extended format, and any change while in use are refused with 0609 0030h."""
+    """Restricted CAN-IDs, the extended format, and a change while in use: abort 0609 0030h."""
     probe.require(0x1012)
     probe.set(0x1012, 0, 0x100)
     for identifier in (*RESTRICTED_IDS, 0x2000_0100):

@@ -138,7 +138,7 @@ def event_timer(probe: CanopenProbe) -> None:
 
 @TPDO.case("inhibit", "inhibit time")
 def inhibit(probe: CanopenProbe) -> None:
-    """With 100 ms, the second of two events is sent 100 ms after the first, with the newest value."""
+    """The second of two events is sent after the 100 ms, with the newest value."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1

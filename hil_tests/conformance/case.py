@@ -97,7 +97,7 @@ class CaseArea(Generic[ProbeType]):
 
 
 def rule(number: int) -> str:
-    """Return the clause of a rule of this product, for what no standard and no public source settles."""
+    """Return the clause of a rule of this product, where no standard or public source applies."""
     return f"R{number}, docs/rules.md"
 
 

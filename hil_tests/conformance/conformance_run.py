@@ -1,4 +1,4 @@
-"""A conformance run from the options to the reports: unit, links, cases, and what to do with the results."""
+"""A complete conformance run: options, links, cases, interruption."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tester's side of a device on a serial line or on CAN: requests, strict reading of the answers, and a log of both.
+"""The tester's side of a serial or CAN link: requests, strict decoding of answers, and a log.
 
 The framing is an independent implementation of the public description; it shares no code with the
 codecs of the product.
@@ -116,7 +116,7 @@ class LinkProbe(ABC):
 
     @abstractmethod
     def send_text(self, text: str) -> None:
-        """Send raw traffic: bytes in hexadecimal, or a CAN frame in which HH and DD stand for host and device."""
+        """Send hexadecimal bytes, or a CAN frame in which HH and DD stand for host and device."""
 
     @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:

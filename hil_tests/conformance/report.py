@@ -1,4 +1,4 @@
-"""Conformance results for people and machines: lines and a table on the terminal, JUnit, HTML, JSON."""
+"""Conformance reports: terminal, JUnit, HTML, JSON."""
 
 from __future__ import annotations
 

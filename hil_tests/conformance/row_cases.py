@@ -1,4 +1,4 @@
-"""Conformance to the interface definition, row by row, on any link: identifiers, lengths, values, limits."""
+"""Conformance to the interface definition, row by row: row IDs, lengths, values, limits."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Outcome:
 def select_cases(
     cases: Iterable[Case[Any]], patterns: Sequence[str] = (), *, safe_only: bool = False
 ) -> list[Case[Any]]:
-    """Return the cases whose identifier matches one of the patterns (`*` and `?`; a bare name takes what begins so).
+    """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
 
     Raises
     ------

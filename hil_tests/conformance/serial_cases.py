@@ -47,7 +47,7 @@ READ: Final = "1F 7F 80 1F FF"
 
 @dataclass(frozen=True)
 class Line:
-    """A row of the framing table: what is sent, in pieces with a pause after each, and what is answered."""
+    """A row of the framing table: pieces to send, a pause after each, and expected rows."""
 
     id: str
     title: str

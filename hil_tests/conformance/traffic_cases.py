@@ -1,4 +1,4 @@
-"""Conformance of the traffic on any link: how soon a reply comes, unsolicited telemetry, recovery from noise and floods."""
+"""Conformance on any link: latency, unsolicited telemetry, recovery from noise and floods."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a conformance run changes in a unit, and how it is put back: its parameters, those that it stores, its mode."""
+"""The settings of a unit that a conformance run changes and restores: parameters, store, mode."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _read_parameters(probe: LinkProbe) -> dict[str, dict[str, float]]:
 
 
 def set_parameters(probe: LinkProbe, values: Mapping[str, float]) -> None:
-    """Set parameters, in any order: those that another parameter bounds are set in a second pass."""
+    """Set parameters in any order; those that another one bounds are set in a second pass."""
     refused: list[str] = []
     for name, value in values.items():
         try:

@@ -72,7 +72,7 @@ def incoming(change: Callable[[Any], list[Any]]) -> Damage:
 
 
 def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]], list[Reply]]) -> Damage:
-    """Come between the links and the device: the change gets device, request and the healthy handler."""
+    """Wrap the request handler; the change gets device, request and the healthy handler."""
 
     def damage(unit: SimulatedUnit) -> None:
         device, handle = unit.device, unit.device.handle
@@ -103,7 +103,7 @@ def enter(name: str, link: str, caught_by: str, damage: Damage) -> None:
 
 
 def without_faults(*kinds: FaultKind) -> Damage:
-    """Let the device not hear of some kinds of fault."""
+    """Hide some kinds of fault from the device."""
 
     def damage(unit: SimulatedUnit) -> None:
         device, fault = unit.device, unit.device.fault

@@ -1,4 +1,4 @@
-"""The real device with its real links in simulated time: a conformance run takes seconds, and always the same."""
+"""The real device with its real links in simulated time: fast and reproducible."""
 
 from __future__ import annotations
 

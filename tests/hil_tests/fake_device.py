@@ -1,4 +1,4 @@
-"""A minimal device for tests of the bench itself: protocol codecs, canned telemetry, and switches for misbehaviour."""
+"""A minimal device for tests of the bench: canned telemetry, and switches for misbehaviour."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The load measurement distinguishes a good device from one that loses, corrupts or delays replies."""
+"""The load measurement detects a device that loses, corrupts or delays replies."""
 
 from __future__ import annotations
 

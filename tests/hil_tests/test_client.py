@@ -1,4 +1,4 @@
-"""The OBC client over a pty (three dialects) and over the TCP hub, against a device of canned answers."""
+"""The OBC client over a pty (three dialects) and over the TCP hub, with a canned device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of a failed run: reports in their folders, and the last lines of stderr of the emulator."""
+"""Results of a failed run: reports, and the last lines of stderr of the emulator."""
 
 from __future__ import annotations
 

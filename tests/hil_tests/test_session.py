@@ -1,4 +1,4 @@
-"""The session runner on a device of canned answers: what passes, what fails, and what is written."""
+"""The session runner with a canned device: passes, failures, and files."""
 
 from __future__ import annotations
 

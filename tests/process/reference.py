@@ -1,4 +1,4 @@
-"""The wire rules once more, written from the published description alone: an oracle for what the emulator must answer."""
+"""An oracle for the replies of the emulator, written from the published wire rules alone."""
 
 from __future__ import annotations
 

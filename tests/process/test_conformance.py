@@ -20,7 +20,7 @@ pytestmark = pytest.mark.process
 
 
 SPEED = 0.5
-"""Simulation time per second: slow motion gives each rule about time the same meaning and a busy machine twice the patience."""
+"""Simulation time per second: slow motion doubles the time-outs on a busy machine."""
 SLOW_MOTION = ["--speed", str(SPEED)]
 TIME_OUT_S = 400.0
 

@@ -1,4 +1,4 @@
-"""Recordings of sessions on a bus of several processes, with a CANopen node that talks meanwhile, as Wireshark reads them."""
+"""Bus recordings of sessions next to a busy CANopen node, dissected by Wireshark."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built wheel, installed into a fresh environment, in a project with folders of the names that ours have."""
+"""The built wheel in a fresh environment, in a project with folders of the same names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A session or a conformance run that is ended by a signal leaves no process and no folder behind, and keeps its reports."""
+"""A signal that ends a session or a conformance run leaves no process or folder, and its reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a bench does to a unit: power cut, peers that do not read, buses that vanish, two masters, half messages."""
+"""Power cuts, peers that do not read, lost buses, two masters, incomplete messages."""
 
 from __future__ import annotations
 

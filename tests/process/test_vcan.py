@@ -1,4 +1,4 @@
-"""Emulator, OBC and can-utils as separate processes on a kernel vcan0 (on machines without one: in a guest)."""
+"""Emulator, OBC and can-utils as separate processes on a kernel vcan0 (if need be, in a guest)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every conformance case of CAN and CANopen on a kernel vcan0 (on machines without one: in a guest)."""
+"""Every CAN and CANopen conformance case on a kernel vcan0 (if need be, in a guest)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The README and the walk-through typed into a shell on a machine with a vcan0 (elsewhere: in a guest)."""
+"""README and walk-through in a shell on a machine with a vcan0 (if need be, in a guest)."""
 
 from __future__ import annotations
 
