@@ -11,6 +11,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_ACCESS,
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
+    FIRST_OWN_OBJECT,
     NO_RTR,
     PDO_OFF,
     CanopenProbe,
@@ -46,18 +47,27 @@ def constant(probe: CanopenProbe) -> ODVariable:
 
 
 def writable(probe: CanopenProbe) -> ODVariable:
-    """Return an object to receive that can be read back and has limits or none."""
-    return probe.find(
-        "object for an RPDO",
-        lambda item: (
+    """Return an object for an RPDO that accepts both its limits now; skip the case if there is none.
+
+    Another object may bound it more tightly than the EDS: an exposure time by the update rate.
+    """
+    for item in probe.variables():
+        size = size_of(item)
+        if (
             item.pdo_mappable
             and item.access_type == "rw"
             and is_integer(item)
-            and size_of(item) in {1, 2}
-            and item.index >= 0x2000
+            and size in {1, 2}
+            and item.index >= FIRST_OWN_OBJECT
             and item.max is not None
-        ),
-    )
+        ):
+            before = probe.read(item.index, item.subindex)
+            limits = [int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max)]
+            accepted = [probe.write(item.index, item.subindex, limit) == 0 for limit in limits]
+            probe.set(item.index, item.subindex, before)
+            if all(accepted):
+                return item
+    raise CaseSkipped("the EDS has no object for an RPDO that accepts its limits")
 
 
 def set_up(

@@ -58,7 +58,7 @@ AREAS = ("framing", "frames", "segments", "stuffing", "errors", "timing", "data"
 def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
     chosen = [f"serial.{area}" for area in AREAS if area not in ("frames", "segments")]
     chosen += [f"can.{area}" for area in AREAS if area not in ("framing", "stuffing")]
-    chosen += ["canopen.nmt", "canopen.sdo"]
+    chosen += ["canopen.nmt", "canopen.sdo", "canopen.rpdo", "canopen.design"]
     junit, html = tmp_path / "c.xml", tmp_path / "c.html"
     links = ["--serial", "auto", "--can", "auto", "--canopen", "44"]
     outcomes = conform(*chosen, "--start", *links, *SLOW_MOTION, reports=("--junit", junit, "--html", html))
