@@ -1,1 +1,1 @@
-"""The test bench: OBC client, session runner, pytest plugin and conformance suite, over a bus only."""
+"""The test bench: OBC client, session runner, pytest plugin and conformance suite."""

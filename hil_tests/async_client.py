@@ -1,51 +1,51 @@
-"""An OBC that asks a star sensor by the names of the interface definition, as coroutines."""
+"""An asynchronous OBC client, which uses the names of the interface definition."""
 
 from __future__ import annotations
 
 import asyncio
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Any, Final
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
 from starhil.hil_tests.images import Image, download_by_bursts, download_by_frames
-from starhil.hil_tests.links import (
-    HostLink,
-)
-from starhil.hil_tests.readings import Ack, Reading, Transaction
+from starhil.hil_tests.links import HostLink
+from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition, load_icd
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import Value
 
 DEFAULT_TIMEOUT_S: Final = 1.0
-"""Time-out of a transaction, that of current public flight software."""
+"""Time-out of a transaction in current public flight software."""
 UNSOLICITED_KEPT: Final = 1000
-"""Unsolicited readings that wait to be taken; the oldest go first."""
+"""Longest queue of unsolicited readings; the oldest are dropped."""
+HISTORY_LENGTH: Final = 10_000
+"""Newest transactions, faults and stray replies that a client keeps."""
 SETTLE_S: Final = 0.05
-"""Pause after a time-out, in which a late reply is thrown away so that no later request takes it for its own."""
+"""Pause after a time-out, in which a late reply is discarded."""
 
 
 class AsyncObcClient:
-    """Asks one device over one link, one request at a time.
+    """An OBC on one link to one device, with one request at a time.
 
     Parameters
     ----------
     link : HostLink
         A serial line or a CAN bus.
     icd : InterfaceDefinition, optional
-        Names and layouts; the one that travels with the package if not given.
+        Names and layouts; default: the one of the package.
     timeout_s : float
-        How long a reply may take unless a call says otherwise.
+        Default time-out of a reply, s.
     retries : int
-        How often a request is sent again after a time-out unless a call says otherwise. Off by default: a bench
-        wants to see a lost reply.
+        Default number of repeats after a time-out. 0 shows a lost reply to the bench.
     """
 
     def __init__(
         self,
-        link: HostLink,
+        link: HostLink[Any],
         icd: InterfaceDefinition | None = None,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
@@ -55,9 +55,9 @@ class AsyncObcClient:
         self.icd = load_icd() if icd is None else icd
         self.timeout_s = timeout_s
         self.retries = retries
-        self.transactions: list[Transaction] = []
-        self.faults: list[LinkFault] = []
-        self.stray_replies: list[Reply] = []
+        self.transactions: deque[Transaction] = deque(maxlen=HISTORY_LENGTH)
+        self.faults: deque[LinkFault] = deque(maxlen=HISTORY_LENGTH)
+        self.stray_replies: deque[Reply] = deque(maxlen=HISTORY_LENGTH)
         self.unsolicited: asyncio.Queue[Reading] = asyncio.Queue(UNSOLICITED_KEPT)
         self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
@@ -77,7 +77,7 @@ class AsyncObcClient:
     # --- by name ---
 
     async def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
-        """Ask for a telemetry row.
+        """Read a telemetry row.
 
         Raises
         ------
@@ -106,12 +106,15 @@ class AsyncObcClient:
         checked: bool = True,
         **fields: Value,
     ) -> Ack:
-        """Send a telecommand and wait for its acknowledge; fields as a mapping, by keyword, or both.
+        """Send a telecommand and wait for its acknowledge.
+
+        Fields as a mapping, by keyword, or both.
 
         Parameters
         ----------
         checked
-            False to send values outside the limits of the interface definition too, for the device to refuse.
+            False also sends values outside the limits of the interface definition, for the device
+            to refuse.
 
         Raises
         ------
@@ -188,7 +191,7 @@ class AsyncObcClient:
                 return reading
             if time.monotonic() >= deadline:
                 raise BenchError(
-                    f"{name}: what was waited for did not come within {within_s:g} s; last {dict(reading.values)}"
+                    f"{name}: the condition did not hold within {within_s:g} s; last {dict(reading.values)}"
                 )
             await asyncio.sleep(every_s)
 
@@ -216,13 +219,13 @@ class AsyncObcClient:
     async def download_image(
         self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
     ) -> Image:
-        """Have an image taken and stored, and download it by `frames` or by `burst`."""
+        """Capture and store an image, and download it by `frames` or by `burst`."""
         if method not in ("frames", "burst"):
             raise BenchError(f"image download method '{method}': must be frames or burst")
         download = download_by_frames if method == "frames" else download_by_bursts
         return await download(self, size, within_s=within_s)
 
-    # --- by number ---
+    # --- by row ID ---
 
     async def transact(
         self,
@@ -233,14 +236,17 @@ class AsyncObcClient:
         timeout_s: float | None = None,
         retries: int | None = None,
     ) -> tuple[Reply, float]:
-        """Send a request and return its reply and latency; the numbers need not be in the definition."""
+        """Send a request and return its reply and latency.
+
+        The row ID need not be in the definition.
+        """
         limit = self.timeout_s if timeout_s is None else timeout_s
         attempts = 1 + (self.retries if retries is None else retries)
         async with self._turn:
             for _ in range(attempts):
                 answer = await self._attempt(request, reply_size, limit)
                 if answer is not None:
-                    return self._judge(name, *answer)
+                    return self._checked_reply(name, *answer)
                 self.transactions.append(Transaction(name, "no_reply", float("inf")))
         self.link.check()
         raise NoReplyError(name, limit, attempts)
@@ -256,12 +262,12 @@ class AsyncObcClient:
             return reply, end - begin
         except TimeoutError:
             await asyncio.sleep(SETTLE_S)
-            self.link.forget()
+            self.link.reset_receiver()
             return None
         finally:
             self._pending = None
 
-    def _judge(self, name: str, reply: Reply, latency: float) -> tuple[Reply, float]:
+    def _checked_reply(self, name: str, reply: Reply, latency: float) -> tuple[Reply, float]:
         if reply.kind is not ReplyKind.NACK:
             self.transactions.append(Transaction(name, "ok", latency))
             return reply, latency

@@ -1,6 +1,6 @@
-"""Attitudes as the bench compares them: quaternions (x, y, z, w) from ICRS into the sensor frame, in plain Python.
+"""Quaternions (x, y, z, w) from ICRS to the sensor frame, and attitude errors, in plain Python.
 
-The bench holds its own few lines of quaternion algebra so that the unit under test and its judge share no numerics.
+The bench has its own quaternion algebra, so that it shares no numerics with the unit under test.
 Conventions (roll, sensor axes, scalar last) are those of the interface definition's attitude rows.
 """
 
@@ -15,7 +15,10 @@ from starhil.hil_tests.errors import BenchError
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02
-"""How far a quaternion given as an attitude may be from unit length; four 1e-4 steps are well within."""
+"""How far a quaternion given as an attitude may be from unit length.
+
+Four 1e-4 steps are well within.
+"""
 
 
 class Quaternion(NamedTuple):
@@ -31,8 +34,8 @@ class Quaternion(NamedTuple):
 class AttitudeError:
     """How a measured attitude differs from the truth, in arcseconds, none of them negative.
 
-    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rest of the turn about the
-    boresight, `total_arcsec` the angle of the whole rotation.
+    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rest of the
+    turn about the boresight, `total_arcsec` the angle of the whole rotation.
     """
 
     cross_boresight_arcsec: float
@@ -58,16 +61,19 @@ def unit(values: Sequence[float]) -> Quaternion:
 
 
 def from_vector_part(x: float, y: float, z: float) -> Quaternion:
-    """Return the quaternion of which only the vector part is sent; its scalar is taken as not negative."""
+    """Return the quaternion of which only the vector part is sent.
+
+    Its scalar is taken as not negative.
+    """
     return unit((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
 
 
 def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:
     """Return the attitude with this boresight and roll.
 
-    Roll is the angle by which celestial north is turned counter-clockwise in the image from image up; rows of the
-    matrix are x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e, z = b, with n and e the unit vectors
-    to north and east at the boresight b.
+    Roll is the angle by which celestial north is turned counter-clockwise in the image from image
+    up; rows of the matrix are x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e, z =
+    b, with n and e the unit vectors to north and east at the boresight b.
     """
     ra, dec, roll = (math.radians(v) for v in (ra_deg, dec_deg, roll_deg))
     boresight = (math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec))
@@ -80,7 +86,10 @@ def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternio
 
 
 def _from_rows(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> Quaternion:
-    """Turn a rotation matrix, given by rows, into a quaternion; the largest part is computed first."""
+    """Turn a rotation matrix, given by rows, into a quaternion.
+
+    The largest part is computed first.
+    """
     trace = x[0] + y[1] + z[2]
     squares = (
         1.0 + x[0] - y[1] - z[2],

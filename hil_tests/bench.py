@@ -1,4 +1,4 @@
-"""A bench set up: the unit under test, the clients on its links, their logs, and the emulator if the bench started it."""
+"""The unit under test, with clients and logs on its links, and the emulator if there is one."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class LinkOptions:
     Attributes
     ----------
     serial, can : str or None
-        Port and channel; None where the link is not used. With an emulator that the bench started, `auto` takes what
-        its ready line says.
+        Port and channel; None where the link is not used. With an emulator that the bench started,
+        `auto` takes what its ready line says.
     """
 
     serial: str | None = None
@@ -42,9 +42,10 @@ class LinkOptions:
 
 
 class Bench:
-    """Clients on one unit; a context manager that opens them at need and closes all.
+    """Clients on one unit: a context manager that opens them on first use and closes them all.
 
-    Leaving it raises `EmulatorProcessError` if its emulator has ended by itself, or does not end as it should.
+    Leaving it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end
+    cleanly.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ class Bench:
         return self._log_of[link]
 
     def close_clients(self) -> None:
-        """Close all clients; the next use opens them anew."""
+        """Close all clients; the next use opens them again."""
         clients, self._clients = list(self._clients.values()), {}
         for client in clients:
             client.close()
@@ -139,7 +140,7 @@ class Bench:
         if self.emulator is None:
             raise BenchError("only an emulator that the bench started can be restarted: use --start")
         self.close_clients()
-        self._started = False  # one that cannot be restarted has been cleared away, and has been told of
+        self._started = False  # a failed restart has already cleaned up and raised its error
         self.emulator.restart(SIGNAL_NUMBERS[how])
         self._started = True
 
@@ -162,11 +163,14 @@ class Bench:
             self._end_emulator(kind)
 
     def _end_emulator(self, kind: type[BaseException] | None) -> None:
-        """End the emulator; one that has ended by itself is told of with its last words, also after what came of that."""
+        """End the emulator.
+
+        Report one that ended unexpectedly, also when that caused the error under way.
+        """
         if self.emulator is None or not self._started:
             return
-        came_of_it = kind is not None and issubclass(kind, BenchError | ProtocolError)
-        if kind is None or (came_of_it and not self.emulator.running):
+        caused_by_emulator = kind is not None and issubclass(kind, BenchError | ProtocolError)
+        if kind is None or (caused_by_emulator and not self.emulator.running):
             self.emulator.stop()
         else:
             self.emulator.kill()

@@ -1,7 +1,7 @@
 """A CAN bus under full load, measured from the OBC's side: nothing lost, replies right, how late.
 
-It talks to a device over its links only, so it measures a real unit as well as the emulator. The other traffic comes from
-a process of its own, which also counts what arrives of it.
+It talks to a device over its links only, so it measures a real unit as well as the emulator. The
+other traffic comes from a separate process, which also counts the frames that arrive.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Final
 
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import CanLoad, Spread
-from starhil.hil_tests.realtime import give_realtime
+from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.protocol.can_framing import (
     CanFrame,
     CanHostReceiver,
@@ -36,7 +36,7 @@ TALKER: Final = 0x20
 """CAN address of the other traffic's sender; it speaks to LISTENER, an address nobody has."""
 LISTENER: Final = 0x21
 ECHO: Final = 0x22
-"""CAN address at which the process of the other traffic answers at once: what the machine itself takes."""
+"""CAN address at which the traffic process echoes requests, for the latency of the machine."""
 
 ECHO_ROW: Final = 133
 """Telemetry identifier of the other traffic."""
@@ -51,7 +51,10 @@ ASKED: Final = (
 )
 """Telemetry that is asked for in turn."""
 PAUSE_S: Final = 0.004
-"""Mean pause between two requests; the moments are random, so that they meet every phase of a frame's processing."""
+"""Mean pause between two requests.
+
+The pauses are random, so that requests hit every phase of image processing.
+"""
 REPLY_WITHIN_S: Final = 2.0
 TICK_S: Final = 0.001
 """Time between two bunches of the other traffic."""
@@ -63,11 +66,11 @@ SETTLE_S: Final = 5.0
 
 
 def _talk(spec: str, rate: float, pipe: Connection) -> None:
-    """Send numbered frames at a rate until told to stop, count them at another port of the bus, and report."""
-    asyncio.run(_talk_until_told(spec, rate, pipe))
+    """Send numbered frames at a rate until stopped; report how many arrived at another port."""
+    asyncio.run(_talk_until_stopped(spec, rate, pipe))
 
 
-async def _talk_until_told(spec: str, rate: float, pipe: Connection) -> None:
+async def _talk_until_stopped(spec: str, rate: float, pipe: Connection) -> None:
     identifier = CanIdentifier(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
     ping = CanIdentifier(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
     pong = CanIdentifier(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
@@ -112,24 +115,27 @@ class OtherTraffic:
         self._process = mp.get_context("spawn").Process(target=_talk, args=(spec, rate, far), daemon=True)
         self._process.start()
         far.close()
-        self._hear()
+        self._receive_report()
         if realtime and self._process.pid is not None:
-            give_realtime(self._process.pid)
+            set_realtime_priority(self._process.pid)
         self._pipe.send("go")
 
     def stop(self) -> tuple[float, int, int, int, int]:
-        """End the traffic; return seconds, frames sent, lost, out of order, and refused by the port."""
+        """End the traffic.
+
+        Return seconds, frames sent, lost, out of order, and refused by the port.
+        """
         self._pipe.send("stop")
-        figures: tuple[float, int, int, int, int] = self._hear()
+        figures: tuple[float, int, int, int, int] = self._receive_report()
         self._process.join()
         return figures
 
-    def _hear(self) -> tuple[float, int, int, int, int]:
+    def _receive_report(self) -> tuple[float, int, int, int, int]:
         try:
             return self._pipe.recv()  # type: ignore[no-any-return]
         except EOFError:
             raise BenchError(
-                "bus load: the process of the other traffic ended; its reason stands above"
+                "bus load: the process of the other traffic ended; see its error above"
             ) from None
 
 
@@ -137,7 +143,7 @@ class OtherTraffic:
 
 
 class _CanAsker:
-    """Asks one node for telemetry over CAN, one request at a time, and judges the replies."""
+    """Requests telemetry over CAN, one row at a time, and measures the latency of the replies."""
 
     def __init__(self, node: int, send: Callable[[CanFrame], bool]) -> None:
         self._node = node
@@ -149,8 +155,8 @@ class _CanAsker:
         self.unanswered = 0
         self.faults = 0
 
-    def take(self, frame: CanFrame) -> None:
-        """Take a frame of the bus."""
+    def on_frame(self, frame: CanFrame) -> None:
+        """Process a frame from the bus."""
         for event in self._receiver.feed(frame, time.monotonic()):
             if isinstance(event, LinkFault):
                 self.faults += 1
@@ -196,7 +202,7 @@ async def load_can(
     seconds
         Duration.
     rate
-        Frames a second of the other traffic.
+        Frames per second of the other traffic.
     device
         CAN address of the device.
     realtime
@@ -207,8 +213,8 @@ async def load_can(
     asker, echo = _CanAsker(device, transport.send), _CanAsker(ECHO, transport.send)
 
     def take(frame: CanFrame) -> None:
-        asker.take(frame)
-        echo.take(frame)
+        asker.on_frame(frame)
+        echo.on_frame(frame)
 
     await transport.start(take)
     traffic = await asyncio.to_thread(OtherTraffic, spec, rate, realtime=realtime)

@@ -1,8 +1,9 @@
-"""An OBC that asks a star sensor by the names of the interface definition, as plain calls."""
+"""A synchronous OBC client, which uses the names of the interface definition."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -14,12 +15,12 @@ from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
     DEFAULT_HOST_ADDRESS,
-    CanLink,
+    CanHostLink,
     HostLink,
-    SerialLink,
+    SerialHostLink,
 )
 from starhil.hil_tests.loop_thread import LoopThread
-from starhil.hil_tests.readings import Ack, Reading, Transaction
+from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
@@ -30,7 +31,9 @@ T = TypeVar("T")
 
 
 class ObcClient:
-    """The same client as plain calls, for scripts, tests and the prompt; its event loop runs in a thread of its own.
+    """A synchronous OBC client for scripts, tests and the prompt.
+
+    Its event loop runs in a separate thread.
 
     Make one with `ObcClient.open(...)` and use it as a context manager::
 
@@ -41,7 +44,7 @@ class ObcClient:
 
     def __init__(
         self,
-        make_link: Callable[[], HostLink],
+        make_link: Callable[[], HostLink[Any]],
         icd: InterfaceDefinition | None = None,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
@@ -56,7 +59,10 @@ class ObcClient:
 
     @staticmethod
     async def _open(
-        make_link: Callable[[], HostLink], icd: InterfaceDefinition | None, timeout_s: float, retries: int
+        make_link: Callable[[], HostLink[Any]],
+        icd: InterfaceDefinition | None,
+        timeout_s: float,
+        retries: int,
     ) -> AsyncObcClient:
         core = AsyncObcClient(make_link(), icd, timeout_s=timeout_s, retries=retries)
         await core.start()
@@ -77,14 +83,14 @@ class ObcClient:
         retries: int = 0,
         log: WireLog | None = None,
     ) -> Self:
-        """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel, one of the two."""
+        """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel."""
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
 
-        def make_link() -> HostLink:
+        def make_link() -> HostLink[Any]:
             if serial is not None:
-                return SerialLink(serial, dialect=Dialect(dialect), baud=baud, log=log)
-            return CanLink(str(can), host_address=host_address, device_address=device_address, log=log)
+                return SerialHostLink(serial, dialect=Dialect(dialect), baud=baud, log=log)
+            return CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
 
         return cls(make_link, icd, timeout_s=timeout_s, retries=retries)
 
@@ -93,7 +99,7 @@ class ObcClient:
         return self._loop.run(coroutine)
 
     def close(self) -> None:
-        """Close the link and end the thread; a second call does nothing."""
+        """Close the link and end the thread; may be called twice."""
         if self._loop.alive:
             self.run(self.core.close())
             self._loop.close()
@@ -112,22 +118,22 @@ class ObcClient:
         return self.core.icd
 
     @property
-    def transactions(self) -> list[Transaction]:
-        """All requests so far, with outcome and latency."""
+    def transactions(self) -> deque[Transaction]:
+        """The newest requests, with outcome and latency."""
         return self.core.transactions
 
     @property
-    def faults(self) -> list[LinkFault]:
-        """Input that made no message."""
+    def faults(self) -> deque[LinkFault]:
+        """The newest input that formed no message."""
         return self.core.faults
 
     @property
-    def stray_replies(self) -> list[Reply]:
-        """Replies that answered no request."""
+    def stray_replies(self) -> deque[Reply]:
+        """The newest replies that answered no request."""
         return self.core.stray_replies
 
     def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
-        """Ask for a telemetry row."""
+        """Read a telemetry row."""
         return self.run(self.core.read(name, timeout_s=timeout_s, retries=retries))
 
     def telemetry(
@@ -146,20 +152,26 @@ class ObcClient:
         checked: bool = True,
         **fields: Value,
     ) -> Ack:
-        """Send a telecommand and wait for its acknowledge; `checked=False` sends values outside their limits too."""
+        """Send a telecommand and wait for its acknowledge.
+
+        `checked=False` sends values outside their limits too.
+        """
         return self.run(
             self.core.command(name, values, timeout_s=timeout_s, retries=retries, checked=checked, **fields)
         )
 
     def request(self, identifier: int, data: bytes = b"", *, timeout_s: float | None = None) -> Reply:
-        """Send a request by number with parameters as they stand; return the reply to it."""
+        """Send a request by row ID with raw parameters; return the reply."""
         request = Request.of(identifier, data)
         row = self.icd.row_by_id(identifier)
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
         return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
 
     def set_parameter(self, name: str, value: Value, *, checked: bool = True) -> Ack:
-        """Set a parameter by name, in its own unit; `checked=False` sends a value outside its limits too."""
+        """Set a parameter by name, in its own unit.
+
+        `checked=False` sends a value outside its limits too.
+        """
         return self.run(self.core.set_parameter(name, value, checked=checked))
 
     def get_parameter(self, name: str) -> Value:
@@ -175,11 +187,11 @@ class ObcClient:
     def wait_unsolicited(
         self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
     ) -> Reading:
-        """Return the next unsolicited telemetry of a row received after a time on `time.monotonic`."""
+        """Return the next unsolicited telemetry of a row; see `AsyncObcClient`."""
         return self.run(self.core.wait_unsolicited(name, timeout_s=timeout_s, since_s=since_s))
 
     def download_image(
         self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
     ) -> Image:
-        """Have an image taken and stored, and download it."""
+        """Capture and store an image, and download it."""
         return self.run(self.core.download_image(size, method=method, within_s=within_s))

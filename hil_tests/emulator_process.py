@@ -1,10 +1,11 @@
-"""The emulator as a process of its own: started, waited for until its ready line, ended, and its end checked."""
+"""The emulator as a process: start, ready line, end and exit status."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,16 +18,11 @@ from typing import IO, Final, Self
 
 from starhil.hil_tests.errors import EmulatorProcessError
 
-STARHIL: Final = "from starhil.emulator.cli.app import main; main()"
-"""What the command `starhil` does, for a Python whose script folder is not known."""
-_ENDS_WITH_PARENT: Final = (
-    "from starhil.emulator.parent_death_signal import end_with_parent; end_with_parent({}, {:d}); "
-)
 READY_WITHIN_S: Final = 300.0
-"""A first start on a machine compiles for minutes; a warm one takes about 3 s."""
+"""The first start on a machine compiles for minutes, later ones take about 3 s."""
 STOP_WITHIN_S: Final = 15.0
 SHOWN_LINES: Final = 5
-"""Lines of the emulator's own output that an error message carries."""
+"""Last lines of the emulator's stderr in an error message."""
 
 
 def emulator_command(
@@ -40,7 +36,7 @@ def emulator_command(
     truth_log: Path | None = None,
     extra: Sequence[str] = (),
 ) -> list[str]:
-    """Return the command line that starts the emulator with this very Python, to end with this process."""
+    """Return the command line of an emulator that ends with this process."""
     command = [*_starhil_command(), "run"]
     if profile is not None:
         command.append(profile)
@@ -57,40 +53,58 @@ def emulator_command(
 
 
 def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
-    """Return the command line that starts a CAN hub, at a free port by default, to end with this process."""
+    """Return the command line of a CAN hub that ends with this process; port 0 is a free one."""
     command = [*_starhil_command(), "hub", "--port", str(port)]
     return command if log is None else [*command, "--log", str(log)]
 
 
+def installed_command() -> str:
+    """Return the path of the command `starhil`: beside this Python, else on PATH.
+
+    Raises
+    ------
+    EmulatorProcessError
+        It is not installed.
+    """
+    beside_python = Path(sys.executable).with_name("starhil")
+    if os.access(beside_python, os.X_OK):
+        return str(beside_python)
+    found = shutil.which("starhil")
+    if found is None:
+        raise EmulatorProcessError(
+            f"the command starhil is neither beside {sys.executable} nor on PATH; install it with pip install starhil"
+        )
+    return found
+
+
 def _starhil_command() -> list[str]:
-    """Return the command `starhil` of this very Python, which the kernel ends by SIGTERM when this process has ended."""
-    code = _ENDS_WITH_PARENT.format(os.getpid(), signal.SIGTERM) + STARHIL
-    return [sys.executable, "-c", code]
+    """Return the start of a command line for a `starhil` that ends with this process."""
+    return [sys.executable, "-m", "starhil.hil_tests.end_with_parent", str(os.getpid()), installed_command()]
 
 
 def parse_ready_line(line: str) -> dict[str, str]:
-    """Return the words `key=value` of a ready line.
+    """Return the `key=value` fields of a ready line.
 
     Raises
     ------
     EmulatorProcessError
         Not a ready line.
     """
-    words = line.split()
-    if not words or words[0] != "ready":
+    fields = line.split()
+    if not fields or fields[0] != "ready":
         raise EmulatorProcessError(f"not a ready line: {line.strip()!r}")
-    return dict(word.split("=", 1) for word in words[1:] if "=" in word)
+    return dict(field.split("=", 1) for field in fields[1:] if "=" in field)
 
 
 class EmulatorProcess:
-    """A running emulator. One that `emulator_command` starts also ends with the thread that called `start`.
+    """A running emulator; it also ends with the thread that called `start`.
 
     Parameters
     ----------
     command : sequence of str
-        As `emulator_command` makes it.
+        Command line, from `emulator_command`.
     ready_within_s : float
-        How long the ready line may take.
+        Time-out of the ready line, s.
     environment : mapping, optional
         Additions to the environment.
 
@@ -122,7 +136,7 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It ended, or said nothing in time; carries its last words.
+            It ended, or was not ready in time; quotes its last lines of stderr.
         """
         begin = time.monotonic()
         self._lines = queue.Queue()
@@ -148,9 +162,7 @@ class EmulatorProcess:
             reader.start()
         try:
             self.ready = self._wait_for_ready(begin + self._ready_within_s)
-        except (
-            BaseException
-        ):  # an interruption too: the process has a session of its own and no signal reaches it
+        except BaseException:  # on interruption too: no signal reaches the process, which has its own session
             self.kill()
             raise
         return self
@@ -160,12 +172,12 @@ class EmulatorProcess:
             try:
                 line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                text = f"the emulator was not ready within {self._ready_within_s:g} s{self._last_words()}"
+                text = f"the emulator was not ready within {self._ready_within_s:g} s{self._last_errors()}"
                 raise EmulatorProcessError(text) from None
             if line is None:
                 status = self.process.wait()
                 raise EmulatorProcessError(
-                    f"the emulator ended with status {status} before it was ready{self._last_words()}"
+                    f"the emulator ended with status {status} before it was ready{self._last_errors()}"
                 )
             if line.startswith("ready"):
                 return parse_ready_line(line)
@@ -178,7 +190,7 @@ class EmulatorProcess:
     def _read_errors(self, stream: IO[str]) -> None:
         self.errors.extend(line.rstrip() for line in stream)
 
-    def _last_words(self) -> str:
+    def _last_errors(self) -> str:
         for reader in self._readers:
             reader.join(timeout=0.5)
         return ": " + " | ".join(self.errors[-SHOWN_LINES:]) if self.errors else ""
@@ -207,13 +219,13 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It had ended before, did not end, or ended with another status.
+            It ended before, does not end, or ends with another status.
         """
         process = self.process
         if process.poll() is not None:
             self.kill()
             raise EmulatorProcessError(
-                f"the emulator had ended by itself with status {process.returncode}{self._last_words()}"
+                f"the emulator ended unexpectedly with status {process.returncode}{self._last_errors()}"
             )
         process.terminate()
         try:
@@ -221,13 +233,13 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             self.kill()
             raise EmulatorProcessError(f"the emulator did not end within {STOP_WITHIN_S:g} s") from None
-        words = self._last_words()
+        errors = self._last_errors()
         self.kill()
         if status != 0:
-            raise EmulatorProcessError(f"the emulator ended with status {status}{words}")
+            raise EmulatorProcessError(f"the emulator ended with status {status}{errors}")
 
     def kill(self) -> None:
-        """End the process and its workers at once (SIGKILL), and gather what is left of them."""
+        """Kill the process and its workers (SIGKILL), and release the resources."""
         process = self.process
         with contextlib.suppress(ProcessLookupError):  # the whole group has ended
             os.killpg(process.pid, signal.SIGKILL)
@@ -247,7 +259,7 @@ class EmulatorProcess:
         self.start()
 
     def memory_bytes(self) -> int:
-        """Return the resident memory of the process and its workers, in bytes (shared pages counted in each)."""
+        """Return the resident memory of the process and its workers, bytes."""
         group = self.process.pid
         total = 0
         for folder in Path("/proc").iterdir():

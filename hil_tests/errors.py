@@ -1,4 +1,4 @@
-"""The errors of the bench: each is one line that says what, where and, if there is one, the remedy."""
+"""Errors of the bench: one line each, with what, where and the remedy."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from collections.abc import Iterable
 
 
 class BenchError(Exception):
-    """A script, port or device that the bench refuses; one line says what, where and the remedy."""
+    """A script, port or device that the bench cannot use.
+
+    One line with what, where and the remedy.
+    """
 
 
 class ScriptError(BenchError):
-    """A session script that cannot be run as it stands; names file, step and key."""
+    """An invalid session script; names file, step and key."""
 
 
 class DeviceError(BenchError):
-    """What went wrong between the OBC and a device that was asked something."""
+    """A failed transaction between OBC and device."""
 
 
 class NackError(DeviceError):
@@ -24,7 +27,7 @@ class NackError(DeviceError):
     Attributes
     ----------
     request : str
-        Name of the telecommand or telemetry row that was asked for.
+        Name of the telecommand or telemetry row.
     code : int
         The error code on the wire.
     code_name : str
@@ -50,7 +53,7 @@ class NoReplyError(DeviceError):
 
 
 class BadReplyError(DeviceError):
-    """A reply came that does not fit the request: wrong length, wrong identifier or no known value."""
+    """A reply that does not match the request: wrong length, wrong ID or unknown value."""
 
 
 class LinkLostError(DeviceError):
@@ -58,11 +61,11 @@ class LinkLostError(DeviceError):
 
 
 class EmulatorProcessError(BenchError):
-    """The emulator could not be started as a process, or did not end as it should."""
+    """The emulator process did not start, or did not end cleanly."""
 
 
 def near_matches(name: str, known: Iterable[str]) -> str:
-    """Return a clause such as `; did you mean 'quaternion'?`, empty if nothing known is near `name`."""
+    """Return a hint such as `; did you mean 'quaternion'?`, empty without a near match."""
     near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.55)
     if not near:
         return ""

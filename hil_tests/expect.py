@@ -1,4 +1,7 @@
-"""What a session script expects: equal, near, within bounds, one of some; an attitude against the truth."""
+"""What a session script expects: equal, near, within bounds, one of some.
+
+An attitude against the truth.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,13 @@ RELATIVE_ROUNDING: Final = 1e-6
 """Numbers given without a tolerance may differ by the rounding of a 32-bit float."""
 
 WHOLE_DIGITS: Final = 1e4
-"""Numbers from here on are shown with six decimals, as ten digits would cut the fraction of a Unix time off."""
+"""Numbers from here on are shown with six decimals, to keep the fraction of a Unix time."""
 
 CLOCK_VARIABLES: Final = ("now", "now_s", "now_ms")
-"""Variables that every script has: the OBC's Unix time in seconds; its whole seconds; its milliseconds."""
+"""Variables that every script has: the OBC's Unix time in seconds; its whole seconds.
+
+Its milliseconds.
+"""
 
 
 @dataclass(frozen=True)
@@ -169,7 +175,7 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
     """Read what a script says of one field: a plain value, or a table of conditions."""
     if not isinstance(value, dict):
         return Expectation(field, equals=operand(value, reader, field, known))
-    table = TableReader(value, f"{reader.place}: {field}")
+    table = TableReader(value, f"{reader.location}: {field}")
 
     def part(key: str) -> Operand | None:
         return operand(table.value(key), table, key, known) if table.has(key) else None
@@ -191,11 +197,11 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
         one_of=tuple(operand(item, table, "one_of", known) for item in one_of),
         differs_from=part("not"),
     )
-    table.finish()
+    table.reject_unknown_keys()
     if not value:
-        table.fail("says nothing: give value, min, max, above, one_of, not or angle_deg")
+        table.fail("is empty: give value, min, max, above, one_of, not or angle_deg")
     if equals is None and ("within" in value or "plus" in value):
-        table.fail("'within' and 'plus' need 'value' or 'angle_deg' beside them")
+        table.fail("'within' and 'plus' need 'value' or 'angle_deg' as well")
     return expectation
 
 
@@ -204,7 +210,9 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
 
 @dataclass(frozen=True)
 class AttitudeCheck:
-    """How far a measured attitude may be from the truth, in arcseconds; parts not given are not judged.
+    """How far a measured attitude may be from the truth, in arcseconds.
+
+    Parts not given are not judged.
 
     `truth` is the attitude that the step itself states, None to take the script's.
     """
@@ -217,7 +225,7 @@ class AttitudeCheck:
     def judge(
         self, values: Mapping[str, Value], truth: Quaternion
     ) -> tuple[AttitudeError | None, str | None]:
-        """Return the error of the attitude in telemetry `values`, and what is wrong, None if nothing is."""
+        """Return the attitude error of telemetry `values`, and the problem, None if it passed."""
         try:
             measured = measured_attitude(values)
         except BenchError as refusal:
@@ -267,14 +275,14 @@ def read_stated_attitude(reader: TableReader) -> Quaternion | None:
 
 
 def read_attitude_check(reader: TableReader) -> AttitudeCheck:
-    """Read the table `attitude` of a step: its tolerances and, if it has one, the attitude itself."""
+    """Read the table `attitude` of a step: tolerances and, optionally, the true attitude."""
     check = AttitudeCheck(
         reader.optional_number("within_arcsec", minimum=0.0),
         reader.optional_number("roll_within_arcsec", minimum=0.0),
         reader.optional_number("total_within_arcsec", minimum=0.0),
         read_stated_attitude(reader),
     )
-    reader.finish()
+    reader.reject_unknown_keys()
     limits = (check.cross_arcsec, check.roll_arcsec, check.total_arcsec)
     if all(limit is None or math.isinf(limit) for limit in limits):
         reader.fail("needs a tolerance: within_arcsec, roll_within_arcsec or total_within_arcsec")

@@ -1,4 +1,4 @@
-"""Image download as an OBC does it: frame by frame with checksums, or by bursts with hole maps."""
+"""Image download: frame by frame with checksums, or in bursts with hole maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
-from starhil.hil_tests.readings import Reading
+from starhil.hil_tests.transactions import Reading
 from starhil.protocol.image_transfer import (
     FRAME_SIZE,
     MAP_PARTS,
@@ -43,21 +43,21 @@ class Downloader(Protocol):
 
 
 FRAME_ATTEMPTS: Final = 3
-"""How often a frame with a wrong checksum is read before the download is given up."""
+"""How often a frame with a wrong checksum is read before the download fails."""
 POLL_S: Final = 0.04
-"""Time between two looks at a state, as public flight software polls."""
+"""Polling period, as in public flight software."""
 
 BMP_HEADER_SIZE: Final = 54
 """Bytes of a BMP file's two headers."""
 BURST_ROUNDS: Final = 20
-"""How often the missing packets of a block are asked for."""
+"""How often the missing packets of a block are requested."""
 BURST_SILENCE_S: Final = 0.5
 """Silence that ends a burst."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """A downloaded grey picture of 8 bits a pixel.
+    """A downloaded grey image of 8 bits per pixel.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Image:
     bytes_received : int
         Payload that crossed the link, repeats included.
     repeats : int
-        Frames or bursts that had to be asked for again.
+        Frames or bursts that were requested again.
     seconds : float
         Duration of the download, capture not included.
     """
@@ -80,7 +80,7 @@ class Image:
 
 
 async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
-    """Have an image taken and wait until it is stored."""
+    """Capture an image and wait until it is stored."""
     await client.command("save_image", {"camera": "star", "image_size": size})
     deadline = time.monotonic() + within_s
     while True:
@@ -97,12 +97,12 @@ async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
 
 
 async def download_by_frames(client: Downloader, size: str, *, within_s: float) -> Image:
-    """Save an image and download it in frames of 128 bytes (init, read, advance), each with its checksum.
+    """Save an image and download it in frames of 128 bytes, each with a checksum.
 
     Raises
     ------
     BadReplyError
-        A frame keeps a wrong number or checksum.
+        The number or checksum of a frame stays wrong.
     """
     edge = int(size.removeprefix("size_"))
     await save_image(client, size, within_s=within_s)
@@ -138,7 +138,7 @@ async def _read_frame(client: Downloader, number: int) -> tuple[bytes, int]:
 
 
 async def _when_not_busy(client: Downloader, name: str, within_s: float, values: Mapping[str, Value]) -> None:
-    """Send a telecommand, again while the device says busy."""
+    """Send a telecommand, again while the device reports busy."""
     deadline = time.monotonic() + within_s
     while True:
         try:
@@ -155,9 +155,9 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 
 
 async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
-    """Save an image and download its file by bursts: blocks of up to 1024 numbered packets, holes asked for again.
+    """Save an image and download its file in bursts of up to 1024 numbered packets.
 
-    The file's own header, loaded first, tells how long it is.
+    The header of the file, loaded first, holds its length.
     """
     await save_image(client, size, within_s=within_s)
     begin = time.monotonic()
@@ -173,7 +173,10 @@ async def download_by_bursts(client: Downloader, size: str, *, within_s: float) 
 
 
 async def _download_block(client: Downloader, offset: int, length: int, within_s: float) -> tuple[bytes, int]:
-    """Load one block of the file and gather its packets; return it and how often packets were asked for again."""
+    """Load one block of the file and gather its packets.
+
+    Return it and how often packets were requested again.
+    """
     await _when_not_busy(
         client,
         "load_file_block",
@@ -224,7 +227,7 @@ async def _gather(client: Downloader, packets: dict[int, bytes], count: int) -> 
 
 
 async def _send_hole_map(client: Downloader, packets: dict[int, bytes]) -> None:
-    """Tell the device which packets have arrived."""
+    """Send the device the map of the packets that have arrived."""
     holes = HoleMap(packets)
     for part in range(1, MAP_PARTS + 1):
         await client.command(f"set_hole_map_{part}", {"map": holes.part(part)})
@@ -239,12 +242,12 @@ def bmp_file_size(header: bytes) -> int:
         Not the header of a BMP file.
     """
     if len(header) < BMP_HEADER_SIZE or header[:2] != b"BM":
-        raise BadReplyError(f"the downloaded file is no BMP picture: it begins with {header[:8].hex(' ')}")
+        raise BadReplyError(f"the downloaded file is no BMP image: it begins with {header[:8].hex(' ')}")
     return int(struct.unpack_from("<I", header, 2)[0])
 
 
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
-    """Return pixels (row by row from the top), width and height of an uncompressed grey BMP file of 8 bits a pixel.
+    """Return pixels (row by row from the top), width and height of an 8-bit grey BMP file.
 
     Raises
     ------
@@ -252,14 +255,14 @@ def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
         Not such a file, or cut short.
     """
     if len(data) < BMP_HEADER_SIZE or data[:2] != b"BM":
-        raise BadReplyError(f"the downloaded file of {len(data)} bytes is no BMP picture")
+        raise BadReplyError(f"the downloaded file of {len(data)} bytes is no BMP image")
     (start,) = struct.unpack_from("<I", data, 10)
     width, signed_height, _planes, depth, compression = struct.unpack_from("<iiHHI", data, 18)
     height = abs(signed_height)
     stride = (width + 3) // 4 * 4
     if depth != 8 or compression != 0 or width < 1 or height < 1 or len(data) < start + stride * height:
         raise BadReplyError(
-            f"the downloaded BMP picture ({width}x{height}, {depth} bits) is cut short or not 8-bit grey"
+            f"the downloaded BMP image ({width}x{height}, {depth} bits) is cut short or not 8-bit grey"
         )
     rows = [data[start + row * stride : start + row * stride + width] for row in range(height)]
     if signed_height > 0:

@@ -1,4 +1,4 @@
-"""Signals that ask a run to end, as an exception that unwinds it: what it started is ended, what it found is kept."""
+"""Termination signals as an exception, so that a run cleans up and keeps its results."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked this process to end.
+    """A termination signal has arrived.
 
     Attributes
     ----------
     reason
         `interrupted by SIGTERM`.
     exit_status
-        As shells report it: 128 and the number of the signal.
+        128 plus the number of the signal, as in a shell.
     """
 
     def __init__(self, number: int) -> None:
@@ -31,9 +31,12 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `Interrupted` in the main thread at the first SIGINT, SIGTERM or SIGHUP; ignore those that follow.
+    """Raise `Interrupted` in the main thread at the first SIGINT, SIGTERM or SIGHUP.
 
-    A signal that is ignored already (`nohup`) stays so. In another thread, which no signal reaches, nothing changes.
+    Ignore those that follow.
+
+    A signal that is ignored already (`nohup`) stays so. In another thread, which no signal reaches,
+    nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""How regularly periodic messages come over CAN, measured from the OBC's side: unsolicited telemetry, heartbeat, TPDOs, SYNC."""
+"""Jitter of periodic CAN messages at the OBC: unsolicited telemetry, heartbeat, TPDO, SYNC."""
 
 from __future__ import annotations
 
@@ -41,18 +41,21 @@ SETTLE_S: Final = 0.2
 
 
 class _Arrivals:
-    """Times at which frames of interest came."""
+    """Arrival times of the frames of interest."""
 
     def __init__(self, wanted: Callable[[CanFrame], bool]) -> None:
         self._wanted = wanted
         self.times: list[float] = []
 
-    def take(self, frame: CanFrame) -> None:
+    def on_frame(self, frame: CanFrame) -> None:
         if self._wanted(frame):
             self.times.append(time.perf_counter())
 
     def jitter(self, what: str, end: float = inf) -> Jitter:
-        """Sum up the intervals of what came before `end`. Raises BenchError if there are too few."""
+        """Sum up the intervals of what came before `end`.
+
+        Raises BenchError if there are too few.
+        """
         times = [moment for moment in self.times[WARM_UP:] if moment < end]
         if len(times) < 3:
             raise BenchError(f"jitter of {what}: only {len(self.times)} messages came; is it switched on?")
@@ -63,7 +66,7 @@ class _Arrivals:
 
 
 async def unsolicited_jitter(spec: str, seconds: float, rate_hz: float, *, device: int) -> Jitter:
-    """Have a device send its clock unasked at a rate, and measure the intervals."""
+    """Let a device send its clock unsolicited at a rate, and measure the intervals."""
     icd = load_icd()
     row = icd.telemetry["unix_time"]
     receiver = CanHostReceiver(HOST, device)
@@ -73,7 +76,7 @@ async def unsolicited_jitter(spec: str, seconds: float, rate_hz: float, *, devic
     def take(frame: CanFrame) -> None:
         for event in receiver.feed(frame, time.monotonic()):
             if isinstance(event, Reply) and event.kind is ReplyKind.UNSOLICITED and event.id == row.id:
-                arrivals.take(frame)
+                arrivals.on_frame(frame)
             elif isinstance(event, Reply):
                 answers.put_nowait(event)
 
@@ -115,25 +118,31 @@ async def _command(
 
 
 class _Node:
-    """Just enough of a CANopen master to set a node up."""
+    """A minimal CANopen master that configures a node."""
 
     def __init__(self, transport: CanTransport, node: int) -> None:
         self._transport = transport
         self._node = node
         self._answer: asyncio.Future[bytes] | None = None
 
-    def take(self, frame: CanFrame) -> None:
-        """Take a frame of the bus."""
+    def on_frame(self, frame: CanFrame) -> None:
+        """Process a frame from the bus."""
         waiting = self._answer is not None and not self._answer.done()
         if frame.id == SDO_REPLY + self._node and not frame.extended and waiting and self._answer is not None:
             self._answer.set_result(frame.data)
 
     async def write(self, index: int, subindex: int, value: int, size: int) -> None:
-        """Write an entry of up to four bytes. Raises BenchError if the node refuses or does not answer."""
+        """Write an entry of up to four bytes.
+
+        Raises BenchError if the node refuses or does not answer.
+        """
         await self._transfer(0x23 | (4 - size) << 2, index, subindex, value)
 
     async def read(self, index: int, subindex: int) -> int:
-        """Read an entry of up to four bytes. Raises BenchError if the node refuses or does not answer."""
+        """Read an entry of up to four bytes.
+
+        Raises BenchError if the node refuses or does not answer.
+        """
         return await self._transfer(0x40, index, subindex, 0)
 
     async def _transfer(self, command: int, index: int, subindex: int, value: int) -> int:
@@ -177,7 +186,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
 
     def receive(frame: CanFrame) -> None:
         take(frame)
-        master.take(frame)
+        master.on_frame(frame)
 
     await transport.start(receive)
     try:
@@ -192,7 +201,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
 async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
     """Set a node's heartbeat period and measure the intervals."""
     arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
-    async with _joined(spec, node, arrivals.take) as master:
+    async with _joined(spec, node, arrivals.on_frame) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
         arrivals.times.clear()
         await asyncio.sleep(seconds)
@@ -204,7 +213,7 @@ async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node:
     """Have a node send its first TPDO by the event timer, and measure the intervals."""
     pdo = -1
     arrivals = _Arrivals(lambda frame: frame.id == pdo and not frame.extended)
-    async with _joined(spec, node, arrivals.take) as master:
+    async with _joined(spec, node, arrivals.on_frame) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, 0, 2)
         pdo = await master.prepare_tpdo(EVENT_DRIVEN, period_ms)
         await asyncio.sleep(SETTLE_S)
@@ -217,7 +226,8 @@ async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node:
 async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> Jitter:
     """Make a node's first TPDO synchronous, send SYNC, and measure how long the PDO takes.
 
-    `deviation` holds the delays themselves, `period_ms` their mean. Raises BenchError if a SYNC stays without a PDO.
+    `deviation` holds the delays themselves, `period_ms` their mean. Raises BenchError if a SYNC
+    stays without a PDO.
     """
     delays: list[float] = []
     sent_at: float | None = None

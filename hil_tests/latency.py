@@ -1,8 +1,8 @@
-"""How fast the links answer while frames are made and solved, measured from the other end of the wire.
+"""Latency of the links while images are rendered and solved, measured from the OBC's side.
 
-An emulator runs as a process of its own; requests for telemetry are sent over its pty and over its CAN hub, one at a time, at
-random moments. Between them the same bytes go to a process that does nothing but send them back over a pty: its
-latency is the machine's own, and what the emulator's is to be seen against.
+An emulator process is asked for telemetry over its pty and over a CAN hub, one request at a time,
+after random pauses. In between, the same bytes go to a process that only echoes them over a pty:
+its latency is that of the machine, with which the emulator's latency is compared.
 """
 
 from __future__ import annotations
@@ -15,35 +15,32 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
-from starhil.emulator.errors import EmulatorError
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanFrame, encode_request_frames
 from starhil.protocol.icd import load_icd
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_framing import encode_request
 
 ROWS: Final = ("identification", "quaternion", "precise_attitude", "star_tracker", "unix_time")
-"""Telemetry that is asked for in turn."""
+"""Telemetry rows, requested in turn."""
 
 PAUSE_S: Final = 0.004
 """Mean pause between two requests, seconds."""
 
 REPLY_WITHIN_S: Final = 1.0
-READY_WITHIN_S: Final = 180.0
 BAUD: Final = 921_600
-"""High, so that the time of the bytes on the line (1 ms for the longest reply) does not hide the device's."""
+"""High, so that the transmission time (1 ms for the longest reply) is short against the latency."""
 
 ECHO: Final = (
     "import os,sys\nf=int(sys.argv[1])\ntry:\n while d:=os.read(f,4096): os.write(f,d)\nexcept OSError: pass"
 )
-"""Program of the process that sends everything back."""
-
-STARHIL: Final = "from starhil.emulator.cli import main; main()"
+"""Program of the process that echoes all bytes."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +59,15 @@ class LatencyRow:
 
 @dataclass(frozen=True)
 class ProcessRow:
-    """The emulator as a process: time to its ready line, resident memory of both its processes, frames left late."""
+    """Start-up time and resident memory of the emulator with its worker."""
 
     worker: str
     ready_s: float
     memory_mb: float
 
 
-class SerialProbe:
-    """A serial OBC as bare as can be."""
+class SerialRequester:
+    """A minimal OBC on a serial line."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -85,7 +82,10 @@ class SerialProbe:
         self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
-        """Ask for a row; return the time to the last byte of the reply in seconds, or None if none came."""
+        """Request a row.
+
+        Return the time until the last byte of the reply, s, or None without a reply.
+        """
         row = load_icd().telemetry[name]
         begin = time.perf_counter()
         os.write(self._fd, encode_request(Request.of(row.id)))
@@ -97,43 +97,46 @@ class SerialProbe:
         return time.perf_counter() - begin
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         os.close(self._fd)
 
 
-class HubProbe:
-    """A CAN OBC on the TCP hub as bare as can be."""
+class HubRequester:
+    """A minimal OBC on the TCP hub for CAN."""
 
     def __init__(self, spec: str) -> None:
         host, port, bus = spec.removeprefix("socketcand:").replace("/", ":").split(":")
         self._socket = socket.create_connection((host, int(port)), REPLY_WITHIN_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._buffer = b""
-        self._until(b"< hi >")
+        self._receive_until(b"< hi >")
         self._socket.sendall(f"< open {bus} >".encode())
-        self._until(b"< ok >")
+        self._receive_until(b"< ok >")
         self._socket.sendall(b"< rawmode >")
-        self._until(b"< ok >")
+        self._receive_until(b"< ok >")
 
     def ask(self, name: str) -> float | None:
-        """Ask for a row; return the time to the last frame of the reply in seconds, or None if none came."""
+        """Request a row.
+
+        Return the time until the last frame of the reply, s, or None without a reply.
+        """
         row = load_icd().telemetry[name]
-        frames = 1 if row.size <= 8 else -(-row.size // 7)  # a frame carries 8 bytes, a segment 7
+        frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
         for frame in encode_request_frames(Request.of(row.id), 1, 4):
             self._socket.sendall(_socketcand(frame))
         try:
             for _ in range(frames):
-                self._until(b" >")
+                self._receive_until(b" >")
         except TimeoutError:
             return None
         return time.perf_counter() - begin
 
-    def _until(self, end: bytes) -> None:
+    def _receive_until(self, end: bytes) -> None:
         while end not in self._buffer:
             data = self._socket.recv(4096)
             if not data:
-                raise EmulatorError("CAN hub: closed the connection; is the emulator still running?")
+                raise BenchError("CAN hub: closed the connection; is the emulator still running?")
             self._buffer += data
         self._buffer = self._buffer.partition(end)[2]
 
@@ -142,8 +145,8 @@ class HubProbe:
         self._socket.close()
 
 
-class EchoProbe:
-    """A process that sends back what it gets over a pty: what the machine itself takes."""
+class EchoRequester:
+    """A process that echoes requests over a pty, for the latency of the machine."""
 
     def __init__(self) -> None:
         self._fd, other = os.openpty()
@@ -154,7 +157,7 @@ class EchoProbe:
         self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
-        """Send as many bytes as a request for a row has; return the time until they are back, or None."""
+        """Send the bytes of a request; return the time until their echo, s, or None without one."""
         request = encode_request(Request.of(load_icd().telemetry[name].id))
         begin = time.perf_counter()
         os.write(self._fd, request)
@@ -170,46 +173,6 @@ class EchoProbe:
         self._process.wait()
 
 
-@contextmanager
-def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, str], float]]:
-    """Start `starhil` with arguments; give process, words of its ready line, and seconds that it took.
-
-    Raises
-    ------
-    EmulatorError
-        It did not become ready.
-    """
-    begin = time.perf_counter()
-    command = [sys.executable, "-c", STARHIL, *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603
-    try:
-        if process.stdout is None or not select.select([process.stdout], [], [], READY_WITHIN_S)[0]:
-            raise EmulatorError(f"starhil {arguments[0]}: not ready within {READY_WITHIN_S:g} s")
-        line = process.stdout.readline()
-        if not line.startswith("ready "):
-            raise EmulatorError(
-                f"starhil {arguments[0]}: did not start: {line.strip() or 'its reason stands above'}"
-            )
-        ready = dict(word.split("=", 1) for word in line.split()[1:])
-        yield process, ready, time.perf_counter() - begin
-    finally:
-        process.terminate()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
-
-
-def resident_mb(pid: int) -> float:
-    """Resident memory of a process and its children, megabytes."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
-    total = 0.0
-    for each in (str(pid), *children):
-        for line in Path(f"/proc/{each}/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmRSS:"):
-                total += int(line.split()[1]) / 1024.0
-    return total
-
-
 def measure(
     rates_hz: list[float], seconds: float, worker: str, report: Callable[[str], None] = lambda _text: None
 ) -> tuple[list[LatencyRow], ProcessRow]:
@@ -218,29 +181,34 @@ def measure(
     Parameters
     ----------
     rates_hz
-        Update rates at which frames are solved; 0 stands for standby.
+        Update rates, Hz; 0 is standby.
     seconds
         Time for each rate.
     worker
         `process` or `thread`.
     report
-        Told what is being done.
+        Called with the progress.
     """
     from starhil.hil_tests.client import ObcClient
 
     rows: list[LatencyRow] = []
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
     with ExitStack() as stack:
-        _, hub_ready, _ = stack.enter_context(running("hub", "--port", "0"))  # a bus of its own
-        process, ready, ready_s = stack.enter_context(
-            running(
-                *("run", "demo", "--serial", "auto", "--can", hub_ready["can"]),
-                *("--set", f"run.worker={worker}", "--set", f"links.serial.baud={BAUD}"),
+        hub_process = stack.enter_context(EmulatorProcess(hub_command()))
+        begin = time.perf_counter()
+        emulator = stack.enter_context(
+            EmulatorProcess(
+                emulator_command(
+                    profile="demo",
+                    can=hub_process.ready["can"],
+                    settings=[f"run.worker={worker}", f"links.serial.baud={BAUD}"],
+                )
             )
         )
+        ready, ready_s = emulator.ready, time.perf_counter() - begin
         with ObcClient.open(serial=ready["serial"], dialect="b", baud=BAUD) as client:
             client.command("set_mode", mode="standby")
-        serial, hub, echo = SerialProbe(ready["serial"]), HubProbe(ready["can"]), EchoProbe()
+        serial, hub, echo = SerialRequester(ready["serial"]), HubRequester(ready["can"]), EchoRequester()
         for probe in (serial, hub, echo):
             stack.callback(probe.close)
         probes = {"serial": serial.ask, "can": hub.ask, "echo": echo.ask}
@@ -253,7 +221,7 @@ def measure(
                 client.command("set_mode", mode="lost_in_space" if rate > 0.0 else "standby")
             serial.open()
             rows += _measure_links(probes, worker, rate, seconds, rng)
-        memory_mb = resident_mb(process.pid)
+        memory_mb = emulator.memory_bytes() / 2**20
     return rows, ProcessRow(worker, ready_s, memory_mb)
 
 

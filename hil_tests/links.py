@@ -1,11 +1,11 @@
-"""The OBC's end of a link: a transport and the host side of its framing behind one small interface."""
+"""The OBC's end of a link: a transport and the host side of its framing."""
 
 from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Generic, Protocol, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.wire_log import WireLog
@@ -13,26 +13,48 @@ from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reque
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
-from starhil.protocol.transports import open_can, open_serial
+from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
-"""CAN address of the OBC, as public flight software has it."""
+"""CAN address of the OBC in public flight software."""
 DEFAULT_DEVICE_ADDRESS: Final = 4
-"""CAN address of the device, as public flight software has it."""
+"""CAN address of the device in public flight software."""
 DEFAULT_BAUD: Final = 115200
 FLUSH_PERIOD_S: Final = 0.05
-"""How often a receiver is asked whether half a message has timed out."""
+"""Period at which a receiver is polled for an incomplete message that has timed out."""
+
+Item = TypeVar("Item", bytes, CanFrame)
+Item_contra = TypeVar("Item_contra", bytes, CanFrame, contravariant=True)
 
 
-class HostLink(ABC):
-    """Sends requests and hands over replies, faults and raw items as they come.
+class Receiver(Protocol[Item_contra]):
+    """The host side of a framing: items in, replies and faults out."""
+
+    def feed(self, item: Item_contra, now: float, /) -> list[Reply | LinkFault]:
+        """Decode an item received at a time in seconds."""
+
+    def flush(self, now: float) -> list[LinkFault]:
+        """Drop an incomplete message that has timed out."""
+
+
+class HostLink(ABC, Generic[Item]):
+    """Sends requests, and passes on replies, faults and raw items as they arrive.
+
+    Parameters
+    ----------
+    transport : Transport
+        Port or bus.
+    description : str
+        What the link is connected to, for error messages.
+    log : WireLog, optional
+        Log of all items.
 
     Attributes
     ----------
     on_reply : callable
         Called with each reply, unsolicited ones included.
     on_fault : callable
-        Called with each piece of input that made no message.
+        Called for input that forms no message.
     on_raw : callable or None
         Called with each item before it is decoded: bytes on serial, frames on CAN.
     """
@@ -40,77 +62,84 @@ class HostLink(ABC):
     name: str
     """`serial` or `can`."""
 
-    def __init__(self, log: WireLog | None) -> None:
+    def __init__(self, transport: Transport[Item], description: str, log: WireLog | None) -> None:
         self.on_reply: Callable[[Reply], None] = lambda _reply: None
         self.on_fault: Callable[[LinkFault], None] = lambda _fault: None
         self.on_raw: Callable[[bytes | CanFrame], None] | None = None
-        self.log = log
+        self.description = description
+        self._log = log
+        self._transport: Transport[Item] = transport
         self._lost: ProtocolError | None = None
         self._flusher: asyncio.Task[None] | None = None
 
+    @property
     @abstractmethod
-    async def start(self) -> None:
-        """Open the port or bus."""
-
-    @abstractmethod
-    async def close(self) -> None:
-        """Close the port or bus."""
+    def _receiver(self) -> Receiver[Item]:
+        """Decoder of the replies."""
 
     @abstractmethod
     def request(self, request: Request, reply_size: int) -> None:
         """Send a request whose telemetry has `reply_size` bytes (0 for a telecommand)."""
 
     @abstractmethod
-    def forget(self) -> None:
-        """Drop what has come in of a reply that is no longer waited for."""
+    def reset_receiver(self) -> None:
+        """Discard the beginning of a reply that is no longer awaited."""
 
-    @abstractmethod
-    def _flush(self, now: float) -> list[LinkFault]:
-        """Give up half a message that has timed out."""
+    async def start(self) -> None:
+        """Open the port or join the bus."""
+        await self._transport.start(self._on_receive, self._on_transport_error)
+        self._flusher = asyncio.get_running_loop().create_task(self._flush_periodically())
 
-    @property
-    @abstractmethod
-    def description(self) -> str:
-        """What the link is connected to."""
+    async def close(self) -> None:
+        """Close the port or leave the bus."""
+        if self._flusher is not None:
+            self._flusher.cancel()
+            await asyncio.gather(self._flusher, return_exceptions=True)
+            self._flusher = None
+        await self._transport.close()
+
+    def send(self, item: Item) -> None:
+        """Send bytes or a frame unchanged.
+
+        Raises
+        ------
+        LinkLostError
+            The port or bus accepts nothing.
+        """
+        if self._log is not None:
+            self._log.sent(item)
+        if not self._transport.send(item):
+            raise LinkLostError(f"{self.description}: accepts no data")
 
     def check(self) -> None:
         """Raise LinkLostError if the port or bus is gone."""
         if self._lost is not None:
             raise LinkLostError(f"{self.description}: {self._lost}")
 
-    def lost(self, error: ProtocolError) -> None:
-        """Note that the transport has failed."""
+    def _on_transport_error(self, error: ProtocolError) -> None:
         self._lost = error
 
-    def found(self) -> None:
-        """Note that the transport works (again)."""
+    def _on_receive(self, item: Item) -> None:
         self._lost = None
-
-    def _hand_over(self, events: list[Reply | LinkFault]) -> None:
-        for event in events:
+        if self._log is not None:
+            self._log.received(item)
+        if self.on_raw is not None:
+            self.on_raw(item)
+        for event in self._receiver.feed(item, asyncio.get_running_loop().time()):
             if isinstance(event, LinkFault):
                 self.on_fault(event)
             else:
                 self.on_reply(event)
 
-    def _start_flusher(self) -> None:
-        self._flusher = asyncio.get_running_loop().create_task(self._flush_for_ever())
-
-    async def _stop_flusher(self) -> None:
-        if self._flusher is not None:
-            self._flusher.cancel()
-            await asyncio.gather(self._flusher, return_exceptions=True)
-            self._flusher = None
-
-    async def _flush_for_ever(self) -> None:
+    async def _flush_periodically(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(FLUSH_PERIOD_S)
-            for fault in self._flush(loop.time()):
+            for fault in self._receiver.flush(loop.time()):
                 self.on_fault(fault)
 
 
-class SerialLink(HostLink):
+class SerialHostLink(HostLink[bytes]):
     """A serial line in one of the three reply dialects.
 
     Parameters
@@ -122,7 +151,7 @@ class SerialLink(HostLink):
     baud : int
         Bit rate of a real line.
     log : WireLog, optional
-        Where every byte is logged.
+        Log of every byte.
     """
 
     name = "serial"
@@ -135,66 +164,35 @@ class SerialLink(HostLink):
         baud: int = DEFAULT_BAUD,
         log: WireLog | None = None,
     ) -> None:
-        super().__init__(log)
-        self._spec = spec
+        super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
         self._dialect = dialect
-        self._receiver = HostReceiver(dialect)
-        self._transport = open_serial(spec, baud=baud, paced=False)
+        self._host_receiver = HostReceiver(dialect)
 
     @property
-    def description(self) -> str:
-        """The port."""
-        return f"serial {self._spec}"
-
-    async def start(self) -> None:
-        """Open the port."""
-        await self._transport.start(self._received, self.lost)
-        self._start_flusher()
-
-    async def close(self) -> None:
-        """Close the port."""
-        await self._stop_flusher()
-        await self._transport.close()
+    def _receiver(self) -> HostReceiver:
+        return self._host_receiver
 
     def request(self, request: Request, reply_size: int) -> None:
         """Frame and send a request."""
-        self._receiver.expect(request, reply_size)
+        self._host_receiver.expect(request, reply_size)
         self.send(encode_request(request))
 
-    def send(self, data: bytes) -> None:
-        """Send bytes as they stand."""
-        if self.log is not None:
-            self.log.sent(data)
-        if not self._transport.send(data):
-            raise LinkLostError(f"{self.description}: the port does not take bytes")
-
-    def forget(self) -> None:
-        """Start with an empty receiver."""
-        self._receiver = HostReceiver(self._dialect)
-
-    def _received(self, data: bytes) -> None:
-        self.found()
-        if self.log is not None:
-            self.log.received(data)
-        if self.on_raw is not None:
-            self.on_raw(data)
-        self._hand_over(self._receiver.feed(data, asyncio.get_running_loop().time()))
-
-    def _flush(self, now: float) -> list[LinkFault]:
-        return self._receiver.flush(now)
+    def reset_receiver(self) -> None:
+        """Discard the beginning of a reply."""
+        self._host_receiver = HostReceiver(self._dialect)
 
 
-class CanLink(HostLink):
-    """A CAN bus with the CubeSpace identifier layout.
+class CanHostLink(HostLink[CanFrame]):
+    """A CAN bus with the CubeSpace layout of CAN IDs.
 
     Parameters
     ----------
     spec : str
-        A channel as `open_can` takes it, such as `vcan0` or `socketcand:127.0.0.1:29536/vcan0`.
+        A channel for `open_can`, such as `vcan0` or `socketcand:127.0.0.1:29536/vcan0`.
     host_address, device_address : int
         CAN addresses of this OBC and of the device.
     log : WireLog, optional
-        Where every frame is logged.
+        Log of every frame.
     """
 
     name = "can"
@@ -207,51 +205,20 @@ class CanLink(HostLink):
         device_address: int = DEFAULT_DEVICE_ADDRESS,
         log: WireLog | None = None,
     ) -> None:
-        super().__init__(log)
-        self._spec = spec
+        super().__init__(open_can(spec), f"CAN {spec}", log)
         self.host_address = host_address
         self.device_address = device_address
-        self._receiver = CanHostReceiver(host_address, device_address)
-        self._transport = open_can(spec)
+        self._host_receiver = CanHostReceiver(host_address, device_address)
 
     @property
-    def description(self) -> str:
-        """The channel."""
-        return f"CAN {self._spec}"
+    def _receiver(self) -> CanHostReceiver:
+        return self._host_receiver
 
-    async def start(self) -> None:
-        """Join the bus."""
-        await self._transport.start(self._received, self.lost)
-        self._start_flusher()
-
-    async def close(self) -> None:
-        """Leave the bus."""
-        await self._stop_flusher()
-        await self._transport.close()
-
-    def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- CAN replies tell their kind
+    def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- CAN replies name their type
         """Send a request as frames."""
         for frame in encode_request_frames(request, self.host_address, self.device_address):
             self.send(frame)
 
-    def send(self, frame: CanFrame) -> None:
-        """Send a frame as it stands."""
-        if self.log is not None:
-            self.log.sent(frame)
-        if not self._transport.send(frame):
-            raise LinkLostError(f"{self.description}: the bus does not take frames")
-
-    def forget(self) -> None:
-        """Start with an empty receiver."""
-        self._receiver = CanHostReceiver(self.host_address, self.device_address)
-
-    def _received(self, frame: CanFrame) -> None:
-        self.found()
-        if self.log is not None:
-            self.log.received(frame)
-        if self.on_raw is not None:
-            self.on_raw(frame)
-        self._hand_over(self._receiver.feed(frame, asyncio.get_running_loop().time()))
-
-    def _flush(self, now: float) -> list[LinkFault]:
-        return self._receiver.flush(now)
+    def reset_receiver(self) -> None:
+        """Discard the segments of an incomplete reply."""
+        self._host_receiver = CanHostReceiver(self.host_address, self.device_address)

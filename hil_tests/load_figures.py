@@ -1,4 +1,4 @@
-"""Figures of a link under load, and whether they are good."""
+"""Figures of a link under load."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Spread:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Spread:
-        """Sum up durations given in seconds; NaN where there are none."""
+        """Summarise durations in seconds; NaN if there are none."""
         if not seconds:
             return cls(float("nan"), float("nan"), float("nan"))
         ordered = sorted(1e3 * value for value in seconds)
-        places = (min(int(share * len(ordered)), len(ordered) - 1) for share in (0.5, 0.99))
-        p50, p99 = (ordered[place] for place in places)
+        ranks = (min(int(share * len(ordered)), len(ordered) - 1) for share in (0.5, 0.99))
+        p50, p99 = (ordered[rank] for rank in ranks)
         return cls(round(p50, 3), round(p99, 3), round(ordered[-1], 3))
 
 
@@ -31,7 +31,7 @@ class CanLoad:
 
     seconds: float
     offered_per_s: float
-    """Frames a second of the other traffic, as sent."""
+    """Frames per second of the other traffic, as sent."""
     sent: int
     lost: int
     """Frames of the other traffic that did not arrive."""
@@ -39,10 +39,10 @@ class CanLoad:
     requests: int
     unanswered: int
     wrong: int
-    """Replies that were refusals, had a wrong length or a value outside its limits, and faults of the framing."""
+    """Refusals, replies with a wrong length or value, and framing faults."""
     latency: Spread
     machine: Spread
-    """Latency of a process on the same bus that does nothing but answer: what the machine itself takes."""
+    """Latency of an echo process on the same bus, which is that of the machine."""
 
     @property
     def good(self) -> bool:
@@ -63,7 +63,7 @@ class SerialLoad:
     received_share: float
     exchanges: int
     wrong: int
-    """Replies out of turn, refusals, wrong bytes, faults of the framing, and error flags that the device reports."""
+    """Wrong replies, framing faults, and error flags that the device reports."""
 
     @property
     def good(self) -> bool:
@@ -73,7 +73,7 @@ class SerialLoad:
 
 @dataclass(frozen=True)
 class Jitter:
-    """How regularly a periodic message comes."""
+    """Regularity of a periodic message."""
 
     what: str
     period_ms: float

@@ -1,4 +1,4 @@
-"""An event loop in a thread of its own, for plain calls into asyncio code."""
+"""An event loop in a separate thread, for synchronous calls into asyncio code."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class LoopThread:
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """End loop and thread; a second call does nothing."""
+        """End the loop and the thread; may be called twice."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()

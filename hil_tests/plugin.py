@@ -6,9 +6,10 @@ In a test::
         starhil_serial.command("set_mode", mode="lost_in_space")
         starhil_serial.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20)
 
-Without options the emulator is started as a process of its own, once a module, and ended in good order. With
-`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is connected there. An answer may
-take `--starhil-timeout` seconds; a test that measures answers in time gives `timeout_s` with the call.
+Without options an emulator process is started once per module and ended after it. With
+`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is
+connected there. The time-out of a reply is `--starhil-timeout` seconds; a test that needs another
+passes `timeout_s`.
 
 pytest loads this module in every run, so it imports the bench only when a fixture is used.
 """
@@ -29,17 +30,17 @@ if TYPE_CHECKING:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options that name a unit or the emulator's profile."""
     group = parser.getgroup("starhil", "star sensor under test")
-    group.addoption("--starhil-serial", metavar="DEV", help="serial port of a unit, in place of an emulator")
-    group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, in place of an emulator")
+    group.addoption("--starhil-serial", metavar="DEV", help="serial port of a unit, instead of an emulator")
+    group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, instead of an emulator")
     group.addoption(
         "--starhil-dialect", default="b", metavar="a|b|c", help="form of serial replies (default b)"
     )
-    group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator that is started")
+    group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator")
     group.addoption(
         "--starhil-seed", default=1, type=int, metavar="N", help="seed of the emulator (default 1)"
     )
     group.addoption(
-        "--starhil-timeout", default=10.0, type=float, metavar="S", help="time for an answer (default 10 s)"
+        "--starhil-timeout", default=10.0, type=float, metavar="S", help="time-out of a reply (default 10 s)"
     )
 
 
@@ -47,16 +48,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def starhil_emulator(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[EmulatorProcess]:
-    """Return an emulator that runs as a process on a pty and on a CAN bus (vcan0, else a hub of its own).
+    """Start an emulator on a pty and on a CAN bus (vcan0, else a private hub).
 
-    `.ready` holds its ready line. It is ended by SIGTERM after the module's last test; another end than status 0 is
-    an error.
+    `.ready` holds its ready line. SIGTERM ends it after the last test of the module; an exit status
+    other than 0 is an error.
     """
     from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-    from starhil.hil_tests.own_hub import OwnBus
+    from starhil.hil_tests.private_can_bus import PrivateCanBus
 
     folder: Path = tmp_path_factory.mktemp("starhil")
-    with OwnBus() as channel:
+    with PrivateCanBus() as channel:
         command = emulator_command(
             profile=request.config.getoption("--starhil-profile"),
             serial="auto",

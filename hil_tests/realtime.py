@@ -1,4 +1,4 @@
-"""Real-time priority for the processes of a link, so that a busy machine does not make them late."""
+"""Real-time priority for the processes of a link on a busy machine."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from starhil.hil_tests.errors import BenchError
 PRIORITY = 1
 
 
-def give_realtime(process: int = 0) -> None:
-    """Let a process (0: this one) go before all ordinary ones, but not the processes that it starts later.
+def set_realtime_priority(process: int = 0) -> None:
+    """Give a process (0: this one) real-time priority; its later children do not inherit it.
 
     Raises
     ------
@@ -22,5 +22,5 @@ def give_realtime(process: int = 0) -> None:
         os.sched_setscheduler(process, policy, os.sched_param(PRIORITY))
     except OSError as error:
         raise BenchError(
-            f"real-time priority: {error.strerror}; run it as root or with CAP_SYS_NICE, or leave --realtime out"
+            f"real-time priority: {error.strerror}; run it as root or with CAP_SYS_NICE, or omit --realtime"
         ) from None

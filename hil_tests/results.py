@@ -1,4 +1,4 @@
-"""What became of a session's steps: as data, as lines on a terminal, as JSON and as a JUnit file."""
+"""Results of a session's steps, as data, JSON and JUnit."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ SHOWN_VALUES: Final = 6
 
 @dataclass(frozen=True)
 class StepResult:
-    """What became of one step on one link.
+    """Result of one step on one link.
 
     Attributes
     ----------
     status : str
         `passed`, `failed` or `skipped`.
     detail : str
-        What was seen, or what is wrong.
+        What was observed, or what is wrong.
     seconds : float
         Duration of the step, repeats and waits included.
     latency_s : float or None
@@ -42,7 +42,7 @@ class StepResult:
     values : mapping
         The last telemetry read.
     figures : mapping
-        Numbers that the step itself worked out, such as the attitude error.
+        Numbers that the step computed, such as the attitude error.
     """
 
     number: int
@@ -56,7 +56,7 @@ class StepResult:
     figures: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON takes it."""
+        """Return the result as JSON data."""
         values = {
             key: value.hex() if isinstance(value, bytes) else value for key, value in self.values.items()
         }
@@ -75,7 +75,7 @@ class StepResult:
 
 @dataclass(frozen=True)
 class SessionResult:
-    """What became of a whole session."""
+    """Result of a whole session."""
 
     title: str
     results: tuple[StepResult, ...]
@@ -93,7 +93,7 @@ class SessionResult:
         return self.interruption is None and self.count(FAILED) == 0 and self.count(PASSED) > 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the whole as JSON takes it."""
+        """Return the result as JSON data."""
         return {
             "title": self.title,
             "passed": self.passed,
@@ -107,7 +107,7 @@ class SessionResult:
 
 
 def summarize(values: Mapping[str, Value]) -> str:
-    """Return the first values of a row as `name=value` words."""
+    """Return the first values of a row as `name=value` pairs."""
     words = [f"{name}={show(value)}" for name, value in list(values.items())[:SHOWN_VALUES]]
     return " ".join([*words, "…"] if len(values) > SHOWN_VALUES else words)
 
@@ -127,7 +127,7 @@ class TestCase:
 
 
 def prepare_report(path: Path) -> None:
-    """Make the folder of a report; to be called before the run that it is about, so that no run is lost.
+    """Create the folder of a report; called before the run, so that no run is lost.
 
     Raises
     ------
@@ -139,13 +139,13 @@ def prepare_report(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BenchError(f"{path}: its folder cannot be made: {error.strerror}") from None
+        raise BenchError(f"{path}: its folder cannot be created: {error.strerror}") from None
     if not _is_stream(path) and not os.access(path.parent, os.W_OK | os.X_OK):
         raise BenchError(f"{path}: cannot be written: its folder takes no new files")
 
 
 def write_report(path: Path, data: bytes) -> None:
-    """Write a report, whole or not at all, or into a device or pipe; its folder is made if need be.
+    """Write a report, atomically, or into a device or pipe; create its folder if needed.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def write_report(path: Path, data: bytes) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all; a device or pipe stays what it is and gets the data, a link stays a link.
+    """Write a file atomically; data go into a device or pipe, and a symbolic link stays one.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _is_stream(path: Path) -> bool:
 
 
 def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float) -> None:
-    """Write a JUnit XML file, whole or not at all."""
+    """Write a JUnit XML file atomically."""
     counts = {
         "tests": len(cases),
         "failures": sum(case.status == FAILED for case in cases),
@@ -240,7 +240,10 @@ def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
 
 
 def percentile(values: Sequence[float], part: float) -> float:
-    """Return the value below which `part` (0 to 1) of the values lie (nearest rank); NaN for none."""
+    """Return the value below which `part` (0 to 1) of the values lie (nearest rank).
+
+    NaN for none.
+    """
     if not values:
         return math.nan
     ordered = sorted(values)

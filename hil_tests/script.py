@@ -1,4 +1,4 @@
-"""The session script: a TOML file of telecommands, reads, waits and expectations, checked whole before it is run.
+"""Session scripts: TOML files of telecommands, reads and expectations, validated before the run.
 
     title = "First light"
 
@@ -6,7 +6,7 @@
     profile = "default"
     set = ["truth.ra_deg=83.8"]
 
-    [truth]                         # what the sensor looks at: an attitude, or a file that the emulator writes
+    [truth]                         # the true attitude, or a file that the emulator writes
     ra_deg = 83.8
     dec_deg = -1.2
     roll_deg = 30.0
@@ -26,8 +26,9 @@
     within_s = 20                   # ask again until the expectations hold
     attitude = { within_arcsec = 30, roll_within_arcsec = 120 }
 
-Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names are those of the
-interface definition; an unknown one is refused with file, step, name and near matches.
+Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names
+are those of the interface definition; the error for an unknown one names file, step and near
+matches.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from starhil.hil_tests.expect import (
     read_stated_attitude,
     show,
 )
-from starhil.hil_tests.raw_exchange import parse_frame, pattern
+from starhil.hil_tests.raw_traffic import parse_frame, pattern
 from starhil.hil_tests.script_model import (
     LINKS,
     SIGNALS,
@@ -78,7 +79,7 @@ from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import Parameter, Value
 
 LISTED: Final = "; `starhil icd list` lists all"
-"""Where names are found that nothing known is near."""
+"""Hint where no known name is near."""
 
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 
@@ -89,8 +90,8 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     Raises
     ------
     ScriptError
-        The file cannot be read, is no TOML, or holds what the interface definition does not know; one line names
-        file, step, name and near matches.
+        The file cannot be read, is no TOML, or does not match the interface definition; names file,
+        step and near matches.
     """
     try:
         table = tomllib.loads(read_user_text(path))
@@ -103,7 +104,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
 
 
 class _Checker:
-    """Turns the tables of one file into a script; holds what earlier steps captured."""
+    """Validates the tables of one file; holds the variables that earlier steps captured."""
 
     def __init__(self, path: Path, icd: InterfaceDefinition) -> None:
         self._path = path
@@ -124,9 +125,9 @@ class _Checker:
         retries = defaults.count("retries", 0, minimum=0)
         keep_going = defaults.flag("keep_going", default=False)
         link = self._link(defaults)
-        defaults.finish()
+        defaults.reject_unknown_keys()
         tables = reader.sub_tables("step")
-        reader.finish()
+        reader.reject_unknown_keys()
         if not tables:
             reader.fail("holds no step: write [[step]] and one of the actions under it")
         steps = tuple(self._step(number, item) for number, item in enumerate(tables, start=1))
@@ -135,7 +136,7 @@ class _Checker:
     def _truth(self, reader: TableReader) -> Truth:
         attitude = read_stated_attitude(reader)
         file = self._file_name(reader, "file") if reader.has("file") else None
-        reader.finish()
+        reader.reject_unknown_keys()
         if attitude is not None and file is not None:
             reader.fail("give an attitude or a file, not both")
         return Truth(attitude, file)
@@ -146,7 +147,7 @@ class _Checker:
             reader.texts("set"),
             reader.count("seed", 1, minimum=0) if reader.has("seed") else None,
         )
-        reader.finish()
+        reader.reject_unknown_keys()
         return request
 
     def _step(self, number: int, table: dict[str, Any]) -> Step:
@@ -181,7 +182,7 @@ class _Checker:
             retries=reader.count("retries", 0, minimum=0),
             max_latency_s=reader.optional_number("max_latency_s", minimum=0.0),
         )
-        reader.finish()
+        reader.reject_unknown_keys()
         self._captured.update(capture)
         return step
 
@@ -192,7 +193,7 @@ class _Checker:
         return reader.choice("link", LINKS) if reader.has("link") else None
 
     def _answer_row(self, action: Action) -> Row | None:
-        """Return the row that the action's answer is laid out by, None if it has no values."""
+        """Return the row of the action's answer, None if it has no values."""
         if isinstance(action, Read | Listen | Sample):
             return action.row
         if isinstance(action, GetParameter):
@@ -206,7 +207,7 @@ class _Checker:
         if table and row is None:
             reader.fail("'expect' needs a step that reads telemetry")
         known = frozenset(self._captured)
-        place = TableReader(table, f"{reader.place}: expect")
+        place = TableReader(table, f"{reader.location}: expect")
         expectations = []
         for name, value in table.items():
             self._check_field(place, row, name)
@@ -221,7 +222,7 @@ class _Checker:
             reader.fail("'attitude' needs a step that reads a row with a quaternion (attitude, quaternion)")
         check = read_attitude_check(reader.sub("attitude"))
         if check.truth is None and not self._has_truth:
-            reader.fail("'attitude' has nothing to compare with: state it here or in a table [truth]")
+            reader.fail("'attitude' has no truth to compare with: give it here or in a table [truth]")
         return check
 
     def _captures(self, reader: TableReader, row: Row | None) -> dict[str, str]:
@@ -231,7 +232,7 @@ class _Checker:
         if table and row is None:
             reader.fail("'capture' needs a step that reads telemetry")
         for name in table.values():
-            self._check_field(TableReader(table, f"{reader.place}: capture"), row, name)
+            self._check_field(TableReader(table, f"{reader.location}: capture"), row, name)
         return dict(table)
 
     def _check_field(self, reader: TableReader, row: Row | None, name: str) -> None:
@@ -242,9 +243,9 @@ class _Checker:
             )
 
     def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> Expectation:
-        """Refuse an expectation that can never hold: another type, or no name of the enumeration.
+        """Reject an expectation that can never hold: wrong type, or no name of the enumeration.
 
-        Bytes stand in the script as hexadecimal text; in what is returned they are bytes.
+        Hexadecimal text is converted to bytes for a field of bytes.
         """
         if row is None:
             return expectation
@@ -299,7 +300,7 @@ class _Checker:
         given = reader.value("with", {})
         if not isinstance(given, dict) or (given and raw is not None):
             reader.fail("give the parameters as a table 'with' or as bytes 'with_hex'")
-        place = TableReader(given, f"{reader.place}: with")
+        place = TableReader(given, f"{reader.location}: with")
         for name in given:
             self._check_field(place, row, name)
         known = frozenset(self._captured)
@@ -322,7 +323,7 @@ class _Checker:
         return Listen(row, reader.count("count", 1)), f"listen for {row.name}"
 
     def sample(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a series of samples, in a table of its own or beside the step's keys."""
+        """Read a series of samples, from a table or from the keys of the step."""
         place = reader
         if isinstance(reader.value("sample"), dict):
             place = reader.sub("sample")
@@ -331,7 +332,7 @@ class _Checker:
             row = self._row(place, "sample", telecommand=False)
         at_least = place.number("at_least", 1.0, minimum=0.0)
         if at_least > 1.0:
-            place.fail("'at_least' is a part of the samples, from 0 to 1")
+            place.fail("'at_least' is a fraction of the samples, from 0 to 1")
         action = Sample(
             row,
             place.number("every_s", minimum=0.0),
@@ -341,7 +342,7 @@ class _Checker:
             place.count("min_samples", 1),
         )
         if place is not reader:
-            place.finish()
+            place.reject_unknown_keys()
         return action, f"sample {row.name}"
 
     def set_parameter(self, reader: TableReader) -> tuple[Action, str]:
@@ -371,7 +372,7 @@ class _Checker:
         return DownloadImage(file, size, method), f"download image {file}"
 
     def send(self, reader: TableReader) -> tuple[Action, str]:
-        """Read bytes or frames that are sent as they stand; their form tells the link."""
+        """Read raw bytes or frames to send; their format determines the link."""
         data = reader.texts("send")
         answer = reader.texts("answer") if reader.has("answer") else None
         kinds = set()
@@ -388,10 +389,10 @@ class _Checker:
             reader.fail(f"'send' or 'answer': {error}")
         if len(kinds) != 1:
             reader.fail(
-                "'send' takes bytes in hexadecimal or CAN frames as cansend writes them, not both or none"
+                "'send' takes bytes in hexadecimal or CAN frames in the format of cansend, not both or none"
             )
         listen_s = reader.number("listen_s", 0.3, minimum=0.0)
-        return Send(kinds.pop(), data, answer, listen_s), "send as it stands"
+        return Send(kinds.pop(), data, answer, listen_s), "send raw data"
 
     def wait(self, reader: TableReader) -> tuple[Action, str]:
         """Read a pause."""
@@ -407,7 +408,7 @@ class _Checker:
         """Read the name of a file to write, which stays inside the log folder."""
         name = reader.text(key, default)
         if name in {"", ".."} or Path(name).name != name or "\0" in name:
-            reader.fail(f"'{key}' must be a plain file name; it stands in the log folder")
+            reader.fail(f"'{key}' must be a plain file name; the file is written to the log folder")
         return name
 
 
@@ -423,7 +424,7 @@ ACTIONS: Final[Mapping[str, Callable[[_Checker, TableReader], tuple[Action, str]
     "wait_s": _Checker.wait,
     "restart": _Checker.restart,
 }
-"""Key that makes a step what it is → how it is read."""
+"""Key of an action → its reader."""
 
 STEP_KEYS: Final = (
     *ACTIONS,
@@ -434,7 +435,7 @@ STEP_KEYS: Final = (
 
 
 def _in_bytes(reader: TableReader, item: Field, expectation: Expectation) -> Expectation:
-    """Return what is expected of a field of bytes with its hexadecimal text as bytes."""
+    """Convert the hexadecimal text in the expectation of a field of bytes."""
 
     def convert(value: Operand) -> Operand:
         if isinstance(value, Variable):
@@ -466,5 +467,5 @@ def _in_bytes(reader: TableReader, item: Field, expectation: Expectation) -> Exp
 
 
 def static_values(values: Mapping[str, Operand]) -> dict[str, Value]:
-    """Return the values that stand in the script itself, without those that come from a variable."""
+    """Return the literal values, without variables."""
     return {name: value for name, value in values.items() if not isinstance(value, Variable)}

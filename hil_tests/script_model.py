@@ -1,4 +1,4 @@
-"""What a session script says, as data: its steps, their actions, and what stands for the whole script."""
+"""Data model of a session script."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Command:
     row: Row
     values: Mapping[str, Operand]
     raw: bytes | None
-    """Parameters as bytes, in place of `values`: for what no honest OBC sends."""
+    """Raw parameters instead of `values`, for malformed telecommands."""
     refused: str | None
-    """Error code that the device must answer with; None: it must accept."""
+    """Name of the expected error code; None if the device must accept."""
 
 
 @dataclass(frozen=True)
 class Read:
-    """Ask for a telemetry row."""
+    """Read a telemetry row."""
 
     row: Row
     refused: str | None
@@ -56,9 +56,9 @@ class Sample:
     for_s: float
     file: str
     at_least: float
-    """Part of the samples for which the expectations must hold, 0 to 1."""
+    """Fraction of the samples for which the expectations must hold, 0 to 1."""
     min_samples: int
-    """Fewest samples that must have come."""
+    """Smallest number of samples."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,14 @@ class DownloadImage:
 
 @dataclass(frozen=True)
 class Send:
-    """Send bytes or CAN frames as they stand, and look at what comes back."""
+    """Send raw bytes or CAN frames, and check the answer."""
 
     link: str
-    """`serial` or `can`, by the form of what is sent."""
+    """`serial` or `can`, by the format of the data."""
     data: tuple[str, ...]
-    """Bytes in hexadecimal (serial), or frames as `cansend` writes them (CAN)."""
+    """Bytes in hexadecimal (serial), or frames in the format of `cansend` (CAN)."""
     answer: tuple[str, ...] | None
-    """What must come back, in the same form; None to take anything."""
+    """Expected answer in the same format; None to accept anything."""
     listen_s: float
 
 
@@ -124,7 +124,7 @@ Action = (
 
 @dataclass(frozen=True)
 class Step:
-    """One step: an action, what is expected of it, and how often it is tried."""
+    """One step: an action, its expectations, and how often it is tried."""
 
     number: int
     name: str
@@ -154,7 +154,7 @@ class EmulatorRequest:
 
 @dataclass(frozen=True)
 class Truth:
-    """What the sensor looks at: one attitude, or a file of attitudes over time that the emulator writes."""
+    """The true attitude, or a file of true attitudes over time that the emulator writes."""
 
     attitude: Quaternion | None = None
     file: str | None = None
@@ -162,7 +162,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Script:
-    """A session script, read and checked."""
+    """A validated session script."""
 
     path: Path
     title: str

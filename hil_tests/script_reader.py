@@ -1,4 +1,4 @@
-"""Reading a table of a session script key by key, so that every error names file, place, key and near matches."""
+"""Reader of the tables of a session script; errors name file, table, key and near matches."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from starhil.hil_tests.errors import ScriptError, near_matches
 
 @dataclass
 class TableReader:
-    """One table of a script, from which known keys are taken one by one.
+    """One table of a script, whose known keys are read one by one.
 
     Attributes
     ----------
     table : mapping
-        The table as TOML gave it.
-    place : str
-        Where it stands, as an error message begins: `first_light.toml: step 3 (read attitude)`.
+        The parsed TOML table.
+    location : str
+        Location, with which error messages begin: `first_light.toml: step 3 (read attitude)`.
     """
 
     table: Mapping[str, Any]
-    place: str
+    location: str
     _known: set[str] = field(default_factory=set)
 
     def fail(self, text: str) -> NoReturn:
-        """Refuse the script with one line that begins with the place."""
-        raise ScriptError(f"{self.place}: {text}")
+        """Raise ScriptError with the location."""
+        raise ScriptError(f"{self.location}: {text}")
 
     def has(self, key: str) -> bool:
-        """Tell whether the key is there, and make it a known one."""
+        """Return whether the key is present; it counts as known from now on."""
         self._known.add(key)
         return key in self.table
 
     def value(self, key: str, default: Any = None) -> Any:
-        """Return whatever stands under the key."""
+        """Return the value of the key."""
         return self.table[key] if self.has(key) else default
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Return a text; without a default the key is needed."""
+        """Return a text; without a default the key is required."""
         value = self.value(key, default)
         if not isinstance(value, str):
             self.fail(f"'{key}' must be a text" + ("" if self.has(key) else ", and is missing"))
@@ -54,7 +54,7 @@ class TableReader:
         return value
 
     def number(self, key: str, default: float | None = None, *, minimum: float = -math.inf) -> float:
-        """Return a finite number not below `minimum`; without a default the key is needed."""
+        """Return a finite number not below `minimum`; without a default the key is required."""
         value = self.value(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             self.fail(f"'{key}' must be a number" + ("" if self.has(key) else ", and is missing"))
@@ -63,7 +63,7 @@ class TableReader:
         return float(value)
 
     def optional_number(self, key: str, *, minimum: float = -math.inf) -> float | None:
-        """Return a number, or None where the key is not there."""
+        """Return a number, or None if the key is missing."""
         return self.number(key, minimum=minimum) if self.has(key) else None
 
     def count(self, key: str, default: int, *, minimum: int = 1) -> int:
@@ -104,7 +104,7 @@ class TableReader:
         return value
 
     def hex_bytes(self, key: str) -> bytes:
-        """Return bytes written in hexadecimal, blanks between them or not."""
+        """Return bytes from hexadecimal text, with or without blanks."""
         text = self.text(key)
         try:
             return bytes.fromhex(text)
@@ -112,11 +112,11 @@ class TableReader:
             self.fail(f"'{key}' must be bytes in hexadecimal, such as \"1F 7F 80 1F FF\", not {text!r}")
 
     def sub(self, key: str) -> TableReader:
-        """Return a reader of the table under the key; an empty one if the key is not there."""
+        """Return a reader of the table under the key; an empty one if the key is missing."""
         value = self.value(key, {})
         if not isinstance(value, dict):
             self.fail(f"'{key}' must be a table, such as {{ name = value }}")
-        return TableReader(value, f"{self.place}: {key}")
+        return TableReader(value, f"{self.location}: {key}")
 
     def sub_tables(self, key: str) -> list[dict[str, Any]]:
         """Return the tables of an array of tables."""
@@ -125,8 +125,8 @@ class TableReader:
             self.fail(f"'{key}' must be an array of tables: write [[{key}]] before each")
         return value
 
-    def finish(self) -> None:
-        """Refuse keys that nobody asked for."""
+    def reject_unknown_keys(self) -> None:
+        """Reject unknown keys."""
         for key in self.table:
             if key not in self._known:
                 known = ", ".join(sorted(self._known))

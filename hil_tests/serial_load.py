@@ -1,4 +1,4 @@
-"""A serial line busy in both directions at once, measured from the OBC's side: every reply right, and how busy it was.
+"""Load on both directions of a serial line at once, with a check of every reply.
 
 It talks to a device over its line only, so it measures a real unit as well as the emulator.
 """
@@ -63,7 +63,7 @@ class _SerialPipeline:
         return encode_request(request)
 
     def take(self, data: bytes) -> None:
-        """Take bytes up to the end of each message, since dialect b needs to know what the next one answers."""
+        """Decode message by message, since dialect b must know the next request."""
         self.received += len(data)
         start = 0
         while start < len(data):
@@ -75,7 +75,10 @@ class _SerialPipeline:
         self._came.set()
 
     async def drain(self, left: int) -> bool:
-        """Wait until no more than `left` requests are under way; False if the line is silent for `REPLY_WITHIN_S` before."""
+        """Wait until no more than `left` requests are under way.
+
+        False if the line is silent for `REPLY_WITHIN_S` before.
+        """
         while self.under_way > left:
             self._came.clear()
             try:

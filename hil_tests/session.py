@@ -1,4 +1,4 @@
-"""Running a session script on a bench: step by step, over each link, with every result reported as it comes."""
+"""Run a session script on a bench, step by step over each link."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.expect import resolve, show
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.png import write_png
-from starhil.hil_tests.raw_exchange import matches, pattern, send_and_listen
-from starhil.hil_tests.readings import Reading
+from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
 from starhil.hil_tests.results import (
     FAILED,
     PASSED,
@@ -40,7 +39,8 @@ from starhil.hil_tests.script_model import (
     Step,
     Wait,
 )
-from starhil.hil_tests.truth_file import TruthFile
+from starhil.hil_tests.transactions import Reading
+from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.values import Value
 
@@ -50,18 +50,18 @@ CLOCK_GRAIN_S: Final = 1e-6
 
 @dataclass
 class Outcome:
-    """What one try of an action gave.
+    """Outcome of one attempt of an action.
 
     Attributes
     ----------
     problem : str or None
-        What is wrong; None if nothing is.
+        What is wrong; None if it passed.
     detail : str
-        What was seen.
+        What was observed.
     values : mapping
         Telemetry read.
     figures : dict
-        Numbers worked out.
+        Computed numbers.
     latency_s : float or None
         Greatest latency.
     """
@@ -79,15 +79,15 @@ class SessionRunner:
     Parameters
     ----------
     script : Script
-        Checked by `load_script`.
+        Script from `load_script`.
     bench : Bench
-        Set up, its emulator started if it has one.
+        Bench, with its emulator started.
     folder : Path
-        Where CSV and picture files go.
+        Folder of CSV and image files.
     on_result : callable
-        Called with each result as it comes.
+        Called with each result.
     truth_path : Path, optional
-        File of true attitudes in place of the one that the script names.
+        File of true attitudes instead of the one in the script.
     """
 
     def __init__(
@@ -107,10 +107,10 @@ class SessionRunner:
         path = truth_path
         if path is None and script.truth.file is not None:
             path = folder / script.truth.file
-        self._truth_file = None if path is None else TruthFile(path)
+        self._truth_log = None if path is None else TruthLogReader(path)
 
     def run(self) -> SessionResult:
-        """Run all steps; after a failed one the rest is skipped unless the script says `keep_going`."""
+        """Run all steps; after a failed one skip the rest unless the script sets `keep_going`."""
         begin = time.monotonic()
         results: list[StepResult] = []
         reason = ""
@@ -121,7 +121,7 @@ class SessionRunner:
                     result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
                 else:
                     try:
-                        result = self._step(step, link)
+                        result = self._run_step(step, link)
                     except Interrupted as signalled:
                         interruption = signalled
                         reason = f"not run: {signalled.reason}"
@@ -142,7 +142,7 @@ class SessionRunner:
 
     # --- one step ---
 
-    def _step(self, step: Step, link: str) -> StepResult:
+    def _run_step(self, step: Step, link: str) -> StepResult:
         begin = time.monotonic()
         if link and link not in self._bench.links:
             detail = f"needs a {link} link, the session has {' and '.join(self._bench.links)}"
@@ -153,7 +153,7 @@ class SessionRunner:
         for turn in range(step.repeat):
             if turn:
                 time.sleep(step.every_s)
-            outcome = self._until_good(step, link)
+            outcome = self._try_until_passed(step, link)
             if outcome.problem is not None:
                 if step.repeat > 1:
                     outcome.problem = f"time {turn + 1} of {step.repeat}: {outcome.problem}"
@@ -170,11 +170,11 @@ class SessionRunner:
             outcome.figures,
         )
 
-    def _until_good(self, step: Step, link: str) -> Outcome:
-        """Try an action once, or until its expectations hold or its time is over."""
+    def _try_until_passed(self, step: Step, link: str) -> Outcome:
+        """Try an action once, or until its expectations hold or its time is up."""
         deadline = None if step.within_s is None else time.monotonic() + step.within_s
         while True:
-            outcome = self._try(step, link)
+            outcome = self._try_once(step, link)
             if outcome.problem is None:
                 return outcome
             if deadline is None:
@@ -184,9 +184,9 @@ class SessionRunner:
                 return outcome
             time.sleep(min(step.every_s, max(0.0, deadline - time.monotonic())))
 
-    def _try(self, step: Step, link: str) -> Outcome:
+    def _try_once(self, step: Step, link: str) -> Outcome:
         try:
-            outcome = self._act(step, link)
+            outcome = self._perform(step, link)
         except (BenchError, ProtocolError) as error:
             return Outcome(problem=str(error))
         limit = step.max_latency_s
@@ -196,7 +196,7 @@ class SessionRunner:
             self._captured.update({name: outcome.values[key] for name, key in step.capture.items()})
         return outcome
 
-    def _act(self, step: Step, link: str) -> Outcome:
+    def _perform(self, step: Step, link: str) -> Outcome:
         action = step.action
         if isinstance(action, Wait):
             time.sleep(action.seconds)
@@ -229,11 +229,13 @@ class SessionRunner:
         row = action.row
         if action.raw is None:
             variables = self._variables()
-            values = {name: _fitting(resolve(value, variables)) for name, value in action.values.items()}
+            values = {
+                name: _whole_as_integer(resolve(value, variables)) for name, value in action.values.items()
+            }
             data = row.encode(values, check=action.refused is None)
         else:
             data = action.raw
-        return self._refusable(
+        return self._expect_acceptance_or_refusal(
             lambda: (
                 client.run(
                     client.core.command_raw(row.name, data, timeout_s=step.timeout_s, retries=step.retries)
@@ -252,7 +254,7 @@ class SessionRunner:
             retries=step.retries,
             checked=action.refused is None,
         )
-        outcome = self._refusable(lambda: client.run(request).latency_s, action.refused)
+        outcome = self._expect_acceptance_or_refusal(lambda: client.run(request).latency_s, action.refused)
         if outcome.problem is None and action.refused is None:
             seen = client.get_parameter(parameter.name)
             wanted = parameter.check(value)
@@ -264,7 +266,7 @@ class SessionRunner:
         return outcome
 
     @staticmethod
-    def _refusable(act: Callable[[], float], refused: str | None) -> Outcome:
+    def _expect_acceptance_or_refusal(act: Callable[[], float], refused: str | None) -> Outcome:
         """Send a request that must be accepted, or refused with the code that `refused` names."""
         try:
             latency = act()
@@ -286,7 +288,7 @@ class SessionRunner:
             readings.append(reading)
             return reading.latency_s
 
-        outcome = self._refusable(ask, action.refused)
+        outcome = self._expect_acceptance_or_refusal(ask, action.refused)
         if outcome.problem is not None or not readings:
             return outcome
         return self._judge(step, readings[0])
@@ -321,7 +323,7 @@ class SessionRunner:
             writer.writerow(["obc_time_s", "latency_ms", *fields])
             while time.monotonic() - begin < action.for_s or count == 0:
                 reading = client.read(action.row.name, timeout_s=step.timeout_s, retries=step.retries)
-                values = [_cell(reading[name]) for name in fields]
+                values = [_csv_text(reading[name]) for name in fields]
                 writer.writerow(
                     [f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}", *values]
                 )
@@ -362,7 +364,7 @@ class SessionRunner:
         }
         levels = sorted(set(image.pixels))
         detail = f"{image.width}x{image.height} in {image.seconds:.2f} s → {action.file}"
-        problem = None if len(levels) > 1 else f"{detail}: the picture is blank (all pixels {levels[0]})"
+        problem = None if len(levels) > 1 else f"{detail}: the image is blank (all pixels {levels[0]})"
         return Outcome(problem, detail, {}, figures)
 
     @staticmethod
@@ -404,11 +406,11 @@ class SessionRunner:
             return []
         truth = check.truth or self._script.truth.attitude
         if truth is None:
-            if self._truth_file is None:
+            if self._truth_log is None:
                 raise BenchError(f"step {step.number}: no truth to compare the attitude with")
             if "time_of_exposure" not in reading.values:
                 raise BenchError(f"step {step.number}: {reading.name} carries no time; read precise_attitude")
-            truth = self._truth_file.at(float(reading["time_of_exposure"]))
+            truth = self._truth_log.at(float(reading["time_of_exposure"]))
         error, problem = check.judge(reading.values, truth)
         if error is not None:
             outcome.figures.update(
@@ -424,13 +426,13 @@ class SessionRunner:
         return {**self._captured, "now": now, "now_s": int(now), "now_ms": int(now % 1.0 * MS_PER_S)}
 
 
-def _fitting(value: Value) -> Value:
-    """Return a whole number given as a float as an integer, as captured values may be."""
+def _whole_as_integer(value: Value) -> Value:
+    """Return a whole float, such as a captured value, as an integer."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _cell(value: Value) -> str:
-    """Return a value as it stands in a CSV file, with all its digits."""
+def _csv_text(value: Value) -> str:
+    """Format a value for a CSV file, with all digits."""
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float):

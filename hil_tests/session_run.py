@@ -1,4 +1,4 @@
-"""A session from the file to the exit: script checked, bench set up, steps shown as they come, reports written."""
+"""A complete session: load the script, set up the bench, run the steps, write the reports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from starhil.hil_tests.bench import Bench, LinkOptions
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.results import (
     FAILED,
     PASSED,
@@ -26,10 +26,10 @@ from starhil.hil_tests.results import (
     prepare_report,
     write_junit,
 )
-from starhil.hil_tests.scratch import scratch_folder
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.icd import load_icd
 from starhil.protocol.serial_framing import Dialect
 
@@ -40,7 +40,7 @@ STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED:
 
 @dataclass(frozen=True)
 class SessionRequest:
-    """What a user asks for; see `starhil session --help`."""
+    """Options of the user; see `starhil session --help`."""
 
     script: Path
     options: LinkOptions
@@ -54,7 +54,7 @@ class SessionRequest:
 
 
 def find_script(path: Path) -> Path:
-    """Return the script file; a bare name is looked up among those that come along.
+    """Return the script file; a bare name refers to a shipped script.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     Raises
     ------
     BenchError
-        The script, a port, or the emulator's start is refused.
+        The script is invalid, a port is not available, or the emulator does not start.
     """
     icd = load_icd()
     path = find_script(request.script)
@@ -89,7 +89,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BenchError(f"{folder}: the log folder cannot be made: {error.strerror}") from None
+        raise BenchError(f"{folder}: the log folder cannot be created: {error.strerror}") from None
     if request.junit is not None:
         prepare_report(request.junit)
     show = _printer(quiet=request.quiet)
@@ -101,12 +101,12 @@ def run_session(request: SessionRequest) -> SessionResult:
             emulator = None
             if request.start:
                 if options.can == "auto":
-                    options = replace(options, can=stack.enter_context(OwnBus()))
-                state = stack.enter_context(scratch_folder("starhil-session-"))
+                    options = replace(options, can=stack.enter_context(PrivateCanBus()))
+                state = stack.enter_context(temporary_folder("starhil-session-"))
                 emulator = _emulator(request, script, options, folder, state)
             bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
             for link in bench.links:
-                bench.client(link)  # a port that cannot be had is refused before the first step
+                bench.client(link)  # report a missing port before the first step
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
     except EmulatorProcessError as error:
         if result is None:
@@ -148,18 +148,18 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
 def _emulator(
     request: SessionRequest, script: Script, options: LinkOptions, folder: Path, state: Path
 ) -> EmulatorProcess:
-    """Prepare an emulator for the session, with a parameter store of its own that is empty at first."""
-    wish = script.emulator
+    """Prepare an emulator for the session, with an empty parameter store."""
+    wanted = script.emulator
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
     return EmulatorProcess(
         emulator_command(
-            profile=request.profile or wish.profile,
+            profile=request.profile or wanted.profile,
             serial=options.serial or "off",
             can=options.can or "off",
-            seed=wish.seed,
-            settings=wish.settings,
+            seed=wanted.seed,
+            settings=wanted.settings,
             state_dir=state,
             truth_log=truth_log,
         )

@@ -1,4 +1,4 @@
-"""Logs of every byte on the wire, with time stamps: readable for a serial line, candump's format for CAN."""
+"""Time-stamped logs of every byte on a link: text for serial, candump format for CAN."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ class WireLog(ABC):
 class SerialLog(WireLog):
     """A readable log of a serial line: time, direction, bytes in hexadecimal.
 
-    One line for each piece handed to or by the port, for example `(1760000000.123456) TX 1F 7F 80 1F FF`. Lines that
-    start with `#` are notes.
+    One line for each piece handed to or by the port, for example `(1760000000.123456) TX 1F 7F 80
+    1F FF`. Lines that start with `#` are notes.
     """
 
     def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:

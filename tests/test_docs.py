@@ -21,8 +21,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.own_hub import OwnBus
-from starhil.hil_tests.raw_exchange import format_frame
+from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen import build_dictionary
 from starhil.protocol.export import export
@@ -210,7 +210,7 @@ def test_library(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def bus():
-    with OwnBus() as channel:
+    with PrivateCanBus() as channel:
         yield channel
 
 

@@ -177,7 +177,7 @@ def bus(
 
     from starhil.emulator.cli.bench_bus import Target, measure, own_device, print_figures
     from starhil.emulator.errors import EmulatorError
-    from starhil.hil_tests.realtime import give_realtime
+    from starhil.hil_tests.realtime import set_realtime_priority
     from starhil.protocol.serial_framing import Dialect
 
     if dialect not in set(Dialect):
@@ -187,7 +187,7 @@ def bus(
     own = can is None and serial is None
     with own_device(baud, realtime, progress.print) if own else nullcontext(given) as target:
         if realtime and not own:
-            give_realtime()
+            set_realtime_priority()
         figures = measure(target, seconds, rate, progress.print, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if json_out:

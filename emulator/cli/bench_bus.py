@@ -15,7 +15,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
 from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
-from starhil.hil_tests.realtime import give_realtime
+from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.serial_load import load_serial
 from starhil.protocol.serial_framing import Dialect
 
@@ -81,9 +81,9 @@ def own_device(baud: int, realtime: bool, report: Callable[[str], None]) -> Iter
         report("starting the emulator")
         emulator = stack.enter_context(EmulatorProcess(command))
         if realtime:
-            give_realtime()
+            set_realtime_priority()
             for process in (hub, emulator):
-                give_realtime(process.process.pid)
+                set_realtime_priority(process.process.pid)
         with ObcClient.open(can=hub.ready["can"], device_address=DEVICE) as client:
             client.command("set_update_rate", rate=UPDATE_RATE_HZ)
             client.command("set_mode", mode="lost_in_space")

@@ -1,1 +1,1 @@
-"""Conformance: table-driven cases that look for faults in a device over its bus, on hardware as well as on the emulator."""
+"""Conformance: cases that test a device, real or emulated, over its links only."""

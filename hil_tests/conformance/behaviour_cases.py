@@ -1,4 +1,4 @@
-"""Conformance of what the device does, on any link: acknowledge, counters, echo, time, modes, reset, store."""
+"""Conformance on any link: acknowledge, counters, data, time, modes, reset, parameter store."""
 
 from __future__ import annotations
 
@@ -6,36 +6,39 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal, rule
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
 from starhil.hil_tests.conformance.unit_settings import save_parameters
-
-ACKNOWLEDGE: Final = "CubeComputer TLM 240: last telecommand, processed, error, index (AlbertaSat, CTS)"
-COUNTERS: Final = "CubeComputer TLM 144: counts of telecommands and telemetry (AlbertaSat, CTS)"
-CLOCK: Final = "CubeComputer TC 2 and TLM 140 (AlbertaSat, CTS)"
-RESET: Final = "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)"
-HOLE_MAP: Final = "CubeComputer TC 120 to 127 and TLM 247 to 254 (AlbertaSat, CTS)"
 
 CLOCK_STEP_S: Final = 1_700_000_000
 CLOCK_TOLERANCE_S: Final = 0.25
 TEST_VALUE: Final = 137.0
 COUNTED: Final = 30
 
-_CASES: list[Case[LinkProbe]] = []
+ACKNOWLEDGE: Final = CaseArea[LinkProbe](
+    "acknowledge",
+    "CubeComputer TLM 240: last telecommand, processed, error, index (AlbertaSat, CTS)",
+    intrusive=True,
+)
+COUNTERS: Final = CaseArea[LinkProbe](
+    "counters", "CubeComputer TLM 144: counts of telecommands and telemetry (AlbertaSat, CTS)"
+)
+DATA: Final = CaseArea[LinkProbe](
+    "data", "CubeComputer TC 120 to 127 and TLM 247 to 254 (AlbertaSat, CTS)", intrusive=True
+)
+TIME: Final = CaseArea[LinkProbe]("time", "CubeComputer TC 2 and TLM 140 (AlbertaSat, CTS)")
+MODES: Final = CaseArea[LinkProbe]("modes", rule(11), intrusive=True)
+RESET: Final = CaseArea[LinkProbe](
+    "reset", "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)", intrusive=True
+)
+STORE: Final = CaseArea[LinkProbe]("store", rule(16), intrusive=True)
 
 
 # --- acknowledge ---
 
 
-@case(
-    _CASES,
-    "acknowledge.accepted",
-    "after an accepted telecommand: its identifier, processed, no error",
-    ACKNOWLEDGE,
-    intrusive=True,
-)
+@ACKNOWLEDGE.case("accepted", "after an accepted telecommand: its identifier, processed, no error")
 def acknowledge_accepted(probe: LinkProbe) -> None:
-    """Two different ones."""
     for name, values in (("select_parameter", {"parameter": 1}), ("clear_counters", {})):
         probe.command(name, **values)
         seen = probe.telemetry("acknowledge")
@@ -48,15 +51,8 @@ def acknowledge_accepted(probe: LinkProbe) -> None:
         check_equal(seen, wanted, "acknowledge")
 
 
-@case(
-    _CASES,
-    "acknowledge.unknown",
-    "after an unknown telecommand: its identifier and invalid_id",
-    ACKNOWLEDGE,
-    intrusive=True,
-)
+@ACKNOWLEDGE.case("unknown", "after an unknown telecommand: its identifier and invalid_id")
 def acknowledge_unknown(probe: LinkProbe) -> None:
-    """Number 60."""
     probe.expect_refusal(60, b"", INVALID_ID)
     seen = probe.telemetry("acknowledge")
     check_equal(
@@ -64,15 +60,8 @@ def acknowledge_unknown(probe: LinkProbe) -> None:
     )
 
 
-@case(
-    _CASES,
-    "acknowledge.kept",
-    "reading telemetry does not change the acknowledge",
-    ACKNOWLEDGE,
-    intrusive=True,
-)
+@ACKNOWLEDGE.case("kept", "reading telemetry does not change the acknowledge")
 def acknowledge_kept(probe: LinkProbe) -> None:
-    """It stays that of the last telecommand."""
     probe.expect_refusal(96, b"\x4d", INVALID_PARAMETER)
     first = probe.telemetry("acknowledge")
     for name in ("identification", "acknowledge", "device_status"):
@@ -80,9 +69,8 @@ def acknowledge_kept(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("acknowledge"), first, "acknowledge")
 
 
-@case(_CASES, "acknowledge.forgets", "a later success clears the error", ACKNOWLEDGE, intrusive=True)
+@ACKNOWLEDGE.case("forgets", "a later success clears the error")
 def acknowledge_forgets(probe: LinkProbe) -> None:
-    """Error and index."""
     probe.expect_refusal(2, bytes.fromhex("00000000FFFF"), INVALID_PARAMETER)
     probe.command("clear_counters")
     seen = probe.telemetry("acknowledge")
@@ -97,14 +85,9 @@ def _counts(probe: LinkProbe) -> tuple[int, int]:
     return int(seen["telecommand_count"]), int(seen["telemetry_count"])
 
 
-@case(
-    _CASES,
-    "counters.telemetry",
-    "each request of telemetry counts once, the reading of the counters too",
-    COUNTERS,
-)
+@COUNTERS.case("telemetry", "each request of telemetry counts once, the reading of the counters too")
 def counters_telemetry(probe: LinkProbe) -> None:
-    """Thirty of them; telecommands do not count along."""
+    """The count of telecommands stays the same."""
     commands, before = _counts(probe)
     for _ in range(COUNTED):
         probe.telemetry("identification")
@@ -113,23 +96,16 @@ def counters_telemetry(probe: LinkProbe) -> None:
     check_equal(after_commands, commands, "count of telecommands")
 
 
-@case(_CASES, "counters.refused-telemetry", "a refused request of telemetry counts as well", COUNTERS)
+@COUNTERS.case("refused-telemetry", "a refused request of telemetry counts as well")
 def counters_refused_telemetry(probe: LinkProbe) -> None:
-    """It was received."""
     _, before = _counts(probe)
     probe.expect_refusal(200, b"", INVALID_ID)
     check_equal((_counts(probe)[1] - before) % 65536, 2, "increase")
 
 
-@case(
-    _CASES,
-    "counters.telecommands",
-    "each telecommand counts once, accepted or refused",
-    COUNTERS,
-    intrusive=True,
-)
+@COUNTERS.case("telecommands", "each telecommand counts once, accepted or refused", intrusive=True)
 def counters_telecommands(probe: LinkProbe) -> None:
-    """Accepted, of a wrong length, unknown, out of limits."""
+    """Accepted, wrong length, unknown, out of limits."""
     before, _ = _counts(probe)
     probe.command("select_parameter", parameter=1)
     probe.expect_refusal(60, b"", INVALID_ID)
@@ -138,9 +114,9 @@ def counters_telecommands(probe: LinkProbe) -> None:
     check_equal((_counts(probe)[0] - before) % 65536, 4, "increase")
 
 
-@case(_CASES, "counters.clear", "clear_counters sets both counts to zero", COUNTERS, intrusive=True)
+@COUNTERS.case("clear", "clear_counters sets both counts to zero", intrusive=True)
 def counters_clear(probe: LinkProbe) -> None:
-    """The command itself does not count any more, the reading does."""
+    """clear_counters itself is not counted, the reading afterwards is."""
     probe.command("clear_counters")
     check_equal(_counts(probe), (0, 1), "counts")
 
@@ -160,30 +136,22 @@ ECHOES: Final = (
 )
 
 
-def _echo_case(name: str, data: bytes) -> Case[LinkProbe]:
+def _add_echo_case(name: str, data: bytes) -> None:
+    @DATA.case(name, f"16 bytes ({name}) go there and back unchanged")
     def run(probe: LinkProbe) -> None:
-        for part in (1, 8):
-            probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{part}"].id, data)
-            row = probe.icd.telemetry[f"hole_map_{part}"]
+        for chunk in (1, 8):
+            probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{chunk}"].id, data)
+            row = probe.icd.telemetry[f"hole_map_{chunk}"]
             probe.post(row.id)
             check_equal(probe.expect_telemetry(row.id), data, "the same bytes")
 
-    return Case(
-        f"data.{name}",
-        "data",
-        f"16 bytes ({name}) go there and back unchanged",
-        HOLE_MAP,
-        run,
-        intrusive=True,
-    )
+
+for _echo in ECHOES:
+    _add_echo_case(*_echo)
 
 
-_CASES += [_echo_case(*echo) for echo in ECHOES]
-
-
-@case(_CASES, "data.parts", "the eight parts of the hole map are kept apart", HOLE_MAP, intrusive=True)
+@DATA.case("parts", "the eight parts of the hole map are independent")
 def parts(probe: LinkProbe) -> None:
-    """Each gets its own number."""
     for part in range(1, 9):
         probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{part}"].id, bytes([part]) * 16)
     for part in range(1, 9):
@@ -200,9 +168,9 @@ def _clock(probe: LinkProbe) -> float:
     return int(seen["seconds"]) + int(seen["milliseconds"]) / 1000.0
 
 
-@case(_CASES, "time.set", "the clock is what it was set to", CLOCK, intrusive=True)
+@TIME.case("set", "the clock is what it was set to", intrusive=True)
 def time_set(probe: LinkProbe) -> None:
-    """Seconds and milliseconds, with bytes that have to be stuffed; the clock is put back afterwards."""
+    """The values include bytes that must be stuffed; the clock is set back afterwards."""
     with _kept_clock(probe):
         for seconds, milliseconds in ((CLOCK_STEP_S, 250), (0x1F1F1F1F, 31), (0, 0), (0xFFFFFFF0, 999)):
             probe.command("set_unix_time", seconds=seconds, milliseconds=milliseconds)
@@ -213,7 +181,7 @@ def time_set(probe: LinkProbe) -> None:
 
 @contextmanager
 def _kept_clock(probe: LinkProbe) -> Iterator[None]:
-    """Put the clock back to what it would be, whatever happens."""
+    """Restore the clock afterwards."""
     before, began = _clock(probe), probe.now()
     try:
         yield
@@ -222,9 +190,9 @@ def _kept_clock(probe: LinkProbe) -> Iterator[None]:
         probe.command("set_unix_time", seconds=int(whole), milliseconds=int(whole % 1.0 * 1000))
 
 
-@case(_CASES, "time.runs", "the clock runs as fast as the tester's", CLOCK)
+@TIME.case("runs", "the clock runs as fast as the tester's")
 def time_runs(probe: LinkProbe) -> None:
-    """Over one second, to 2 % and the time of the requests."""
+    """Over one second, with a tolerance of 2 % and the duration of the requests."""
     begin, first = probe.now(), _clock(probe)
     middle = probe.now()
     probe.sleep(1.0)
@@ -233,15 +201,8 @@ def time_runs(probe: LinkProbe) -> None:
     check(0.98 * (third - middle) <= last - first <= 1.02 * (end - begin) + 0.002, f"{third - middle:.3f} to {end - begin:.3f} s", f"{last - first:.3f} s")  # fmt: skip
 
 
-@case(
-    _CASES,
-    "time.flag",
-    "device_status tells that the clock was set, and the same time",
-    CLOCK,
-    intrusive=True,
-)
+@TIME.case("flag", "device_status reports that the clock was set, and the same time", intrusive=True)
 def time_flag(probe: LinkProbe) -> None:
-    """The two rows agree."""
     with _kept_clock(probe):
         probe.command("set_unix_time", seconds=CLOCK_STEP_S, milliseconds=0)
         status = probe.telemetry("device_status")
@@ -253,9 +214,13 @@ def time_flag(probe: LinkProbe) -> None:
     )
 
 
-@case(_CASES, "time.uptime", "runtime and uptime agree and grow", RESET)
+@TIME.case(
+    "uptime",
+    "runtime and uptime agree and grow",
+    "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)",
+)
 def uptime(probe: LinkProbe) -> None:
-    """Identification wraps at 65536 s."""
+    """The runtime in identification wraps at 65536 s."""
     first = probe.telemetry("identification")
     status = probe.telemetry("device_status")
     runtime = int(first["runtime_s"]) + int(first["runtime_ms"]) / 1000.0
@@ -271,15 +236,9 @@ def uptime(probe: LinkProbe) -> None:
 # --- modes ---
 
 
-@case(
-    _CASES,
-    "modes.standby",
-    "in standby no attitude is valid, and the rows agree on it",
-    rule(11),
-    intrusive=True,
-)
+@MODES.case("standby", "in standby no attitude is valid, and the rows agree on it")
 def standby(probe: LinkProbe) -> None:
-    """precise_attitude, device_status, star_performance_2."""
+    """The rows are precise_attitude, device_status and star_performance_2."""
     probe.standby()
     probe.wait_for("device_status", {"attitude_valid": False}, 2.0)
     attitude = probe.telemetry("precise_attitude")
@@ -288,17 +247,11 @@ def standby(probe: LinkProbe) -> None:
     check(not probe.telemetry("star_performance_2")["attitude_ok"], "attitude_ok not set", "set")
 
 
-@case(
-    _CASES,
-    "modes.frames",
-    "out of standby frames are made at the update rate, in standby none",
-    rule(12),
-    intrusive=True,
-)
+@MODES.case("frames", "out of standby frames are made at the update rate, in standby none", rule(12))
 def frames(probe: LinkProbe) -> None:
-    """Two seconds at 5 Hz, with or without stars; the exposure must leave room for that rate."""
+    """Two seconds at 5 Hz, with or without stars; the exposure leaves room for that rate."""
     probe.standby()
-    with probe.kept("update_rate", "exposure"):
+    with probe.parameters_kept("update_rate", "exposure"):
         probe.set_parameter("exposure", 50.0)
         probe.set_parameter("update_rate", 5.0)
         probe.command("set_mode", mode="lost_in_space")
@@ -314,9 +267,8 @@ def frames(probe: LinkProbe) -> None:
         check_equal(int(probe.telemetry("device_status")["frames_captured"]), first, "frames in standby")
 
 
-@case(_CASES, "modes.changes", "mode and its counter follow the command", rule(13), intrusive=True)
+@MODES.case("changes", "mode and its counter follow the command", rule(13))
 def changes(probe: LinkProbe) -> None:
-    """Standby to lost in space and back."""
     probe.standby()
     first = int(probe.telemetry("device_status")["mode_changes"])
     probe.command("set_mode", mode="lost_in_space")
@@ -332,30 +284,20 @@ def changes(probe: LinkProbe) -> None:
     )
 
 
-@case(
-    _CASES,
-    "modes.no-tracking",
-    "tracking without an attitude to start from is refused with code 7",
-    rule(14),
-    intrusive=True,
-)
+@MODES.case("no-tracking", "tracking without an attitude to start from is refused with code 7", rule(14))
 def no_tracking(probe: LinkProbe) -> None:
-    """After a reset there is none."""
+    """After a reset there is no attitude to start from."""
     probe.reset()
     row = probe.icd.telecommands["set_mode"]
     probe.expect_refusal(row.id, row.encode({"mode": "tracking"}), SEQUENCE)
     check_equal(probe.telemetry("device_status")["mode"], "standby", "mode")
 
 
-@case(
-    _CASES,
-    "modes.attitude",
-    "with stars in view: valid, of unit length, its time just past, all rows agree",
-    rule(15),
-    intrusive=True,
+@MODES.case(
+    "attitude", "with stars in view: valid, of unit length, its time just past, all rows agree", rule(15)
 )
 def attitude(probe: LinkProbe) -> None:
-    """Skipped where no attitude is found within 20 s."""
+    """Skipped if no attitude is found within 20 s."""
     probe.standby()
     probe.command("set_mode", mode="lost_in_space")
     end = probe.now() + 20.0
@@ -378,11 +320,9 @@ def attitude(probe: LinkProbe) -> None:
 # --- reset ---
 
 
-@case(
-    _CASES, "reset.magic", "reset without its magic number is refused and does nothing", RESET, intrusive=True
-)
+@RESET.case("magic", "reset without its magic number is refused and does nothing")
 def reset_magic(probe: LinkProbe) -> None:
-    """CubeWheel's 0x55 among them."""
+    """The magic number of CubeWheel, 0x55, is among those refused."""
     before = probe.telemetry("boot_status")["boot_count"]
     row = probe.icd.telecommands["reset"]
     for magic in (0x00, 0x55, 0x59, 0x5B, 0xFF):
@@ -391,15 +331,9 @@ def reset_magic(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("boot_status")["boot_count"], before, "boot count")
 
 
-@case(
-    _CASES,
-    "reset.acknowledged",
-    "reset is acknowledged, then the device restarts by command",
-    RESET,
-    intrusive=True,
-)
+@RESET.case("acknowledged", "reset is acknowledged, then the device restarts by command")
 def reset_acknowledged(probe: LinkProbe) -> None:
-    """Runtime from zero, one boot more, cause, counters at zero."""
+    """The runtime and the counters start from zero; boot count and reset cause are updated."""
     before = probe.telemetry("boot_status")
     began = probe.now()
     probe.reset()
@@ -416,15 +350,9 @@ def reset_acknowledged(probe: LinkProbe) -> None:
 # --- store ---
 
 
-@case(
-    _CASES,
-    "store.reset",
-    "a parameter that is not saved is lost at a reset, a saved one is kept",
-    rule(16),
-    intrusive=True,
-)
+@STORE.case("reset", "a parameter that is not saved is lost at a reset, a saved one is kept")
 def store_reset(probe: LinkProbe) -> None:
-    """What was stored before is stored again afterwards."""
+    """The parameters stored before are stored again afterwards."""
     before = float(probe.parameter("exposure")["value"])
     probe.set_parameter("exposure", TEST_VALUE)
     probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
@@ -438,9 +366,8 @@ def store_reset(probe: LinkProbe) -> None:
         save_parameters(probe)
 
 
-@case(_CASES, "store.restore", "restore_parameters brings back what is stored", rule(17), intrusive=True)
+@STORE.case("restore", "restore_parameters brings back what is stored", rule(17))
 def store_restore(probe: LinkProbe) -> None:
-    """Without a reset."""
     before = float(probe.parameter("exposure")["value"])
     save_parameters(probe)
     probe.set_parameter("exposure", TEST_VALUE)
@@ -448,15 +375,9 @@ def store_restore(probe: LinkProbe) -> None:
     check_equal(float(probe.parameter("exposure")["value"]), before, "exposure")
 
 
-@case(
-    _CASES,
-    "store.defaults",
-    "default_parameters sets the defaults and leaves the store as it is",
-    rule(18),
-    intrusive=True,
-)
+@STORE.case("defaults", "default_parameters sets the defaults and leaves the store unchanged", rule(18))
 def store_defaults(probe: LinkProbe) -> None:
-    """Restored afterwards."""
+    """The stored value is restored afterwards."""
     save_parameters(probe)
     stored = float(probe.parameter("limiting_magnitude")["value"])
     probe.set_parameter("limiting_magnitude", 4.25)
@@ -470,15 +391,13 @@ def store_defaults(probe: LinkProbe) -> None:
     save_parameters(probe)
 
 
-@case(
-    _CASES,
-    "store.config",
+@STORE.case(
+    "config",
     "set_star_config sets parameters, all or nothing, and star_config shows them",
     "CubeComputer TC 37, TLM 202 (AlbertaSat)",
-    intrusive=True,
 )
 def star_config(probe: LinkProbe) -> None:
-    """53 bytes there and back; one bad field changes nothing."""
+    """53 bytes there and back; one invalid field changes nothing."""
     row = probe.icd.telecommands["set_star_config"]
     before = probe.telemetry("star_config")
     wanted = {**before, "exposure": 140, "max_stars_matched": 40}
@@ -492,4 +411,12 @@ def star_config(probe: LinkProbe) -> None:
     probe.command("set_star_config", **before)
 
 
-CASES: Final = tuple(_CASES)
+CASES: Final = (
+    *ACKNOWLEDGE.cases,
+    *COUNTERS.cases,
+    *DATA.cases,
+    *TIME.cases,
+    *MODES.cases,
+    *RESET.cases,
+    *STORE.cases,
+)

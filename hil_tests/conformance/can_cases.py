@@ -12,36 +12,46 @@ from starhil.hil_tests.conformance.can_probe import (
     identifier_of,
     segments,
 )
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
-from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
+from starhil.hil_tests.conformance.case import CaseArea, check, check_equal, rule
+from starhil.hil_tests.conformance.error_flags import FlagRow, add_flag_cases
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, LONG_PAUSE_S
+from starhil.hil_tests.raw_traffic import format_frame, matches, pattern
 from starhil.protocol.can_framing import CanFrame
 
-LAYOUT: Final = "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
+SEGMENT_RULE: Final = "more than 8 bytes: 7 and a counter down to 0, no padding (libCubeObc)"
 TYPES: Final = "message types 0 to 12 (libCubeObc)"
-SEGMENTS: Final = "more than 8 bytes: 7 and a counter down to 0, no padding (libCubeObc)"
-ERRORS: Final = "configs/icd: communication_status 144, flag can_telecommand_error"
 
-LONG_PAUSE_S: Final = 0.8
-"""Longer than the device waits for the next segment (0.5 s)."""
 OTHER_HOST: Final = 0x4D
 IDENTIFICATION: Final = 128
 COMBINED: Final = 211
 COMBINED_SIZE: Final = 54
 
-_CASES: list[Case[CanProbe]] = []
+FRAMES: Final = CaseArea[CanProbe](
+    "frames", "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
+)
+REPLY_SEGMENTS: Final = CaseArea[CanProbe]("segments", SEGMENT_RULE)
+SEGMENTS: Final = CaseArea[CanProbe]("segments", SEGMENT_RULE, intrusive=True)
+UNSOLICITED: Final = CaseArea[CanProbe](
+    "unsolicited", "types 10 to 12 (libCubeObc); their use: R20, docs/rules.md", intrusive=True
+)
+ERRORS: Final = CaseArea[CanProbe](
+    "errors", "configs/icd: communication_status 144, flag can_telecommand_error", intrusive=True
+)
+TIMING: Final = CaseArea[CanProbe]("timing", rule(10))
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """A row of the frame table; HH and DD stand for the addresses of host and device, `..` for any byte."""
+    """A row of the frame table.
+
+    HH and DD stand for the addresses of host and device, `..` for any byte.
+    """
 
     id: str
     title: str
-    clause: str
     sent: tuple[str, ...]
-    answers: tuple[str, ...]
+    answers: tuple[str, ...] = ()
+    clause: str | None = None
 
 
 IGNORED: Final = ((2, "an acknowledge"), (3, "a telecommand refusal"), (5, "telemetry"), (6, "a telemetry refusal"),
@@ -50,66 +60,55 @@ IGNORED: Final = ((2, "an acknowledge"), (3, "a telecommand refusal"), (5, "tele
                   (13, "type 13"), (31, "type 31"))  # fmt: skip
 
 EXCHANGES: Final = (
-    Exchange("telemetry", "a request of telemetry is answered with type 5, addresses exchanged", LAYOUT, ("0480HHDD#",), ("0580DDHH#................",)),
-    Exchange("telemetry-6", "telemetry of 6 bytes has 6 bytes, no padding", LAYOUT, ("04E6HHDD#",), ("05E6DDHH#............",)),
-    Exchange("unknown-telemetry", "an unknown telemetry identifier is refused with type 6 and the code", TYPES, ("04C8HHDD#",), ("06C8DDHH#01",)),
-    Exchange("request-with-data", "a request of telemetry with data is refused for its length", rule(5), ("0480HHDD#00",), ("0680DDHH#02",)),
-    Exchange("other-device", "a frame for another address is not answered", LAYOUT, ("0480HHFE#",), ()),
-    Exchange("other-device-zero", "a frame for address 0 is not answered", LAYOUT, ("0480HH00#",), ()),
-    Exchange("standard", "a frame with an 11-bit identifier is not answered", LAYOUT, ("480#", "604#"), ()),
-    Exchange("remote", "a remote frame is not answered", LAYOUT, ("0480HHDD#R",), ()),
-    *(Exchange(f"type-{kind}", f"{words} is not answered", TYPES, (f"{kind:02X}80HHDD#00",), ()) for kind, words in IGNORED),
-    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", rule(6), ("0180HHDD#",), ()),
-    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", rule(6), ("0402HHDD#",), ()),
-    Exchange("two-at-once", "two requests back to back are answered in order", LAYOUT, ("0480HHDD#", "04E6HHDD#"), ("0580DDHH#................", "05E6DDHH#............")),
+    Exchange("telemetry", "a request of telemetry is answered with type 5, addresses exchanged", ("0480HHDD#",), ("0580DDHH#................",)),
+    Exchange("telemetry-6", "telemetry of 6 bytes has 6 bytes, no padding", ("04E6HHDD#",), ("05E6DDHH#............",)),
+    Exchange("unknown-telemetry", "an unknown telemetry identifier is refused with type 6 and the code", ("04C8HHDD#",), ("06C8DDHH#01",), clause=TYPES),
+    Exchange("request-with-data", "a request of telemetry with data is refused for its length", ("0480HHDD#00",), ("0680DDHH#02",), clause=rule(5)),
+    Exchange("other-device", "a frame for another address is not answered", ("0480HHFE#",)),
+    Exchange("other-device-zero", "a frame for address 0 is not answered", ("0480HH00#",)),
+    Exchange("standard", "a frame with an 11-bit identifier is not answered", ("480#", "604#")),
+    Exchange("remote", "a remote frame is not answered", ("0480HHDD#R",)),
+    *(Exchange(f"type-{kind}", f"{words} is not answered", (f"{kind:02X}80HHDD#00",), clause=TYPES) for kind, words in IGNORED),
+    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", ("0180HHDD#",), clause=rule(6)),
+    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", ("0402HHDD#",), clause=rule(6)),
+    Exchange("two-at-once", "two requests back to back are answered in order", ("0480HHDD#", "04E6HHDD#"), ("0580DDHH#................", "05E6DDHH#............")),
 )  # fmt: skip
 
 INTRUSIVE_EXCHANGES: Final = (
-    Exchange("ack", "an accepted telecommand is answered with type 2 and no data", TYPES, ("0167HHDD#",), ("0267DDHH#",)),
-    Exchange("nack", "a refused telecommand is answered with type 3 and one byte", TYPES, ("0160HHDD#4D",), ("0360DDHH#03",)),
-    Exchange("unknown-telecommand", "an unknown telecommand is refused with code 1", TYPES, ("013CHHDD#",), ("033CDDHH#01",)),
-    Exchange("short-telecommand", "a telecommand that is too short is refused with code 2", TYPES, ("0102HHDD#0102",), ("0302DDHH#02",)),
-    Exchange("long-telecommand", "a telecommand that is too long is refused with code 2", TYPES, ("0167HHDD#00",), ("0367DDHH#02",)),
-    Exchange("eight", "a telecommand of 8 bytes goes in one frame", SEGMENTS, ("0170HHDD#0200000000000100",), ("0370DDHH#03",)),
-    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", rule(7), ("0770HHDD#0200000000000101", "0770HHDD#0000"), ("0370DDHH#03",)),
-    Exchange("segmented-unknown", "an unknown telecommand in segments is refused once, after the last", SEGMENTS, ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B00"), ("033CDDHH#01",)),
-    Exchange("segmented-full-last", "the last segment may hold 7 bytes", SEGMENTS, ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B0C0D00"), ("033CDDHH#01",)),
+    Exchange("ack", "an accepted telecommand is answered with type 2 and no data", ("0167HHDD#",), ("0267DDHH#",), clause=TYPES),
+    Exchange("nack", "a refused telecommand is answered with type 3 and one byte", ("0160HHDD#4D",), ("0360DDHH#03",), clause=TYPES),
+    Exchange("unknown-telecommand", "an unknown telecommand is refused with code 1", ("013CHHDD#",), ("033CDDHH#01",), clause=TYPES),
+    Exchange("short-telecommand", "a telecommand that is too short is refused with code 2", ("0102HHDD#0102",), ("0302DDHH#02",), clause=TYPES),
+    Exchange("long-telecommand", "a telecommand that is too long is refused with code 2", ("0167HHDD#00",), ("0367DDHH#02",), clause=TYPES),
+    Exchange("eight", "a telecommand of 8 bytes goes in one frame", ("0170HHDD#0200000000000100",), ("0370DDHH#03",), clause=SEGMENT_RULE),
+    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", ("0770HHDD#0200000000000101", "0770HHDD#0000"), ("0370DDHH#03",), clause=rule(7)),
+    Exchange("segmented-unknown", "an unknown telecommand in segments is refused once, after the last", ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B00"), ("033CDDHH#01",), clause=SEGMENT_RULE),
+    Exchange("segmented-full-last", "the last segment may hold 7 bytes", ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B0C0D00"), ("033CDDHH#01",), clause=SEGMENT_RULE),
 )  # fmt: skip
 
 
-def _exchange_case(row: Exchange, *, intrusive: bool) -> Case[CanProbe]:
+def _add_exchange_case(row: Exchange, *, intrusive: bool) -> None:
+    @FRAMES.case(row.id, row.title, row.clause, intrusive=intrusive)
     def run(probe: CanProbe) -> None:
         for text in row.sent:
-            probe.send(_frame(probe, text))
+            probe.send_text(text)
         for text in row.answers:
-            wanted = pattern(_placed(probe, text))
+            wanted = pattern(probe.with_addresses(text))
             frame = probe.next_frame()
             seen = "nothing" if frame is None else format_frame(frame)
             check(matches(wanted, seen), wanted, seen)
         probe.expect_silence("no more was asked for")
         probe.expect_alive()
 
-    return Case(f"frames.{row.id}", "frames", row.title, row.clause, run, intrusive)
+
+for _row in EXCHANGES:
+    _add_exchange_case(_row, intrusive=False)
+for _row in INTRUSIVE_EXCHANGES:
+    _add_exchange_case(_row, intrusive=True)
 
 
-def _placed(probe: CanProbe, text: str) -> str:
-    return text.replace("HH", f"{probe.host:02X}").replace("DD", f"{probe.device:02X}")
-
-
-def _frame(probe: CanProbe, text: str) -> CanFrame:
-    try:
-        return parse_frame(_placed(probe, text))
-    except BenchError as error:  # a slip in the tables above
-        raise AssertionError(text) from error
-
-
-_CASES += [_exchange_case(row, intrusive=False) for row in EXCHANGES]
-_CASES += [_exchange_case(row, intrusive=True) for row in INTRUSIVE_EXCHANGES]
-
-
-@case(_CASES, "frames.askers", "each asker gets the answer at its own address", LAYOUT)
+@FRAMES.case("askers", "each asker gets the answer at its own address")
 def askers(probe: CanProbe) -> None:
-    """Two hosts at once."""
     for source in (OTHER_HOST, probe.host, 0xFF):
         probe.post_as(source, IDENTIFICATION)
     seen = [probe.next_answer() for _ in range(3)]
@@ -119,14 +118,11 @@ def askers(probe: CanProbe) -> None:
 # --- segments of the answer ---
 
 
-@case(
-    _CASES,
-    "segments.reply",
+@REPLY_SEGMENTS.case(
+    "reply",
     "54 bytes come in 8 segments that count 7 to 0, the last with 5 bytes and its counter",
-    SEGMENTS,
 )
 def segmented_reply(probe: CanProbe) -> None:
-    """All under one identifier of type 8."""
     probe.post(COMBINED)
     frames = [probe.next_frame() for _ in range(8)]
     identifier = identifier_of(8, COMBINED, probe.device, probe.host)
@@ -138,9 +134,9 @@ def segmented_reply(probe: CanProbe) -> None:
     check_equal(seen, [(identifier, 8, left) for left in range(7, 0, -1)] + [(identifier, 6, 0)], "segments")
 
 
-@case(_CASES, "segments.all-rows", "every row goes in one frame up to 8 bytes, in segments above", SEGMENTS)
+@REPLY_SEGMENTS.case("all-rows", "every row goes in one frame up to 8 bytes, in segments above")
 def all_rows(probe: CanProbe) -> None:
-    """The type of the first frame tells."""
+    """The type of the first frame shows which."""
     for row in probe.icd.telemetry.values():
         probe.post(row.id)
         frame = probe.next_frame()
@@ -155,18 +151,12 @@ def all_rows(probe: CanProbe) -> None:
                 probe.next_frame()
 
 
-@case(
-    _CASES,
-    "unsolicited.segments",
-    "a long row comes unsolicited as first, body and last, counters down to 0",
-    "types 10 to 12 (libCubeObc); their use: R20, docs/rules.md",
-    intrusive=True,
-)
+@UNSOLICITED.case("segments", "a long row comes unsolicited as first, body and last, counters down to 0")
 def unsolicited_segments(probe: CanProbe) -> None:
-    """star_tracker, 54 bytes: 8 frames."""
+    """star_tracker has 54 bytes, so 8 frames."""
     probe.command("set_unsolicited", telemetry=COMBINED, rate=5.0)
     try:
-        probe.unasked(1.0)
+        probe.receive_unsolicited(1.0)
         seen = probe.unsolicited[:8]
     finally:
         probe.command("set_unsolicited", telemetry=COMBINED, rate=0.0)
@@ -203,19 +193,13 @@ def _expect_one_refusal(probe: CanProbe) -> None:
     probe.expect_silence("one message was sent")
 
 
-@case(
-    _CASES,
-    "segments.lost",
-    "a message with a lost segment has no effect, the next one has",
-    SEGMENTS,
-    intrusive=True,
-)
+@SEGMENTS.case("lost", "a message with a lost segment has no effect, the next one has")
 def lost_segment(probe: CanProbe) -> None:
-    """Each of the segments in turn."""
+    """Each of the segments is left out in turn."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     for lost in range(len(frames)):
         _send(probe, frames[:lost] + frames[lost + 1 :])
-        # a message without its first segment cannot be told from a shorter one
+        # a message without its first segment looks like a shorter one
         if lost == 0:
             probe.sleep(probe.times.quiet_s)
             probe.drain()
@@ -228,7 +212,7 @@ def lost_segment(probe: CanProbe) -> None:
         _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.doubled", "a message with a doubled segment has no effect", SEGMENTS, intrusive=True)
+@SEGMENTS.case("doubled", "a message with a doubled segment has no effect")
 def doubled_segment(probe: CanProbe) -> None:
     """The second of five."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
@@ -238,7 +222,7 @@ def doubled_segment(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.swapped", "a message with exchanged segments has no effect", SEGMENTS, intrusive=True)
+@SEGMENTS.case("swapped", "a message with exchanged segments has no effect")
 def swapped_segments(probe: CanProbe) -> None:
     """The second and the third of five."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
@@ -248,47 +232,48 @@ def swapped_segments(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.empty", "a segment without a counter has no effect", SEGMENTS, intrusive=True)
+@SEGMENTS.case("empty", "a segment without a counter has no effect")
 def empty_segment(probe: CanProbe) -> None:
-    """No data at all."""
     probe.send(CanFrame(identifier_of(TELECOMMAND_SEGMENT, UNKNOWN, probe.host, probe.device)))
     probe.expect_silence("there was no counter")
     _send(probe, _segment_frames(probe, UNKNOWN, LONG))
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.half", "half a message is given up after a while", rule(2), intrusive=True)
+@SEGMENTS.case("half", "an incomplete message is dropped after a time-out", rule(2))
 def half_message(probe: CanProbe) -> None:
-    """The last segment, when it comes too late, has no effect (two of them would be a message of their own)."""
+    """The last segment arrives too late (the last two would form a message)."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:-1])
     probe.sleep(LONG_PAUSE_S)
     _send(probe, frames[-1:])
-    probe.expect_silence("the message had been given up")
+    probe.expect_silence("the message has timed out")
     _send(probe, frames)
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.pause", "a pause of 0.1 s between segments does no harm", rule(1), intrusive=True)
+@SEGMENTS.case("pause", "a pause of 0.1 s between segments does no harm", rule(1))
 def pause_between(probe: CanProbe) -> None:
-    """As slow hosts send."""
     for frame in _segment_frames(probe, UNKNOWN, LONG):
         probe.send(frame)
         probe.sleep(0.1)
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.anew", "a message may begin anew before it was ended", rule(8), intrusive=True)
-def begun_anew(probe: CanProbe) -> None:
-    """Two segments, then all of them."""
+@SEGMENTS.case("anew", "a message may restart before its end", rule(8))
+def restarted_message(probe: CanProbe) -> None:
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:2] + frames)
     _expect_one_refusal(probe)
 
 
-@case(_CASES, "segments.two-hosts", "segments of two hosts do not mix", LAYOUT, intrusive=True)
+@SEGMENTS.case(
+    "two-hosts",
+    "segments of two hosts do not mix",
+    "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)",
+)
 def two_hosts(probe: CanProbe) -> None:
-    """One from each in turn; both messages are complete."""
+    """The segments alternate; both messages are complete."""
     ours, theirs = _segment_frames(probe, UNKNOWN, LONG), _segment_frames(probe, UNKNOWN, LONG, OTHER_HOST)
     for one, other in zip(ours, theirs, strict=True):
         _send(probe, [one, other])
@@ -296,15 +281,13 @@ def two_hosts(probe: CanProbe) -> None:
     check_equal([(answer.kind, answer.code, answer.other) for answer in seen], [("nack", INVALID_ID, probe.host), ("nack", INVALID_ID, OTHER_HOST)], "answers")  # fmt: skip
 
 
-@case(
-    _CASES,
-    "segments.request-between",
+@SEGMENTS.case(
+    "request-between",
     "a request between segments is answered at once and does no harm",
-    LAYOUT,
-    intrusive=True,
+    "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)",
 )
 def request_between(probe: CanProbe) -> None:
-    """Telemetry after the second of five segments."""
+    """Telemetry is requested after the second of five segments."""
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:2])
     probe.expect_alive()
@@ -312,84 +295,42 @@ def request_between(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@case(
-    _CASES,
-    "segments.overlong",
-    "a message that is too long has no effect, the next one has",
-    rule(4),
-    intrusive=True,
-)
+@SEGMENTS.case("overlong", "a message that is too long has no effect, the next one has", rule(4))
 def overlong(probe: CanProbe) -> None:
-    """1750 bytes; the published host's buffer has 512."""
+    """1750 bytes; the buffer of the published host software has 512."""
     _send(probe, _segment_frames(probe, UNKNOWN, bytes(250 * 7)))
     probe.expect_silence("the message was too long")
     _send(probe, _segment_frames(probe, UNKNOWN, LONG))
     _expect_one_refusal(probe)
 
 
-@case(
-    _CASES,
-    "segments.long",
-    "a message of 500 bytes is taken and refused for its length",
-    rule(4),
-    intrusive=True,
-)
+@SEGMENTS.case("long", "a message of 500 bytes is taken and refused for its length", rule(4))
 def long_message(probe: CanProbe) -> None:
-    """set_star_config has 53."""
+    """set_star_config has 53 bytes."""
     row = probe.icd.telecommands["set_star_config"]
     probe.expect_refusal(row.id, bytes(500), INVALID_LENGTH)
 
 
 # --- errors are flagged ---
 
+CAN_ERROR: Final = frozenset({"can_telecommand_error"})
 FLAGS: Final = (
-    ("type", "a message type that is no request", ("0580HHDD#00",), 0.0),
-    ("swapped-kinds", "a telecommand frame with a telemetry identifier", ("0180HHDD#",), 0.0),
-    ("sequence", "a segment out of order", ("073CHHDD#0001020304050602", "073CHHDD#0001020304050600"), 0.0),
-    ("begins-nothing", "a last segment without others", ("073CHHDD#00010203040500",), 0.0),
-    ("no-counter", "a segment without a counter", ("073CHHDD#",), 0.0),
-    ("half", "half a message", ("073CHHDD#0001020304050602",), LONG_PAUSE_S),
-)
+    FlagRow("type", "a message type that is no request", ("0580HHDD#00",), CAN_ERROR),
+    FlagRow("swapped-kinds", "a telecommand frame with a telemetry identifier", ("0180HHDD#",), CAN_ERROR),
+    FlagRow("sequence", "a segment out of order", ("073CHHDD#0001020304050602", "073CHHDD#0001020304050600"), CAN_ERROR),
+    FlagRow("begins-nothing", "a last segment without others", ("073CHHDD#00010203040500",), CAN_ERROR),
+    FlagRow("no-counter", "a segment without a counter", ("073CHHDD#",), CAN_ERROR),
+    FlagRow("half", "half a message", ("073CHHDD#0001020304050602",), CAN_ERROR, pause_s=LONG_PAUSE_S),
+)  # fmt: skip
+add_flag_cases(ERRORS, FLAGS)
 
 
-def _flag_case(name: str, title: str, sent: tuple[str, ...], pause_s: float) -> Case[CanProbe]:
-    def run(probe: CanProbe) -> None:
-        probe.command("clear_counters")
-        for text in sent:
-            probe.send(_frame(probe, text))
-        probe.expect_silence("no request was made", max(pause_s, probe.times.quiet_s))
-        status = probe.telemetry("communication_status")
-        check(status["can_telecommand_error"], "flag can_telecommand_error", "not set")
-        check(
-            not status["uart_protocol_error"] and not status["uart_incomplete"],
-            "no flag of the serial line",
-            "set",
-        )
-        counts = (status["telecommand_count"], status["telemetry_count"])
-        check_equal(counts, (0, 1), "counts of telecommands and telemetry")
-        probe.command("clear_counters")
-        status = probe.telemetry("communication_status")
-        check(not status["can_telecommand_error"], "flag cleared", "still set")
-
-    return Case(
-        f"errors.{name}",
-        "errors",
-        f"{title} sets its flag and counts as nothing",
-        ERRORS,
-        run,
-        intrusive=True,
-    )
-
-
-_CASES += [_flag_case(*row) for row in FLAGS]
-
-
-@case(_CASES, "errors.none", "good requests, and frames for others, set no flag", ERRORS, intrusive=True)
+@ERRORS.case("none", "good requests, and frames for others, set no flag")
 def no_flag(probe: CanProbe) -> None:
-    """11-bit, remote and foreign frames are nobody's error."""
+    """11-bit, remote and foreign frames are not errors."""
     probe.command("clear_counters")
     for text in ("0480HHFE#", "1F80HHFE#00", "480#0102", "0480HHDD#R", "073CHHFE#00"):
-        probe.send(_frame(probe, text))
+        probe.send_text(text)
     probe.expect_silence("they are not for the device")
     _send(probe, _segment_frames(probe, UNKNOWN, LONG))
     _expect_one_refusal(probe)
@@ -400,13 +341,20 @@ def no_flag(probe: CanProbe) -> None:
 # --- time ---
 
 
-@case(_CASES, "timing.burst", "two hundred requests back to back are all answered", rule(10))
+@TIMING.case("burst", "two hundred requests back to back are all answered")
 def many_at_once(probe: CanProbe) -> None:
-    """In order, none lost."""
+    """In order."""
     identifier = identifier_of(TELEMETRY_REQUEST, IDENTIFICATION, probe.host, probe.device)
     _send(probe, [CanFrame(identifier)] * 200)
     for _ in range(200):
         probe.expect_telemetry(IDENTIFICATION, 2.0)
 
 
-CASES: Final = tuple(_CASES)
+CASES: Final = (
+    *FRAMES.cases,
+    *REPLY_SEGMENTS.cases,
+    *UNSOLICITED.cases,
+    *SEGMENTS.cases,
+    *ERRORS.cases,
+    *TIMING.cases,
+)

@@ -1,4 +1,4 @@
-"""The tester's side of a device on CAN with the CubeSpace identifier layout: strict about every frame."""
+"""The tester's side of a CAN link with the CubeSpace layout of CAN IDs; checks every frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starhil.hil_tests.conformance.link_probe import (
     ProbeTimes,
 )
 from starhil.hil_tests.conformance.ports import Port
-from starhil.hil_tests.raw_exchange import format_frame
+from starhil.hil_tests.raw_traffic import format_frame, parse_frame
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -79,10 +79,10 @@ class CanProbe(LinkProbe):
         return self.bus.now()
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass; what comes meanwhile is kept."""
+        """Let time pass; received data are kept."""
         end = self.now() + seconds
         while (left := end - self.now()) > 0:
-            self._take(left)
+            self._receive_into_buffer(left)
 
     def post(self, identifier: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
@@ -98,11 +98,19 @@ class CanProbe(LinkProbe):
             self.send(CanFrame(identifier_of(kind, identifier, source, self.device), payload))
 
     def send(self, frame: CanFrame) -> None:
-        """Send a frame as it stands."""
+        """Send a raw frame."""
         self.log.append(f"{self.now():.4f} -> {format_frame(frame)}")
         self.bus.send(frame)
 
-    def _take(self, timeout_s: float) -> bool:
+    def send_text(self, text: str) -> None:
+        """Send a frame in the format of `cansend`, with HH and DD for the addresses."""
+        self.send(parse_frame(self.with_addresses(text)))
+
+    def with_addresses(self, text: str) -> str:
+        """Replace HH and DD in the text of a frame by the addresses of host and device."""
+        return text.replace("HH", f"{self.host:02X}").replace("DD", f"{self.device:02X}")
+
+    def _receive_into_buffer(self, timeout_s: float) -> bool:
         frame = self.bus.receive(timeout_s)
         if frame is None:
             return False
@@ -116,18 +124,18 @@ class CanProbe(LinkProbe):
         return True
 
     def drain(self) -> None:
-        """Let go of all that has come."""
+        """Discard everything received."""
         while self.bus.receive(0.0) is not None:
             pass
         self._frames.clear()
         self.unsolicited.clear()
 
-    def surplus(self, quiet_s: float) -> Answer:
-        """Return what comes without having been asked for."""
+    def unexpected_answer(self, quiet_s: float) -> Answer:
+        """Return an unexpected answer."""
         self.sleep(quiet_s)
         return self._read(0.0) if self._frames else Answer("none")
 
-    def unasked(self, seconds: float) -> list[Answer]:
+    def receive_unsolicited(self, seconds: float) -> list[Answer]:
         """Return the messages of unsolicited telemetry that come within a time."""
         self.unsolicited.clear()
         self.sleep(seconds)
@@ -147,12 +155,12 @@ class CanProbe(LinkProbe):
         end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
         while not self._frames:
             left = end - self.now()
-            if left <= 0 or not self._take(left):
+            if left <= 0 or not self._receive_into_buffer(left):
                 break
         return self._frames.pop(0) if self._frames else None
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next answer that was not yet looked at."""
+        """Return the next unread answer."""
         return self._read(self.times.answer_s if timeout_s is None else timeout_s)
 
     def _read(self, timeout_s: float) -> Answer:
@@ -175,7 +183,10 @@ class CanProbe(LinkProbe):
                 return Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
 
     def _segmented(self, first: CanFrame, number: int, other: int) -> Answer:
-        """Join the segments of one message; another counter or a short one in between is malformed."""
+        """Join the segments of one message.
+
+        Another counter or a short one in between is malformed.
+        """
         data = b""
         frame: CanFrame | None = first
         left = first.data[-1] if first.data else 0

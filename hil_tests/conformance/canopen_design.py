@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from starhil.hil_tests.conformance.canopen_pdo import (
     EVENT,
     SYNCHRONOUS,
@@ -12,20 +14,14 @@ from starhil.hil_tests.conformance.canopen_pdo import (
     writable,
 )
 from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe, size_of
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+DESIGN: Final = CaseArea[CanopenProbe]("canopen.design", "interface definition: canopen.toml", intrusive=True)
 
 
-@case(
-    _CASES,
-    "canopen.design.write-event",
-    "a write to a mapped object is an event",
-    "interface definition: canopen.toml",
-    intrusive=True,
-)
+@DESIGN.case("write-event", "a write to a mapped object is an event")
 def write_event(probe: CanopenProbe) -> None:
-    """The event-driven TPDO comes with the new value."""
+    """The event-driven TPDO carries the new value."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
     before = probe.read(item.index, item.subindex)
@@ -37,15 +33,9 @@ def write_event(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(
-    _CASES,
-    "canopen.design.attitude",
-    "TPDOs with a sequence number are of one sample",
-    "interface definition: canopen.toml",
-    intrusive=True,
-)
+@DESIGN.case("attitude", "TPDOs with a sequence number are of one sample")
 def attitude(probe: CanopenProbe) -> None:
-    """All TPDOs that map an object named `sequence` carry the same one after one SYNC."""
+    """All TPDOs that map an object named `sequence` carry the same number after one SYNC."""
     marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
     chosen: list[int] = []
     probe.quiet()
@@ -65,4 +55,4 @@ def attitude(probe: CanopenProbe) -> None:
         check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*DESIGN.cases,)

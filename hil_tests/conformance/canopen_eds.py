@@ -1,4 +1,4 @@
-"""CANopen conformance: the data sheet by itself, whether it is complete and consistent (CiA 306)."""
+"""CANopen conformance: completeness and consistency of the EDS (CiA 306)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
 from starhil.hil_tests.conformance.canopen_sdo_block import upload_blocks
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+EDS: Final = CaseArea[CanopenProbe]("canopen.eds", "CiA 306 4.5")
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 ACCESS: Final = {"ro", "rw", "wo", "const", "rwr", "rww"}
 LISTS: Final = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
@@ -28,7 +28,7 @@ RESTRICTED: Final = (
 
 def _file(probe: CanopenProbe) -> configparser.RawConfigParser:
     if not probe.eds:
-        raise CaseSkipped("no data sheet as a file")
+        raise CaseSkipped("no EDS file")
     parser = configparser.RawConfigParser(inline_comment_prefixes=(";",), strict=True)
     try:
         parser.read_string(probe.eds)
@@ -37,16 +37,15 @@ def _file(probe: CanopenProbe) -> configparser.RawConfigParser:
     return parser
 
 
-@case(_CASES, "canopen.eds.mandatory", "mandatory objects are described", "CiA 301 7.5.1")
+@EDS.case("mandatory", "mandatory objects are described", "CiA 301 7.5.1")
 def mandatory(probe: CanopenProbe) -> None:
-    """1000h, 1001h and 1018h are in every data sheet."""
     missing = [f"{index:04X}h" for index in MANDATORY if index not in probe.od]
     check(not missing, "1000h, 1001h and 1018h", f"missing {', '.join(missing)}")
 
 
-@case(_CASES, "canopen.eds.lists", "object lists and sections agree", "CiA 306 4.6.2")
+@EDS.case("lists", "object lists and sections agree", "CiA 306 4.6.2")
 def lists(probe: CanopenProbe) -> None:
-    """Each listed object has a section, each section is listed, in the list of its range, once."""
+    """Each object is listed once, in the list of its range, and has a section."""
     parser = _file(probe)
     listed: list[int] = []
     for name in LISTS:
@@ -65,7 +64,7 @@ def lists(probe: CanopenProbe) -> None:
     check_equal(sorted(listed), sorted(sections), "listed objects")
 
 
-@case(_CASES, "canopen.eds.types", "every variable has a type, a name and an access", "CiA 306 4.6.3")
+@EDS.case("types", "every variable has a type, a name and an access", "CiA 306 4.6.3")
 def types(probe: CanopenProbe) -> None:
     """Data types are those of CiA 301, access types those of CiA 306."""
     known = set(ODVariable.STRUCT_TYPES) | set(datatypes.DATA_TYPES)
@@ -76,9 +75,9 @@ def types(probe: CanopenProbe) -> None:
         check(item.name, f"name of {item.index:04X}h:{item.subindex:02X}h", "none")
 
 
-@case(_CASES, "canopen.eds.limits", "limits and defaults fit each other and their type", "CiA 306 4.6.3")
+@EDS.case("limits", "limits and defaults fit each other and their type", "CiA 306 4.6.3")
 def limits(probe: CanopenProbe) -> None:
-    """Low limit, default and high limit are in order and in the range of the type."""
+    """Low limit, default and high limit are in ascending order and within the range of the type."""
     for item in probe.variables():
         if not is_integer(item):
             continue
@@ -92,9 +91,12 @@ def limits(probe: CanopenProbe) -> None:
             check(low <= item.default <= high, f"default of {item.qualname} in {low} to {high}", item.default)
 
 
-@case(_CASES, "canopen.eds.sub-index-0", "sub-index 0 tells the highest sub-index", "CiA 301 7.4.3")
+@EDS.case("sub-index-0", "sub-index 0 holds the highest sub-index", "CiA 301 7.4.3")
 def sub_index_0(probe: CanopenProbe) -> None:
-    """Records and arrays have a sub-index 0, an UNSIGNED8, whose constant is the highest sub-index."""
+    """Sub-index 0 of records and arrays is an UNSIGNED8.
+
+    A constant one equals the highest sub-index.
+    """
     for index in sorted(probe.od.indices):
         item = probe.od.indices[index]
         if not isinstance(item, ODRecord | ODArray):
@@ -106,20 +108,20 @@ def sub_index_0(probe: CanopenProbe) -> None:
             check_equal(first.default, max(item.subindices), f"highest sub-index of {index:04X}h")
 
 
-@case(_CASES, "canopen.eds.pdo-count", "number of PDOs agrees with the records", "CiA 306 4.5")
+@EDS.case("pdo-count", "number of PDOs agrees with the records")
 def pdo_count(probe: CanopenProbe) -> None:
     """NrOfRXPDO and NrOfTXPDO count the communication records, and each has its mapping record."""
     information = probe.od.device_information
-    for first, told in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
+    for first, stated in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
         indices = probe.pdo_indices(first)
-        check_equal(int(told or 0), len(indices), f"number of PDOs from {first:04X}h on")
+        check_equal(int(stated or 0), len(indices), f"number of PDOs from {first:04X}h on")
         missing = [f"{index + 0x200:04X}h" for index in indices if index + 0x200 not in probe.od]
         check(not missing, "a mapping record for each PDO", f"missing {missing}")
 
 
-@case(_CASES, "canopen.eds.mapping", "default mappings name objects that can be mapped", "CiA 301 7.5.2.36")
+@EDS.case("mapping", "default mappings name objects that can be mapped", "CiA 301 7.5.2.36")
 def mapping(probe: CanopenProbe) -> None:
-    """Object, length, mappability, direction, and 64 bits at most."""
+    """Existence, length, mappability, direction, and 64 bits at most."""
     for first in (0x1600, 0x1A00):
         for index in probe.pdo_indices(first):
             record = probe.od.indices[index]
@@ -133,7 +135,7 @@ def mapping(probe: CanopenProbe) -> None:
                     continue
                 item = probe.od.get_variable(value >> 16, value >> 8 & 0xFF)
                 where = f"{index:04X}h:{number:02X}h"
-                check(item is not None, f"{where} names an object of the data sheet", f"{value:08X}")
+                check(item is not None, f"{where} names an object of the EDS", f"{value:08X}")
                 if item is not None:
                     usable = item.readable if first == 0x1A00 else item.writable
                     check(
@@ -143,9 +145,9 @@ def mapping(probe: CanopenProbe) -> None:
             check(total <= 64, f"{index:04X}h maps at most 64 bits", total)
 
 
-@case(_CASES, "canopen.eds.cob-ids", "default identifiers are free, allowed and distinct", "CiA 301 7.3.5")
+@EDS.case("cob-ids", "default identifiers are free, allowed and distinct", "CiA 301 7.3.5")
 def cob_ids(probe: CanopenProbe) -> None:
-    """Identifiers of valid PDOs, SYNC, TIME and EMCY are not restricted, and no two messages share one."""
+    """Valid PDOs, SYNC, TIME and EMCY use no restricted CAN-ID, and no two of them share one."""
     used: dict[int, str] = {}
     for index in (0x1005, 0x1012, 0x1014, *probe.pdo_indices(0x1400), *probe.pdo_indices(0x1800)):
         item = probe.od.get_variable(index, 0 if index < 0x1400 else 1)
@@ -154,35 +156,32 @@ def cob_ids(probe: CanopenProbe) -> None:
         identifier = item.default & 0x1FFFFFFF
         restricted = any(low <= identifier <= high for low, high in RESTRICTED)
         check(not restricted, f"identifier of {index:04X}h allowed", f"0x{identifier:03X}")
-        check(identifier not in used, f"identifier of {index:04X}h of its own", used.get(identifier))
+        check(identifier not in used, f"identifier of {index:04X}h is unique", used.get(identifier))
         used[identifier] = f"0x{identifier:03X} is that of {index:04X}h"
 
 
-@case(_CASES, "canopen.eds.identity", "device information agrees with the identity object", "CiA 306 4.5")
+@EDS.case("identity", "device information agrees with the identity object")
 def identity(probe: CanopenProbe) -> None:
-    """Vendor, product and revision stand in both places."""
+    """Vendor, product and revision number."""
     information = probe.od.device_information
-    told = (information.vendor_number, information.product_number, information.revision_number)
-    for subindex, number in enumerate(told, 1):
+    stated = (information.vendor_number, information.product_number, information.revision_number)
+    for subindex, number in enumerate(stated, 1):
         item = probe.od.get_variable(0x1018, subindex)
         if item is not None and item.default is not None and number is not None:
             check_equal(item.default, number, f"1018h:{subindex:02X}h")
 
 
-@case(_CASES, "canopen.eds.bit-rates", "at least one bit rate is supported", "CiA 306 4.5")
+@EDS.case("bit-rates", "at least one bit rate is supported")
 def bit_rates(probe: CanopenProbe) -> None:
-    """BaudRate_... entries."""
     check(probe.od.device_information.allowed_baudrates, "a supported bit rate", "none")
 
 
-@case(
-    _CASES, "canopen.eds.stored", "the data sheet that the node serves is the one given", "CiA 301 7.5.2.21"
-)
+@EDS.case("stored", "the EDS that the node serves is the one under test", "CiA 301 7.5.2.21")
 def stored(probe: CanopenProbe) -> None:
-    """1021h, if there is one, gives the text of the file."""
+    """1021h, if present, serves the text of the file."""
     item = probe.od.get_variable(0x1021)
     if item is None:
-        raise CaseSkipped("the data sheet has no object 1021h")
+        raise CaseSkipped("the EDS has no object 1021h")
     parser = _file(probe)
     served = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     try:
@@ -197,4 +196,4 @@ def stored(probe: CanopenProbe) -> None:
             check_equal(dict(served.items(name)), dict(parser.items(name)), f"section {name}")
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*EDS.cases,)

@@ -8,25 +8,21 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_GENERAL,
     ABORT_NO_DATA,
     ABORT_NO_SUBINDEX,
-    ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
     PDO_OFF,
     PRE_OPERATIONAL,
     STOP,
+    VALUE_ABORTS,
+    WATCHED_NODE,
     CanopenProbe,
     multiplexer,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
-REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
-WATCHED: Final = 0x05
-"""A node-ID that stands for a watched node; nobody else on the bus may have it."""
+EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusive=True)
 
 
-class Provocation:
-    """An error that the tester can call forth and end: a SYNC of wrong length, else a watched node that falls silent."""
+class ProvokedError:
+    """An error caused by the tester: a SYNC of wrong length, else a missing heartbeat."""
 
     def __init__(self, probe: CanopenProbe) -> None:
         probe.require(0x1014)
@@ -38,41 +34,35 @@ class Provocation:
         self.cause()
         if probe.wait_for(self.emergency, 0.2) is None:
             if 0x1016 not in probe.od:
-                raise CaseSkipped("no error of this device can be called forth over the bus")
+                raise CaseSkipped("no error of this device can be caused over the bus")
             self._by_sync = False
-            probe.set(0x1016, 1, WATCHED << 16 | 50)
+            probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
             self.cause()
             probe.expect(self.emergency, "EMCY 8130h of a watched node", 0.5)
         self.code = 0x8240 if self._by_sync else 0x8130
-        self.end()
+        self.clear()
         probe.wait_for(self.emergency, 0.2)
         probe.drain()
 
     def cause(self) -> None:
-        """Call the error forth; with a watched node it comes 50 ms later."""
+        """Cause the error; with a watched node it occurs 50 ms later."""
         if self._by_sync:
             self._probe.send(0x080, b"\x01")
         else:
-            self._probe.send(0x700 + WATCHED, b"\x05")
+            self._probe.send_watched_heartbeat()
 
-    def end(self) -> None:
-        """End it."""
+    def clear(self) -> None:
+        """Clear the error."""
         if self._by_sync:
             self._probe.send(0x080)
         else:
-            self._probe.send(0x700 + WATCHED, b"\x05")
+            self._probe.send_watched_heartbeat()
 
 
-@case(
-    _CASES,
-    "canopen.emcy.format",
-    "EMCY has 8 bytes: code, error register, 5 bytes",
-    "CiA 301 7.2.7.3",
-    intrusive=True,
-)
+@EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
 def emcy_format(probe: CanopenProbe) -> None:
-    """The register is that of 1001h, with the generic bit."""
-    error = Provocation(probe)
+    """The register equals 1001h and has the generic bit set."""
+    error = ProvokedError(probe)
     error.cause()
     data = probe.expect(error.emergency, "EMCY")
     check_equal(len(data), 8, "bytes")
@@ -80,24 +70,24 @@ def emcy_format(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1001), data[2], "1001h")
 
 
-@case(_CASES, "canopen.emcy.once", "one EMCY an error", "CiA 301 7.2.7.1", intrusive=True)
+@EMCY.case("once", "one EMCY per error", "CiA 301 7.2.7.1")
 def emcy_once(probe: CanopenProbe) -> None:
-    """The same error again while it is there sends nothing."""
-    error = Provocation(probe)
+    """The same error sends nothing while it persists."""
+    error = ProvokedError(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
     error.cause()
     probe.expect_silence(error.emergency, "second EMCY")
 
 
-@case(_CASES, "canopen.emcy.gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1", intrusive=True)
+@EMCY.case("gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
-    """The error register is clear again, the history keeps the error."""
-    error = Provocation(probe)
+    """The error register is clear again; the history keeps the error."""
+    error = ProvokedError(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
     count = probe.number(0x1003, 0) if 0x1003 in probe.od else 0
-    error.end()
+    error.clear()
     data = probe.expect(error.emergency, "EMCY 0000h")
     check_equal(data[:3], bytes(3), "error code and register")
     check_equal(probe.number(0x1001), 0, "1001h")
@@ -105,17 +95,14 @@ def emcy_gone(probe: CanopenProbe) -> None:
         check_equal(probe.number(0x1003, 0), count, "errors in the history")
 
 
-@case(
-    _CASES,
-    "canopen.emcy.history",
-    "the error history has the newest first",
-    "CiA 301 7.5.2.3",
-    intrusive=True,
-)
+@EMCY.case("history", "the error history has the newest first")
 def emcy_history(probe: CanopenProbe) -> None:
-    """Its count grows by one an error up to its length; sub-index 1 has the newest code; writing 0 clears it."""
+    """The count grows with each error up to the length; sub-index 1 holds the newest code.
+
+    Writing 0 clears it.
+    """
     probe.require(0x1003)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)
     check_equal(probe.number(0x1003, 0), 0, "errors after the clear")
     probe.expect_abort(b"\x40" + multiplexer(0x1003, 1), ABORT_NO_DATA, ABORT_GENERAL, ABORT_NO_SUBINDEX)
@@ -125,88 +112,80 @@ def emcy_history(probe: CanopenProbe) -> None:
         probe.expect(error.emergency, "EMCY")
         check_equal(probe.number(0x1003, 0), min(number, length), "errors")
         check_equal(probe.number(0x1003, 1) & 0xFFFF, error.code, "newest error")
-        error.end()
+        error.clear()
         probe.expect(error.emergency, "EMCY 0000h")
 
 
-@case(_CASES, "canopen.emcy.history-order", "older errors move up", "CiA 301 7.5.2.3", intrusive=True)
+@EMCY.case("history-order", "older errors move up")
 def emcy_history_order(probe: CanopenProbe) -> None:
-    """A second, other error: a watched node that falls silent."""
+    """The second error is another one: the heartbeat of a watched node stops."""
     probe.require(0x1003)
     probe.require(0x1016)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)
     error.cause()
     probe.expect(error.emergency, "EMCY")
-    probe.set(0x1016, 1, 0x0005_0032)
-    probe.send(0x705, b"\x05")
+    probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
+    probe.send_watched_heartbeat()
     register = probe.expect(error.emergency, "EMCY 8130h", 0.5)[2]
     codes = [probe.number(0x1003, subindex) & 0xFFFF for subindex in (1, 2)]
     check_equal(codes, [0x8130, error.code], "errors")
-    error.end()
+    error.clear()
     data = probe.expect(error.emergency, "EMCY 0000h")
     check_equal(data[2], register, "error register with the error that remains")
 
 
-@case(
-    _CASES, "canopen.emcy.history-write", "the error history takes 0 only", "CiA 301 7.5.2.3", intrusive=True
-)
+@EMCY.case("history-write", "the error history takes 0 only")
 def emcy_history_write(probe: CanopenProbe) -> None:
     """Any other number is refused by 0609 0030h."""
     probe.require(0x1003)
-    probe.expect_refusal(0x1003, 0, 1, 1, *REFUSED)
+    probe.expect_refusal(0x1003, 0, 1, 1, *VALUE_ABORTS)
 
 
-@case(
-    _CASES,
-    "canopen.emcy.switch",
-    "EMCY is switched off by bit 31 and moved only then",
-    "CiA 301 7.5.2.15",
-    intrusive=True,
-)
+@EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
-    """Another identifier while it is on is refused, as are restricted ones."""
-    error = Provocation(probe)
-    probe.expect_refusal(0x1014, 0, 0x91, 4, *REFUSED)
+    """A new CAN-ID is refused while EMCY is on; restricted ones always are."""
+    error = ProvokedError(probe)
+    probe.expect_refusal(0x1014, 0, 0x91, 4, *VALUE_ABORTS)
     probe.set(0x1014, 0, PDO_OFF | error.emergency)
     for identifier in (0x2000_0091, 0x701, 0x000):
-        probe.expect_refusal(0x1014, 0, identifier, 4, *REFUSED)
+        probe.expect_refusal(0x1014, 0, identifier, 4, *VALUE_ABORTS)
     error.cause()
     probe.expect_silence(error.emergency, "EMCY while it is off")
-    error.end()
+    error.clear()
     probe.set(0x1014, 0, 0x91)
     probe.drain()
     error.cause()
     probe.expect(0x91, "EMCY under its new identifier")
 
 
-@case(_CASES, "canopen.emcy.inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16", intrusive=True)
+@EMCY.case("inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16")
 def emcy_inhibit(probe: CanopenProbe) -> None:
-    """With 100 ms the second comes 100 ms after the first."""
+    """With 100 ms the second EMCY follows 100 ms after the first."""
     probe.require(0x1015)
-    error = Provocation(probe)
+    error = ProvokedError(probe)
     probe.set(0x1015, 0, 1000, 2)
     error.cause()
     probe.expect(error.emergency, "EMCY")
     start = probe.bus.now()
-    error.end()
+    error.clear()
     probe.expect(error.emergency, "EMCY 0000h")
     check(
         0.08 <= probe.bus.now() - start <= 0.15, "0.1 s between two EMCY", f"{probe.bus.now() - start:.3f} s"
     )
 
 
-@case(_CASES, "canopen.emcy.stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
+@EMCY.case("stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5")
 def emcy_stopped(probe: CanopenProbe) -> None:
-    """A watched node falls silent in STOPPED: nothing until the node leaves it."""
+    """A missing heartbeat in STOPPED causes no EMCY until the node leaves that state."""
     probe.require(0x1016)
-    error = Provocation(probe)
-    probe.set(0x1016, 1, 0x0005_0032)
+    error = ProvokedError(probe)
+    probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
     probe.command(STOP)
-    probe.send(0x705, b"\x05")
+    probe.send_watched_heartbeat()
     probe.expect_silence(error.emergency, "EMCY in STOPPED", 0.3)
     probe.command(PRE_OPERATIONAL)
     check(probe.number(0x1001) & 0x10, "communication error in 1001h", probe.number(0x1001))
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*EMCY.cases,)

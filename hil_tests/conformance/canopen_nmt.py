@@ -13,16 +13,16 @@ from starhil.hil_tests.conformance.canopen_probe import (
     SETTLING_S,
     START,
     STOP,
+    WATCHED_NODE,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+NMT: Final = CaseArea[CanopenProbe]("canopen.nmt", "CiA 301 7.3.2.2", intrusive=True)
+ERROR_CONTROL: Final = CaseArea[CanopenProbe]("canopen.error-control", "CiA 301 7.2.8.3.2", intrusive=True)
 NMT_CLAUSE: Final = "CiA 301 7.3.2.2"
 CONTROL_CLAUSE: Final = "CiA 301 7.2.8.3"
 STATE_OF: Final = {START: 0x05, STOP: 0x04, PRE_OPERATIONAL: 0x7F}
-OTHER_NODE: Final = 0x05
-"""A node-ID that stands for a watched node; nobody else on the bus may have it."""
 
 
 def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
@@ -30,21 +30,15 @@ def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
 
 
 def _state(probe: CanopenProbe) -> int:
-    """Return the state that the next heartbeat tells, once what was under way has come."""
+    """Return the state in the next heartbeat, after the frames in transit have arrived."""
     probe.wait_for(NOBODY, SETTLING_S)
     probe.drain()
     return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]
 
 
-@case(
-    _CASES,
-    "canopen.nmt.boot-up",
-    "boot-up message, then PRE-OPERATIONAL by itself",
-    f"{NMT_CLAUSE}.1",
-    intrusive=True,
-)
+@NMT.case("boot-up", "boot-up message, then PRE-OPERATIONAL without a command", "CiA 301 7.3.2.2.1")
 def boot_up(probe: CanopenProbe) -> None:
-    """After each reset one frame 700h + node-ID with one byte 00, and SDO works."""
+    """After each reset: one frame 700h + node-ID with data 00; then SDO works."""
     for command in (RESET_COMMUNICATION, RESET_NODE):
         probe.drain()
         probe.command(command)
@@ -53,25 +47,16 @@ def boot_up(probe: CanopenProbe) -> None:
         check_equal(_state(probe), 0x7F, "state")
 
 
-@case(
-    _CASES, "canopen.nmt.boot-up-once", "one boot-up message a reset", f"{CONTROL_CLAUSE}.3", intrusive=True
-)
+@NMT.case("boot-up-once", "one boot-up message per reset", "CiA 301 7.2.8.3.3")
 def boot_up_once(probe: CanopenProbe) -> None:
-    """No second frame 00."""
     probe.reset_communication()
     data = probe.wait_for(0x700 + probe.node, 0.2, lambda data: data == b"\0")
     check(data is None, "one boot-up message", "two")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.commands",
-    "start, stop and enter PRE-OPERATIONAL from every state",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("commands", "start, stop and enter PRE-OPERATIONAL from every state")
 def commands(probe: CanopenProbe) -> None:
-    """All nine changes, addressed to the node."""
+    """All nine transitions, addressed to the node."""
     _prepare(probe)
     for before in STATE_OF:
         for command, state in STATE_OF.items():
@@ -80,36 +65,23 @@ def commands(probe: CanopenProbe) -> None:
             check_equal(_state(probe), state, f"state after commands {before} and {command}:")
 
 
-@case(_CASES, "canopen.nmt.broadcast", "commands to all nodes", f"{CONTROL_CLAUSE}", intrusive=True)
+@NMT.case("broadcast", "commands to all nodes", "CiA 301 7.2.8.3")
 def broadcast(probe: CanopenProbe) -> None:
-    """Node-ID 0 stands for every node; only for a bus with nothing else in operation."""
+    """Node-ID 0 addresses every node; only for a bus on which nothing else is in operation."""
     _prepare(probe)
     for command, state in STATE_OF.items():
         probe.command(command, 0)
         check_equal(_state(probe), state, f"state after command {command} to all:")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.other-node",
-    "commands to another node are not obeyed",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("other-node", "commands to another node are ignored")
 def other_node(probe: CanopenProbe) -> None:
-    """Start for the next node-ID."""
     _prepare(probe)
     probe.command(START, probe.node % 127 + 1)
     check_equal(_state(probe), 0x7F, "state")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.malformed",
-    "frames that are no NMT command are not obeyed",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("malformed", "frames that are no NMT command are ignored")
 def malformed(probe: CanopenProbe) -> None:
     """Unknown specifier, one byte, three bytes, extended frame."""
     _prepare(probe)
@@ -121,7 +93,7 @@ def malformed(probe: CanopenProbe) -> None:
     check_equal(_state(probe), 0x7F, "state after an extended frame:")
 
 
-@case(_CASES, "canopen.nmt.reset-states", "resets work from every state", f"{NMT_CLAUSE}", intrusive=True)
+@NMT.case("reset-states", "resets work from every state")
 def reset_states(probe: CanopenProbe) -> None:
     """Reset node and reset communication from OPERATIONAL and STOPPED."""
     for before in (START, STOP):
@@ -132,13 +104,7 @@ def reset_states(probe: CanopenProbe) -> None:
             probe.expect_boot_up()
 
 
-@case(
-    _CASES,
-    "canopen.nmt.reset-communication",
-    "reset communication restores the communication profile",
-    f"{NMT_CLAUSE}",
-    intrusive=True,
-)
+@NMT.case("reset-communication", "reset communication restores the communication profile")
 def reset_communication(probe: CanopenProbe) -> None:
     """A changed heartbeat time has its stored value again."""
     before = probe.number(0x1017)
@@ -147,15 +113,8 @@ def reset_communication(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1017), before, "1017h")
 
 
-@case(
-    _CASES,
-    "canopen.nmt.sdo-states",
-    "SDO in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED",
-    f"{NMT_CLAUSE}.5",
-    intrusive=True,
-)
+@NMT.case("sdo-states", "SDO in PRE-OPERATIONAL and OPERATIONAL, not in STOPPED", "CiA 301 7.3.2.2.5")
 def sdo_states(probe: CanopenProbe) -> None:
-    """As the table of states and communication objects has it."""
     for command, answered in ((PRE_OPERATIONAL, True), (START, True), (STOP, False)):
         probe.command(command)
         answer = probe.ask("40 00 10 00", 0.2)
@@ -165,15 +124,9 @@ def sdo_states(probe: CanopenProbe) -> None:
 # Heartbeat
 
 
-@case(
-    _CASES,
-    "canopen.error-control.heartbeat",
-    "heartbeat at its period with the state",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("heartbeat", "heartbeat at its period with the state")
 def heartbeat(probe: CanopenProbe) -> None:
-    """One byte, bit 7 clear; period within a fifth over five heartbeats of 100 ms."""
+    """One byte with bit 7 clear; mean period within 20 % over five heartbeats of 100 ms."""
     _prepare(probe, 100)
     probe.drain()
     found = probe.count(0x700 + probe.node, 0.75)
@@ -183,30 +136,16 @@ def heartbeat(probe: CanopenProbe) -> None:
     check(0.08 <= mean <= 0.12, "period 0.1 s", f"{mean:.4f} s")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.heartbeat-off",
-    "no heartbeat with time 0",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("heartbeat-off", "no heartbeat with time 0")
 def heartbeat_off(probe: CanopenProbe) -> None:
-    """1017h set to 0."""
     _prepare(probe, 50)
     _prepare(probe, 0)
     probe.drain()
     probe.expect_silence(0x700 + probe.node, "heartbeat", 0.3)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.heartbeat-stopped",
-    "heartbeat goes on in STOPPED",
-    f"{NMT_CLAUSE}.5",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("heartbeat-stopped", "heartbeat goes on in STOPPED", "CiA 301 7.3.2.2.5")
 def heartbeat_stopped(probe: CanopenProbe) -> None:
-    """With state 04."""
     _prepare(probe)
     probe.command(STOP)
     check_equal(_state(probe), 0x04, "state")
@@ -226,15 +165,9 @@ def _prepare_guarding(probe: CanopenProbe) -> None:
     probe.drain()
 
 
-@case(
-    _CASES,
-    "canopen.error-control.guarding",
-    "node guarding with toggle bit",
-    f"{CONTROL_CLAUSE}.1",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("guarding", "node guarding with toggle bit", "CiA 301 7.2.8.3.1")
 def guarding(probe: CanopenProbe) -> None:
-    """The toggle bit begins at 0 after a reset and alternates; the state is right."""
+    """The toggle bit starts at 0 after a reset and alternates; the state is correct."""
     _prepare_guarding(probe)
     check_equal([_guard(probe) for _ in range(3)], [0x7F, 0xFF, 0x7F], "answers")
     probe.command(START)
@@ -249,15 +182,11 @@ def guarding(probe: CanopenProbe) -> None:
     check_equal(_guard(probe), 0x7F, "first answer after the reset")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.guarding-or-heartbeat",
-    "no node guarding while the heartbeat is on",
-    f"{CONTROL_CLAUSE}.1",
-    intrusive=True,
+@ERROR_CONTROL.case(
+    "guarding-or-heartbeat", "no node guarding while the heartbeat is on", "CiA 301 7.2.8.3.1"
 )
 def guarding_or_heartbeat(probe: CanopenProbe) -> None:
-    """A remote request is not answered with 1017h set."""
+    """A remote request is not answered while 1017h is not 0."""
     probe.require(0x100C)
     _prepare(probe, 5000)
     probe.drain()
@@ -265,9 +194,12 @@ def guarding_or_heartbeat(probe: CanopenProbe) -> None:
     probe.expect_silence(0x700 + probe.node, "answer to node guarding", 0.2)
 
 
-@case(_CASES, "canopen.error-control.life-guarding", "life guarding", f"{CONTROL_CLAUSE}.1", intrusive=True)
+@ERROR_CONTROL.case("life-guarding", "life guarding", "CiA 301 7.2.8.3.1")
 def life_guarding(probe: CanopenProbe) -> None:
-    """It begins with the first request; when they end, EMCY 8130h comes and OPERATIONAL is left."""
+    """It starts with the first request.
+
+    When requests stop, EMCY 8130h is sent and the node leaves OPERATIONAL.
+    """
     _prepare_guarding(probe)
     probe.require(0x100D)
     probe.set(0x100C, 0, 50, 2)
@@ -294,54 +226,41 @@ def _emergency(probe: CanopenProbe) -> int:
 def _watch(probe: CanopenProbe) -> int:
     probe.require(0x1016)
     _prepare(probe, 0)
-    probe.set(0x1016, 1, OTHER_NODE << 16 | 100)
+    probe.set(0x1016, 1, WATCHED_NODE << 16 | 100)
     return _emergency(probe)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer-start",
-    "a watch begins with the first heartbeat",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer-start", "a watch begins with the first heartbeat")
 def consumer_start(probe: CanopenProbe) -> None:
-    """No EMCY while the watched node was never heard."""
+    """No EMCY before the watched node has sent its first heartbeat."""
     emergency = _watch(probe)
     probe.expect_silence(emergency, "EMCY", 0.4)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer",
-    "a watched node falls silent and comes back",
-    f"{CONTROL_CLAUSE}.2",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer", "the heartbeat of a watched node stops and returns")
 def consumer(probe: CanopenProbe) -> None:
-    """EMCY 8130h after the time, not before; error register set; EMCY 0000h when it is heard again."""
+    """EMCY 8130h after the consumer time, not before; the error register is set.
+
+    EMCY 0000h at the next heartbeat.
+    """
     emergency = _watch(probe)
     for _ in range(3):
-        probe.send(0x700 + OTHER_NODE, b"\x05")
+        probe.send_watched_heartbeat()
         probe.expect_silence(emergency, "EMCY while it is heard", 0.07)
     data = probe.expect(emergency, "EMCY 8130h", 0.3)
     check_equal(data[:2], b"\x30\x81", "error code")
     check(data[2] & 0x11 == 0x11, "error register with generic and communication", data[2])
     check_equal(probe.number(0x1001), data[2], "1001h")
-    probe.send(0x700 + OTHER_NODE, b"\x05")
+    probe.send_watched_heartbeat()
     data = probe.expect(emergency, "EMCY 0000h", 0.3)
     check_equal(data[:3], bytes(3), "error code and register")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.behaviour",
-    "error behaviour when a watched node falls silent",
-    "CiA 301 7.5.2.32",
-    intrusive=True,
+@ERROR_CONTROL.case(
+    "behaviour", "error behaviour when the heartbeat of a watched node stops", "CiA 301 7.5.2.32"
 )
 def behaviour(probe: CanopenProbe) -> None:
-    """1029h:01h at 0 leads to PRE-OPERATIONAL, at 1 to no change, at 2 to STOPPED."""
+    """1029h:01h = 0 leads to PRE-OPERATIONAL, 1 to no change, 2 to STOPPED."""
     probe.require(0x1029)
     for value, state in ((0, 0x7F), (1, 0x05), (2, 0x04)):
         probe.command(PRE_OPERATIONAL)
@@ -349,43 +268,34 @@ def behaviour(probe: CanopenProbe) -> None:
         probe.set(0x1029, 1, value, 1)
         _prepare(probe)
         probe.command(START)
-        probe.send(0x700 + OTHER_NODE, b"\x05")
+        probe.send_watched_heartbeat()
         probe.wait_for(NOBODY, 0.2)
         check_equal(_state(probe), state, f"state with 1029h:01h at {value}:")
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer-twice",
-    "one node is watched by one entry",
-    "CiA 301 7.5.2.18",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer-twice", "one node is watched by one entry", "CiA 301 7.5.2.18")
 def consumer_twice(probe: CanopenProbe) -> None:
-    """A second entry for the same node is refused by 0604 0043h."""
+    """A second entry for the same node is refused with 0604 0043h."""
     _watch(probe)
     item = probe.od.get_variable(0x1016, 2)
     if item is None:
         raise CaseSkipped("1016h has one entry")
-    probe.expect_refusal(0x1016, 2, OTHER_NODE << 16 | 200, 4, ABORT_INCOMPATIBLE)
-    probe.set(0x1016, 2, (OTHER_NODE + 1) << 16 | 200)
+    probe.expect_refusal(0x1016, 2, WATCHED_NODE << 16 | 200, 4, ABORT_INCOMPATIBLE)
+    probe.set(0x1016, 2, (WATCHED_NODE + 1) << 16 | 200)
 
 
-@case(
-    _CASES,
-    "canopen.error-control.consumer-off",
-    "a watch with time 0 is off",
-    "CiA 301 7.5.2.18",
-    intrusive=True,
-)
+@ERROR_CONTROL.case("consumer-off", "a watch with time 0 is off", "CiA 301 7.5.2.18")
 def consumer_off(probe: CanopenProbe) -> None:
-    """Heard once, then switched off: no EMCY."""
+    """The watch is switched off after the first heartbeat: no EMCY."""
     emergency = _watch(probe)
-    probe.send(0x700 + OTHER_NODE, b"\x05")
+    probe.send_watched_heartbeat()
     probe.set(0x1016, 1, 0)
     data = probe.wait_for(emergency, 0.4)
     if data is not None:
         raise CaseFailed("no EMCY", data.hex(" "))
 
 
-CASES = tuple(_CASES)
+CASES: Final = (
+    *NMT.cases,
+    *ERROR_CONTROL.cases,
+)

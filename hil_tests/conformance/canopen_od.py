@@ -1,6 +1,8 @@
-"""CANopen conformance: the object dictionary that the node serves against its data sheet."""
+"""CANopen conformance: the object dictionary of the node compared with its EDS."""
 
 from __future__ import annotations
+
+from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
@@ -24,9 +26,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     multiplexer,
     size_of,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
 NOT_NOW = {ABORT_NO_DATA, ABORT_GENERAL, ABORT_DEVICE_STATE, ABORT_NOT_STORED}
 """Aborts by which a node says that an object exists and has no value now."""
 
@@ -43,38 +45,29 @@ def _readable(probe: CanopenProbe, indices: range) -> None:
             check_equal(len(seen), size_of(item), f"bytes of {where} ({item.qualname})")
 
 
-@case(
-    _CASES,
-    "canopen.od.communication",
-    "every object of the communication profile can be read",
-    "CiA 301 7.5.2",
+@OD.case(
+    "communication", "every object of the communication profile can be read", "CiA 301 7.5.2", intrusive=False
 )
 def communication(probe: CanopenProbe) -> None:
-    """1000h to 1FFFh, each in the length of its type."""
+    """1000h to 1FFFh, each with the length of its type."""
     _readable(probe, range(0x1000, 0x2000))
 
 
-@case(_CASES, "canopen.od.manufacturer", "every object of the manufacturer can be read", "CiA 301 7.4.1")
+@OD.case("manufacturer", "every object of the manufacturer can be read", "CiA 301 7.4.1", intrusive=False)
 def manufacturer(probe: CanopenProbe) -> None:
-    """2000h to 5FFFh, each in the length of its type."""
+    """2000h to 5FFFh, each with the length of its type."""
     _readable(probe, range(0x2000, 0x6000))
 
 
-@case(_CASES, "canopen.od.profile", "every object of the device profile area can be read", "CiA 301 7.4.1")
+@OD.case("profile", "every object of the device profile area can be read", "CiA 301 7.4.1", intrusive=False)
 def profile(probe: CanopenProbe) -> None:
-    """6000h to 9FFFh, each in the length of its type."""
+    """6000h to 9FFFh, each with the length of its type."""
     _readable(probe, range(0x6000, 0xA000))
 
 
-@case(
-    _CASES,
-    "canopen.od.defaults",
-    "after a reset the defaults are those of the data sheet",
-    "CiA 301 7.5.2",
-    intrusive=True,
-)
+@OD.case("defaults", "after a reset the defaults are those of the EDS", "CiA 301 7.5.2")
 def defaults(probe: CanopenProbe) -> None:
-    """Communication profile, integers, in a node whose parameters were not stored."""
+    """Integers of the communication profile, after `load` has cleared stored parameters."""
     if 0x1011 in probe.od:
         probe.set(0x1011, 1, b"load")
     probe.reset_communication()
@@ -91,9 +84,9 @@ def defaults(probe: CanopenProbe) -> None:
             )
 
 
-@case(_CASES, "canopen.od.texts", "names and versions are those of the data sheet", "CiA 301 7.5.2.7")
+@OD.case("texts", "names and versions are those of the EDS", "CiA 301 7.5.2.7", intrusive=False)
 def texts(probe: CanopenProbe) -> None:
-    """1008h to 100Ah, as far as the data sheet gives them."""
+    """1008h to 100Ah, if the EDS has them."""
     for index in (0x1008, 0x1009, 0x100A):
         item = probe.od.get_variable(index)
         if item is not None and item.default is not None:
@@ -102,7 +95,7 @@ def texts(probe: CanopenProbe) -> None:
             )
 
 
-@case(_CASES, "canopen.od.identity", "identity is that of the data sheet", "CiA 301 7.5.2.19")
+@OD.case("identity", "identity is that of the EDS", "CiA 301 7.5.2.19", intrusive=False)
 def identity(probe: CanopenProbe) -> None:
     """1000h and 1018h."""
     for index, subindex in ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3)):
@@ -111,7 +104,7 @@ def identity(probe: CanopenProbe) -> None:
             check_equal(probe.number(index, subindex), item.default, f"{index:04X}h:{subindex:02X}h")
 
 
-@case(_CASES, "canopen.od.sub-index-0", "sub-index 0 of a record is its highest sub-index", "CiA 301 7.4.3")
+@OD.case("sub-index-0", "sub-index 0 of a record is its highest sub-index", "CiA 301 7.4.3", intrusive=False)
 def sub_index_0(probe: CanopenProbe) -> None:
     """Every record and array whose sub-index 0 is constant."""
     for item in probe.variables():
@@ -120,24 +113,18 @@ def sub_index_0(probe: CanopenProbe) -> None:
             check_equal(probe.number(item.index, 0), max(group.subindices), f"{item.index:04X}h:00h")
 
 
-@case(_CASES, "canopen.od.write-only", "write-only objects are not read", "CiA 301 7.2.4.3.17")
+@OD.case("write-only", "write-only objects are not read", intrusive=False)
 def write_only(probe: CanopenProbe) -> None:
-    """All of them, abort 0601 0001h."""
+    """Abort 0601 0001h for each of them."""
     probe.find("write-only object", lambda item: item.access_type == "wo")
     for item in probe.variables():
         if item.access_type == "wo":
             probe.expect_abort(b"\x40" + multiplexer(item.index, item.subindex), ABORT_WRITE_ONLY)
 
 
-@case(
-    _CASES,
-    "canopen.od.read-only",
-    "read-only and constant objects are not written",
-    "CiA 301 7.2.4.3.17",
-    intrusive=True,
-)
+@OD.case("read-only", "read-only and constant objects are not written")
 def read_only(probe: CanopenProbe) -> None:
-    """All of them, abort 0601 0002h."""
+    """Abort 0601 0002h for each of them."""
     for item in probe.variables():
         if item.access_type in {"ro", "const"}:
             size = min(size_of(item) or 1, 4)
@@ -146,15 +133,9 @@ def read_only(probe: CanopenProbe) -> None:
                 probe.expect_abort(command + multiplexer(item.index, item.subindex), ABORT_READ_ONLY)
 
 
-@case(
-    _CASES,
-    "canopen.od.no-object",
-    "objects that the data sheet does not have do not exist",
-    "CiA 301 7.2.4.3.17",
-    intrusive=True,
-)
+@OD.case("no-object", "objects that are not in the EDS do not exist")
 def no_object(probe: CanopenProbe) -> None:
-    """The gaps at both ends of each run of objects, abort 0602 0000h, reading and writing."""
+    """The gaps at both ends of each run of objects: abort 0602 0000h for reading and writing."""
     present = {index for index in probe.od.indices if index >= 0x1000}
     gaps = sorted({near for index in present for near in (index - 1, index + 1) if near >= 0x1000} - present)
     for index in [0x0000, 0x0005, *gaps, 0xFFFF]:
@@ -163,15 +144,9 @@ def no_object(probe: CanopenProbe) -> None:
             probe.expect_abort(b"\x2f" + multiplexer(index, 0), ABORT_NO_OBJECT)
 
 
-@case(
-    _CASES,
-    "canopen.od.no-sub-index",
-    "sub-indices beyond the data sheet do not exist",
-    "CiA 301 7.2.4.3.17",
-    intrusive=True,
-)
+@OD.case("no-sub-index", "sub-indices that are not in the EDS do not exist")
 def no_sub_index(probe: CanopenProbe) -> None:
-    """The first beyond each record and sub-index 1 of each variable, abort 0609 0011h."""
+    """The first beyond each record, and sub-index 1 of each variable: abort 0609 0011h."""
     for index in sorted(probe.od.indices):
         if index < 0x1000:
             continue
@@ -182,9 +157,9 @@ def no_sub_index(probe: CanopenProbe) -> None:
             probe.expect_abort(b"\x2f" + multiplexer(index, beyond), ABORT_NO_SUBINDEX)
 
 
-@case(_CASES, "canopen.od.length-high", "too long a value is refused", "CiA 301 7.2.4.3.17", intrusive=True)
+@OD.case("length-high", "too long a value is refused")
 def length_high(probe: CanopenProbe) -> None:
-    """Expedited writes with one byte too many, abort 0607 0010h or 0607 0012h."""
+    """Expedited writes with one byte too many: abort 0607 0010h or 0607 0012h."""
     for item in probe.variables():
         size = size_of(item)
         if item.writable and size is not None and size < 4 and item.index not in {0x1010, 0x1011}:
@@ -194,9 +169,9 @@ def length_high(probe: CanopenProbe) -> None:
             )
 
 
-@case(_CASES, "canopen.od.length-low", "too short a value is refused", "CiA 301 7.2.4.3.17", intrusive=True)
+@OD.case("length-low", "too short a value is refused")
 def length_low(probe: CanopenProbe) -> None:
-    """Expedited writes with one byte too few, abort 0607 0010h or 0607 0013h."""
+    """Expedited writes with one byte too few: abort 0607 0010h or 0607 0013h."""
     for item in probe.variables():
         size = size_of(item)
         if item.writable and size is not None and 1 < size <= 5:
@@ -215,15 +190,9 @@ def _bounded(probe: CanopenProbe) -> list[ODVariable]:
     ]
 
 
-@case(
-    _CASES,
-    "canopen.od.value-high",
-    "values above the limit are refused",
-    "CiA 301 7.2.4.3.17",
-    intrusive=True,
-)
+@OD.case("value-high", "values above the limit are refused")
 def value_high(probe: CanopenProbe) -> None:
-    """One above each high limit that the type can hold, abort 0609 0031h or 0609 0030h."""
+    """One above each high limit that the type can hold: abort 0609 0031h or 0609 0030h."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
@@ -233,11 +202,9 @@ def value_high(probe: CanopenProbe) -> None:
             probe.expect_refusal(item.index, item.subindex, data, size, ABORT_VALUE_HIGH, ABORT_VALUE)
 
 
-@case(
-    _CASES, "canopen.od.value-low", "values below the limit are refused", "CiA 301 7.2.4.3.17", intrusive=True
-)
+@OD.case("value-low", "values below the limit are refused")
 def value_low(probe: CanopenProbe) -> None:
-    """One below each low limit that the type can hold, abort 0609 0032h or 0609 0030h."""
+    """One below each low limit that the type can hold: abort 0609 0032h or 0609 0030h."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
@@ -247,9 +214,9 @@ def value_low(probe: CanopenProbe) -> None:
             probe.expect_refusal(item.index, item.subindex, data, size, ABORT_VALUE_LOW, ABORT_VALUE)
 
 
-@case(_CASES, "canopen.od.write-back", "what is written is read back", "CiA 301 7.2.4.3", intrusive=True)
+@OD.case("write-back", "what is written is read back", "CiA 301 7.2.4.3")
 def write_back(probe: CanopenProbe) -> None:
-    """Limits and default of a writable application object, then its old value again."""
+    """Both limits of each writable application object, then its previous value."""
     found = 0
     for item in probe.variables():
         size = size_of(item)
@@ -275,4 +242,4 @@ def write_back(probe: CanopenProbe) -> None:
         raise CaseFailed("an object that takes its limits", "none")
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*OD.cases,)

@@ -11,8 +11,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_ACCESS,
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
+    FIRST_OWN_OBJECT,
     NO_RTR,
     PDO_OFF,
     CanopenProbe,
@@ -21,10 +20,8 @@ from starhil.hil_tests.conformance.canopen_probe import (
 )
 from starhil.hil_tests.conformance.case import CaseSkipped
 
-REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
 FIXED: Final = (ABORT_ACCESS, ABORT_DEVICE_STATE, ABORT_VALUE)
 """Aborts by which stacks refuse a change of the mapping of a PDO in use; CiA 301 names none."""
-FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 SYNCHRONOUS: Final = 1
 EVENT: Final = 255
 
@@ -50,18 +47,27 @@ def constant(probe: CanopenProbe) -> ODVariable:
 
 
 def writable(probe: CanopenProbe) -> ODVariable:
-    """Return an object to receive that can be read back and has limits or none."""
-    return probe.find(
-        "object for an RPDO",
-        lambda item: (
+    """Return an object for an RPDO that accepts both its limits now; skip the case if there is none.
+
+    Another object may bound it more tightly than the EDS: an exposure time by the update rate.
+    """
+    for item in probe.variables():
+        size = size_of(item)
+        if (
             item.pdo_mappable
             and item.access_type == "rw"
             and is_integer(item)
-            and size_of(item) in {1, 2}
-            and item.index >= 0x2000
+            and size in {1, 2}
+            and item.index >= FIRST_OWN_OBJECT
             and item.max is not None
-        ),
-    )
+        ):
+            before = probe.read(item.index, item.subindex)
+            limits = [int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max)]
+            accepted = [probe.write(item.index, item.subindex, limit) == 0 for limit in limits]
+            probe.set(item.index, item.subindex, before)
+            if all(accepted):
+                return item
+    raise CaseSkipped("the EDS has no object for an RPDO that accepts its limits")
 
 
 def set_up(
@@ -75,7 +81,10 @@ def set_up(
     event_ms: int = 0,
     start: int | None = None,
 ) -> int:
-    """Configure a PDO by the procedure of CiA 301 and return its identifier; other PDOs and the heartbeat are off."""
+    """Configure a PDO by the procedure of CiA 301 and return its identifier.
+
+    Other PDOs and the heartbeat are off.
+    """
     probe.quiet()
     transmit = index >= 0x1800
     number = index & 0x1FF
@@ -103,7 +112,10 @@ def set_up(
 
 
 def first(probe: CanopenProbe, kind: int) -> int:
-    """Return the index of the first RPDO (1400h) or TPDO (1800h); skip the case if there is none."""
+    """Return the index of the first RPDO (1400h) or TPDO (1800h).
+
+    Skip the case if there is none.
+    """
     indices = probe.pdo_indices(kind)
     if not indices:
         raise CaseSkipped(f"no PDO from {kind:04X}h on")
@@ -116,7 +128,10 @@ def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
 
 
 def after_event(probe: CanopenProbe, identifier: int, timeout_s: float | None = None) -> bytes:
-    """Return the TPDO that a write to a mapped object has caused; skip the case if such a write is no event here."""
+    """Return the TPDO that a write to a mapped object has caused.
+
+    Skip the case if such a write is no event here.
+    """
     data = probe.wait_for(identifier, timeout_s)
     if data is None:
         raise CaseSkipped("a write to a mapped object is no event of this device")

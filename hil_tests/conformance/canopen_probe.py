@@ -1,4 +1,4 @@
-"""The tester's side of a CANopen node: frames and short SDO requests, with a log of all that was sent and seen."""
+"""The tester's side of a CANopen node: frames and SDO requests, with a log of the traffic."""
 
 from __future__ import annotations
 
@@ -64,9 +64,16 @@ ABORT_NOT_STORED: Final = 0x08000020
 ABORT_DEVICE_STATE: Final = 0x08000022
 ABORT_NO_DATA: Final = 0x08000024
 
+VALUE_ABORTS: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
+"""Abort codes with which a node may refuse a value."""
+RESTRICTED_IDS: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
+"""CAN-IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
+WATCHED_NODE: Final = 0x05
+"""Node-ID of a simulated watched node; no other node on the bus may have it."""
+
 
 class FrameBus(Protocol):
-    """A CAN bus as the cases use it: synchronous, with its own time."""
+    """A synchronous CAN bus with its own clock."""
 
     def send(self, frame: CanFrame) -> None:
         """Send a frame."""
@@ -88,9 +95,9 @@ class CanopenProbe:
     node
         Its node-ID.
     od
-        Its object dictionary, from its data sheet.
+        Its object dictionary, from its EDS.
     eds
-        Text of the data sheet; empty if there is none.
+        Text of the EDS; empty if there is none.
     timeout_s
         Longest time for an answer.
     """
@@ -113,7 +120,8 @@ class CanopenProbe:
     def silence(self, *, booting: bool) -> str | None:
         """Return `nothing` if the node answers no reading of its device type, None if it does.
 
-        A node that may be booting or stopped is asked again, with its boot-up message as an answer too.
+        A node that may be booting or stopped is asked again, with its boot-up message as an answer
+        too.
         """
         if booting:
             self.drain()
@@ -147,7 +155,7 @@ class CanopenProbe:
         """
         if not self._found:
             return
-        self.begin_anew()
+        self.reset_to_stored_values()
         changed = {item: value for item, value in self._found.items() if self.read(*item) != value}
         refused = {item: value for item, value in changed.items() if self.write(*item, value)}
         for item, value in refused.items():  # one that another one bounds
@@ -160,14 +168,14 @@ class CanopenProbe:
     def begin(self, *, intrusive: bool) -> None:
         """Start a case: an intrusive one begins with the communication reset."""
         if intrusive:
-            self.begin_anew()
+            self.reset_to_stored_values()
         else:
             self.abandon_transfer()
 
     def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same after any case)
         """End a case: an intrusive one ends with the communication reset."""
         if intrusive:
-            self.begin_anew()
+            self.reset_to_stored_values()
 
     def recover(self) -> None:
         """Nothing is left to pass: the next case begins by abandoning what was under way."""
@@ -191,7 +199,7 @@ class CanopenProbe:
         return frame
 
     def drain(self) -> None:
-        """Let go of what has already come; fail if there is no end of it."""
+        """Discard everything received; fail if the node floods the bus."""
         for _ in range(MOST_WAITING):
             if self.receive(0.0) is None:
                 return
@@ -203,7 +211,7 @@ class CanopenProbe:
         timeout_s: float | None = None,
         accept: Callable[[bytes], bool] = lambda _data: True,
     ) -> bytes | None:
-        """Return the data of the next frame with one of the identifiers that is accepted, None if none comes."""
+        """Return the data of the next accepted frame with one of the CAN IDs, else None."""
         wanted = {identifiers} if isinstance(identifiers, int) else identifiers
         end = self.bus.now() + (self.timeout_s if timeout_s is None else timeout_s)
         while (left := end - self.bus.now()) >= 0:
@@ -281,7 +289,10 @@ class CanopenProbe:
         )
 
     def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str) -> None:
-        """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer stands for any."""
+        """Fail unless an SDO answer is an abort with one of the codes.
+
+        An empty multiplexer stands for any.
+        """
         expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
         if seen is None:
             raise CaseFailed(expected, "nothing")
@@ -351,21 +362,25 @@ class CanopenProbe:
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
 
     def command_and_settle(self, specifier: int) -> None:
-        """Send an NMT command, and let go of what the node had sent before it obeyed."""
+        """Send an NMT command, and discard what the node sent before it obeyed."""
         self.command(specifier)
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
 
+    def send_watched_heartbeat(self) -> None:
+        """Send a heartbeat of the watched node, in OPERATIONAL."""
+        self.send(0x700 + WATCHED_NODE, b"\x05")
+
     def reset_communication(self) -> None:
-        """Reset the communication and wait for the boot-up message, so that all is at its stored values."""
+        """Reset the communication to its stored values and wait for the boot-up message."""
         self.drain()
         self.command(RESET_COMMUNICATION)
         self.expect_boot_up()
 
-    def begin_anew(self) -> None:
-        """Bring the node to PRE-OPERATIONAL with its stored values, as far as it can be brought there.
+    def reset_to_stored_values(self) -> None:
+        """Bring the node to PRE-OPERATIONAL with its stored values, if it boots.
 
-        That a node does not boot up is for the cases about booting up to find; all others go on without it.
+        Other cases than those of the boot-up go on without a boot-up message.
         """
         self.abandon_transfer()
         self.command(RESET_COMMUNICATION)
@@ -379,14 +394,14 @@ class CanopenProbe:
         self.expect(0x700 + self.node, "boot-up message 00", 5.0, _is_boot_up)
 
     def quiet(self) -> None:
-        """Switch off the heartbeat and all PDOs, so that only what a case provokes is on the bus."""
+        """Switch off the heartbeat and all PDOs, so that the case alone causes traffic."""
         if 0x1017 in self.od:
             self.set(0x1017, 0, 0, 2)
         for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):
             self.set(index, 1, self.number(index, 1) | PDO_OFF)
 
     def expect_state(self, state: int) -> None:
-        """Fail unless the node is in a state: it tells by a heartbeat, switched on for it if it must be."""
+        """Fail unless the heartbeat reports a state; the heartbeat is switched on if necessary."""
         if state == 0x04:
             data = self.wait_for(0x700 + self.node, 2.5)
         else:
@@ -399,7 +414,7 @@ class CanopenProbe:
     # What the dictionary has
 
     def variables(self) -> list[ODVariable]:
-        """Return all variables of the data sheet, without those that only describe data types."""
+        """Return all variables of the EDS, without those that only describe data types."""
         found: list[ODVariable] = []
         for index in sorted(self.od.indices):
             if index < 0x1000:
@@ -416,12 +431,12 @@ class CanopenProbe:
         for item in self.variables():
             if wanted(item):
                 return item
-        raise CaseSkipped(f"the data sheet has no {what}")
+        raise CaseSkipped(f"the EDS has no {what}")
 
     def require(self, index: int) -> None:
         """Skip the case if an object is not there."""
         if index not in self.od:
-            raise CaseSkipped(f"the data sheet has no object {index:04X}h")
+            raise CaseSkipped(f"the EDS has no object {index:04X}h")
 
     def pdo_indices(self, first: int) -> list[int]:
         """Return the indices of communication records from 1400h or 1800h on."""
@@ -440,7 +455,7 @@ def size_of(item: ODVariable) -> int | None:
 
 
 def is_integer(item: ODVariable) -> bool:
-    """Tell whether a variable is an integer."""
+    """Return whether a variable is an integer."""
     return item.data_type in datatypes.INTEGER_TYPES
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from starhil.hil_tests.conformance.canopen_pdo import (
     FIXED,
-    FORBIDDEN,
-    REFUSED,
     SYNCHRONOUS,
     entry,
     first,
@@ -17,19 +17,20 @@ from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_NOT_MAPPABLE,
     PDO_OFF,
     PRE_OPERATIONAL,
+    RESTRICTED_IDS,
     START,
     STOP,
+    VALUE_ABORTS,
     CanopenProbe,
     size_of,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+RPDO: Final = CaseArea[CanopenProbe]("canopen.rpdo", "CiA 301 7.2.2.2", intrusive=True)
 
 
-@case(_CASES, "canopen.rpdo.event", "event-driven RPDO acts at once", "CiA 301 7.2.2.2", intrusive=True)
+@RPDO.case("event", "event-driven RPDO acts at once")
 def rpdo_event(probe: CanopenProbe) -> None:
-    """The object has the value that was sent."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
@@ -41,9 +42,9 @@ def rpdo_event(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.rpdo.gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5", intrusive=True)
+@RPDO.case("gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def rpdo_gate(probe: CanopenProbe) -> None:
-    """In PRE-OPERATIONAL and in STOPPED the object keeps its value."""
+    """The object keeps its value in PRE-OPERATIONAL and in STOPPED."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     data = next(
@@ -59,15 +60,9 @@ def rpdo_gate(probe: CanopenProbe) -> None:
         check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(
-    _CASES,
-    "canopen.rpdo.synchronous",
-    "synchronous RPDO acts at the next SYNC",
-    "CiA 301 7.2.2.2",
-    intrusive=True,
-)
+@RPDO.case("synchronous", "synchronous RPDO acts at the next SYNC")
 def rpdo_synchronous(probe: CanopenProbe) -> None:
-    """The old value before it, the latest received after it."""
+    """The object keeps its value until the SYNC, then takes the last one received."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
@@ -81,13 +76,7 @@ def rpdo_synchronous(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(
-    _CASES,
-    "canopen.rpdo.short",
-    "too short an RPDO is reported and not processed",
-    "CiA 301 7.2.2.3, 7.2.7.1",
-    intrusive=True,
-)
+@RPDO.case("short", "too short an RPDO is reported and not processed", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_short(probe: CanopenProbe) -> None:
     """EMCY 8210h; the object keeps its value."""
     item = writable(probe)
@@ -101,9 +90,9 @@ def rpdo_short(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(_CASES, "canopen.rpdo.long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1", intrusive=True)
+@RPDO.case("long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_long(probe: CanopenProbe) -> None:
-    """EMCY 8220h, and EMCY 0000h after one of the right length."""
+    """EMCY 8220h, then EMCY 0000h after a PDO of the correct length."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
@@ -116,17 +105,11 @@ def rpdo_long(probe: CanopenProbe) -> None:
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
 
 
-@case(
-    _CASES,
-    "canopen.rpdo.place-holder",
-    "place holders skip bytes of an RPDO",
-    "CiA 301 7.4.7",
-    intrusive=True,
-)
+@RPDO.case("place-holder", "dummy entries skip bytes of an RPDO", "CiA 301 7.4.7")
 def place_holder(probe: CanopenProbe) -> None:
-    """UNSIGNED16 mapped by its type before the object."""
+    """A dummy UNSIGNED16 is mapped before the object."""
     if 0x0006 not in probe.od:
-        raise CaseSkipped("the data sheet allows no place holder of 16 bits")
+        raise CaseSkipped("the EDS allows no dummy entry of 16 bits")
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     identifier = set_up(probe, first(probe, 0x1400), [0x0006_0010, entry(item)], 255)
@@ -137,9 +120,9 @@ def place_holder(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.rpdo.deadline", "deadline of an RPDO", "CiA 301 7.5.2.35", intrusive=True)
+@RPDO.case("deadline", "deadline of an RPDO", "CiA 301 7.5.2.35")
 def deadline(probe: CanopenProbe) -> None:
-    """With an event timer of 100 ms EMCY 8250h comes 100 ms after the last message, not before the first."""
+    """EMCY 8250h comes 100 ms (event timer) after the last message, not before the first."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255, event_ms=100)
@@ -157,20 +140,18 @@ def deadline(probe: CanopenProbe) -> None:
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
 
 
-@case(
-    _CASES, "canopen.rpdo.refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35", intrusive=True
-)
+@RPDO.case("refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35")
 def rpdo_refused(probe: CanopenProbe) -> None:
-    """Restricted identifiers, another identifier in use, types 241 to 253, read-only objects."""
+    """Restricted CAN-IDs, another CAN-ID while in use, types 241 to 253, read-only objects."""
     index, item = first(probe, 0x1400), writable(probe)
     set_up(probe, index, [entry(item)], 255)
     probe.expect_refusal(index, 1, 0x3F3, 4, *FIXED)
     for value in (241, 252, 253):
-        probe.expect_refusal(index, 2, value, 1, *REFUSED)
+        probe.expect_refusal(index, 2, value, 1, *VALUE_ABORTS)
     probe.expect_refusal(index + 0x200, 0, 0, 1, *FIXED)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
-    for identifier in FORBIDDEN:
-        probe.expect_refusal(index, 1, identifier, 4, *REFUSED)
+    for identifier in RESTRICTED_IDS:
+        probe.expect_refusal(index, 1, identifier, 4, *VALUE_ABORTS)
     probe.set(index + 0x200, 0, 0, 1)
     constant_ = probe.find(
         "mappable read-only object", lambda item: item.pdo_mappable and item.access_type == "ro"
@@ -178,4 +159,4 @@ def rpdo_refused(probe: CanopenProbe) -> None:
     probe.expect_refusal(index + 0x200, 1, entry(constant_), 4, ABORT_NOT_MAPPABLE)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*RPDO.cases,)

@@ -19,9 +19,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     multiplexer,
     size_of,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+SDO: Final = CaseArea[CanopenProbe]("canopen.sdo", "CiA 301 7.2.4.3.17")
 CLAUSE: Final = "CiA 301 7.2.4.3"
 LONGEST_TIMEOUT_S: Final = 12.0
 
@@ -37,7 +37,7 @@ def long_text(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
 
 
 def writable_number(probe: CanopenProbe) -> ODVariable:
-    """Return a 16-bit number that can be written without effect: the heartbeat time, else another."""
+    """Return a writable 16-bit number without side effects: the heartbeat time, else another."""
     if 0x1017 in probe.od:
         item = probe.od.get_variable(0x1017)
         if item is not None:
@@ -63,9 +63,9 @@ def expect_no_transfer(probe: CanopenProbe) -> None:
     probe.check_abort(probe.ask("60"), ABORT_COMMAND, multiplexer="")
 
 
-@case(_CASES, "canopen.sdo.expedited-upload", "expedited upload tells its size", f"{CLAUSE}.6")
+@SDO.case("expedited-upload", "expedited upload states its size", "CiA 301 7.2.4.3.6")
 def expedited_upload(probe: CanopenProbe) -> None:
-    """Objects of 1, 2 and 4 bytes: e and s set, n right."""
+    """Objects of 1, 2 and 4 bytes: e and s are set, n is correct."""
     for size, command in ((1, 0x4F), (2, 0x4B), (4, 0x43)):
         fitting = [
             item for item in probe.variables() if item.readable and is_integer(item) and size_of(item) == size
@@ -76,11 +76,9 @@ def expedited_upload(probe: CanopenProbe) -> None:
         probe.expect_answer(upload(item), f"{command:02x} {mux(item)} .. .. .. ..")
 
 
-@case(
-    _CASES, "canopen.sdo.expedited-download", "expedited download is confirmed", f"{CLAUSE}.3", intrusive=True
-)
+@SDO.case("expedited-download", "expedited download is confirmed", "CiA 301 7.2.4.3.3", intrusive=True)
 def expedited_download(probe: CanopenProbe) -> None:
-    """60h, the multiplexer, four zeros; the value has changed."""
+    """The answer is 60h, the multiplexer and four zeros; the value has changed."""
     item = writable_number(probe)
     probe.expect_answer(
         b"\x2b" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
@@ -88,9 +86,9 @@ def expedited_download(probe: CanopenProbe) -> None:
     check_equal(probe.number(item.index, item.subindex), 12345, "value")
 
 
-@case(_CASES, "canopen.sdo.no-size", "expedited download without a size", f"{CLAUSE}.3", intrusive=True)
+@SDO.case("no-size", "expedited download without a size", "CiA 301 7.2.4.3.3", intrusive=True)
 def no_size(probe: CanopenProbe) -> None:
-    """With s cleared the object's own size counts."""
+    """With s = 0 the size of the object counts."""
     item = writable_number(probe)
     probe.expect_answer(
         b"\x22" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
@@ -98,9 +96,12 @@ def no_size(probe: CanopenProbe) -> None:
     check_equal(probe.number(item.index, item.subindex), 12345, "value")
 
 
-@case(_CASES, "canopen.sdo.segmented-upload", "segmented upload: size, toggle, last segment", f"{CLAUSE}.7")
+@SDO.case("segmented-upload", "segmented upload: size, toggle, last segment", "CiA 301 7.2.4.3.7")
 def segmented_upload(probe: CanopenProbe) -> None:
-    """Size in the first answer, toggle bit alternating from 0, c in the last segment only, n right."""
+    """The first answer has the size; the toggle bit starts at 0; c is set in the last segment only.
+
+    N is correct.
+    """
     item, value = long_text(probe)
     probe.expect_answer(upload(item), f"41 {mux(item)} {len(value).to_bytes(4, 'little').hex()}")
     toggle, data = 0, b""
@@ -115,7 +116,7 @@ def segmented_upload(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(_CASES, "canopen.sdo.upload-toggle", "toggle bit not alternated in an upload", f"{CLAUSE}.17")
+@SDO.case("upload-toggle", "toggle bit not alternated in an upload")
 def upload_toggle(probe: CanopenProbe) -> None:
     """Abort 0503 0000h at the first and at a later segment; the transfer has ended."""
     item, _ = long_text(probe)
@@ -128,11 +129,9 @@ def upload_toggle(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(
-    _CASES, "canopen.sdo.segmented-download", "segmented download of a number", f"{CLAUSE}.4", intrusive=True
-)
+@SDO.case("segmented-download", "segmented download of a number", "CiA 301 7.2.4.3.4", intrusive=True)
 def segmented_download(probe: CanopenProbe) -> None:
-    """A 16-bit number in one segment, with its size announced and without."""
+    """A 16-bit number in one segment, with and without an announced size."""
     item = writable_number(probe)
     for command, size, value in ((0x21, 2, b"\x39\x30"), (0x20, 0, b"\x38\x30")):
         request = bytes([command]) + multiplexer(item.index, item.subindex) + size.to_bytes(4, "little")
@@ -141,15 +140,9 @@ def segmented_download(probe: CanopenProbe) -> None:
         check_equal(probe.read(item.index, item.subindex), value, "value")
 
 
-@case(
-    _CASES,
-    "canopen.sdo.download-in-parts",
-    "segmented download in two segments",
-    f"{CLAUSE}.4",
-    intrusive=True,
-)
+@SDO.case("download-in-parts", "segmented download in two segments", "CiA 301 7.2.4.3.4", intrusive=True)
 def download_in_parts(probe: CanopenProbe) -> None:
-    """One byte a segment: toggle bit echoed, nothing written before the end."""
+    """One byte per segment: the toggle bit is echoed, nothing is written before the end."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     value = bytes([before[0] ^ 0x55, before[1] ^ 0x01])
@@ -159,13 +152,7 @@ def download_in_parts(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), value, "value")
 
 
-@case(
-    _CASES,
-    "canopen.sdo.download-toggle",
-    "toggle bit not alternated in a download",
-    f"{CLAUSE}.17",
-    intrusive=True,
-)
+@SDO.case("download-toggle", "toggle bit not alternated in a download", intrusive=True)
 def download_toggle(probe: CanopenProbe) -> None:
     """Abort 0503 0000h; the object keeps its value and the transfer has ended."""
     item = writable_number(probe)
@@ -179,9 +166,7 @@ def download_toggle(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(
-    _CASES, "canopen.sdo.announced-high", "announced size above the object's", f"{CLAUSE}.17", intrusive=True
-)
+@SDO.case("announced-high", "announced size above the object's", intrusive=True)
 def announced_high(probe: CanopenProbe) -> None:
     """Abort 0607 0010h or 0607 0012h, at once or at the end."""
     item = writable_number(probe)
@@ -191,9 +176,7 @@ def announced_high(probe: CanopenProbe) -> None:
     probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
 
 
-@case(
-    _CASES, "canopen.sdo.sent-high", "more bytes sent than the object takes", f"{CLAUSE}.17", intrusive=True
-)
+@SDO.case("sent-high", "more bytes sent than the object takes", intrusive=True)
 def sent_high(probe: CanopenProbe) -> None:
     """Abort 0607 0010h or 0607 0012h."""
     item = writable_number(probe)
@@ -202,9 +185,7 @@ def sent_high(probe: CanopenProbe) -> None:
     probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
 
 
-@case(
-    _CASES, "canopen.sdo.sent-low", "fewer bytes sent than the object takes", f"{CLAUSE}.17", intrusive=True
-)
+@SDO.case("sent-low", "fewer bytes sent than the object takes", intrusive=True)
 def sent_low(probe: CanopenProbe) -> None:
     """Abort 0607 0010h or 0607 0013h; the object keeps its value."""
     item = writable_number(probe)
@@ -215,9 +196,7 @@ def sent_low(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(
-    _CASES, "canopen.sdo.announced-differs", "fewer bytes sent than announced", f"{CLAUSE}.17", intrusive=True
-)
+@SDO.case("announced-differs", "fewer bytes sent than announced", intrusive=True)
 def announced_differs(probe: CanopenProbe) -> None:
     """Abort 0607 0010h, 0607 0012h or 0607 0013h."""
     item = writable_number(probe)
@@ -226,20 +205,20 @@ def announced_differs(probe: CanopenProbe) -> None:
     probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, ABORT_LENGTH_LOW, multiplexer=mux(item))
 
 
-@case(_CASES, "canopen.sdo.unknown-command", "unknown command specifier", f"{CLAUSE}.17")
+@SDO.case("unknown-command", "unknown command specifier")
 def unknown_command(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for 7."""
+    """Abort 0504 0001h for specifier 7."""
     probe.check_abort(probe.ask("e0 00 10 00"), ABORT_COMMAND, multiplexer="")
 
 
-@case(_CASES, "canopen.sdo.no-transfer", "segments without a transfer", f"{CLAUSE}.17")
+@SDO.case("no-transfer", "segments without a transfer")
 def no_transfer(probe: CanopenProbe) -> None:
     """Abort 0504 0001h for an upload segment, a download segment and ends of blocks."""
     for request in ("60", "70", "00", "01", "a1", "a2 01 7f", "a3", "c1"):
         probe.check_abort(probe.ask(request), ABORT_COMMAND, multiplexer="")
 
 
-@case(_CASES, "canopen.sdo.wrong-segment", "download segment within an upload", f"{CLAUSE}.17")
+@SDO.case("wrong-segment", "download segment within an upload")
 def wrong_segment(probe: CanopenProbe) -> None:
     """Abort 0504 0001h; the transfer has ended."""
     item, _ = long_text(probe)
@@ -248,9 +227,7 @@ def wrong_segment(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(
-    _CASES, "canopen.sdo.client-abort", "an abort of the client ends the transfer, unanswered", f"{CLAUSE}.17"
-)
+@SDO.case("client-abort", "an abort of the client ends the transfer, unanswered")
 def client_abort(probe: CanopenProbe) -> None:
     """After 80h nothing is sent, and the next segment finds no transfer."""
     item, _ = long_text(probe)
@@ -262,9 +239,8 @@ def client_abort(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(_CASES, "canopen.sdo.new-request", "a new request replaces the transfer under way", f"{CLAUSE}.6")
+@SDO.case("new-request", "a new request replaces the transfer under way", "CiA 301 7.2.4.3.6")
 def new_request(probe: CanopenProbe) -> None:
-    """A client that has restarted is served."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.ask("60")
@@ -272,9 +248,9 @@ def new_request(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(_CASES, "canopen.sdo.time-out", "a transfer whose client falls silent ends", f"{CLAUSE}.17")
+@SDO.case("time-out", "a transfer whose client stops sending times out")
 def time_out(probe: CanopenProbe) -> None:
-    """Abort 0504 0000h in some seconds."""
+    """Abort 0504 0000h within 12 s."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.check_abort(
@@ -283,7 +259,7 @@ def time_out(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(_CASES, "canopen.sdo.wrong-length", "frames of other than 8 bytes are no SDO", f"{CLAUSE}.2")
+@SDO.case("wrong-length", "frames of other than 8 bytes are no SDO", "CiA 301 7.2.4.3.2")
 def wrong_length(probe: CanopenProbe) -> None:
     """No answer to 0, 4 and 7 bytes."""
     for length in (0, 4, 7):
@@ -291,30 +267,27 @@ def wrong_length(probe: CanopenProbe) -> None:
         probe.expect_silence(0x580 + probe.node, f"answer to {length} bytes")
 
 
-@case(_CASES, "canopen.sdo.extended", "frames with a 29-bit identifier are no SDO", "CiA 301 7.3.5")
+@SDO.case("extended", "frames with a 29-bit identifier are no SDO", "CiA 301 7.3.5")
 def extended(probe: CanopenProbe) -> None:
-    """No answer to the same number as an extended identifier."""
     probe.send(0x600 + probe.node, "40 00 10 00 00 00 00 00", extended=True)
     probe.expect_silence(0x580 + probe.node, "answer to an extended frame")
 
 
-@case(_CASES, "canopen.sdo.remote", "remote frames are no SDO", "CiA 301 7.2.4")
+@SDO.case("remote", "remote frames are no SDO", "CiA 301 7.2.4")
 def remote(probe: CanopenProbe) -> None:
-    """No answer."""
     probe.send(0x600 + probe.node, remote=True)
     probe.expect_silence(0x580 + probe.node, "answer to a remote frame")
 
 
-@case(_CASES, "canopen.sdo.other-node", "requests to another node are not answered", "CiA 301 7.3.5")
+@SDO.case("other-node", "requests to another node are not answered", "CiA 301 7.3.5")
 def other_node(probe: CanopenProbe) -> None:
-    """No answer under this node's identifier."""
     probe.send(0x600 + (probe.node % 127 + 1), "40 00 10 00 00 00 00 00")
     probe.expect_silence(0x580 + probe.node, "answer to another node's request")
 
 
-@case(_CASES, "canopen.sdo.stopped", "no SDO in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
+@SDO.case("stopped", "no SDO in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
 def stopped(probe: CanopenProbe) -> None:
-    """Neither to a new request nor within a transfer that was under way."""
+    """No answer to a new request, nor to a segment of a transfer in progress."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.command(STOP)
@@ -322,7 +295,7 @@ def stopped(probe: CanopenProbe) -> None:
         raise CaseFailed("no SDO answer in STOPPED", "an answer")
 
 
-@case(_CASES, "canopen.sdo.server-parameter", "1200h tells the identifiers in use", "CiA 301 7.5.2.33")
+@SDO.case("server-parameter", "1200h holds the identifiers in use", "CiA 301 7.5.2.33")
 def server_parameter(probe: CanopenProbe) -> None:
     """600h and 580h plus the node-ID."""
     probe.require(0x1200)
@@ -330,4 +303,4 @@ def server_parameter(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1200, 2), 0x580 + probe.node, "1200h:02h")
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*SDO.cases,)

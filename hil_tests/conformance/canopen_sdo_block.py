@@ -29,15 +29,15 @@ from starhil.hil_tests.conformance.canopen_sdo import (
     mux,
     writable_number,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+SDO_BLOCK: Final = CaseArea[CanopenProbe]("canopen.sdo-block", "CiA 301 7.2.4.3.17")
 CLAUSE: Final = "CiA 301 7.2.4.3"
 SEGMENT: Final = 7
 
 
 def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
-    """Return the longest readable text or bulk data of at most 200 kB that the data sheet has: many blocks if it can be."""
+    """Return the longest readable text or domain of at most 200 kB, ideally many blocks."""
     best: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         if item.readable and item.data_type in {
@@ -69,7 +69,7 @@ def _begin(
 
 
 def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
-    """Send a request and return the segments of the block that it lets go, checking their numbers."""
+    """Send a request and return the segments of the next block, after a check of their numbers."""
     probe.send_request(request)
     found: list[bytes] = []
     while len(found) < block:
@@ -109,32 +109,33 @@ def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: boo
     return data
 
 
-@case(_CASES, "canopen.sdo-block.upload", "block upload with CRC", f"{CLAUSE}.13")
+@SDO_BLOCK.case("upload", "block upload with CRC", "CiA 301 7.2.4.3.13")
 def upload_with_crc(probe: CanopenProbe) -> None:
-    """Numbers from 1, last bit, unused bytes, size and CRC; the same data as by segments."""
+    """Segment numbers from 1, last bit, unused bytes, size and CRC.
+
+    The same data as a segmented upload.
+    """
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127), value, "value")
     expect_no_transfer(probe)
 
 
-@case(
-    _CASES, "canopen.sdo-block.upload-sizes", "block upload in blocks of 1, 2 and 5 segments", f"{CLAUSE}.13"
-)
+@SDO_BLOCK.case("upload-sizes", "block upload in blocks of 1, 2 and 5 segments", "CiA 301 7.2.4.3.13")
 def upload_sizes(probe: CanopenProbe) -> None:
-    """The block size is the client's."""
+    """The client sets the block size."""
     item, value = long_text(probe)
     for block in (1, 2, 5):
         check_equal(upload_blocks(probe, item, block), value, "value")
 
 
-@case(_CASES, "canopen.sdo-block.upload-without-crc", "block upload without CRC", f"{CLAUSE}.13")
+@SDO_BLOCK.case("upload-without-crc", "block upload without CRC", "CiA 301 7.2.4.3.13")
 def upload_without_crc(probe: CanopenProbe) -> None:
-    """A client that does not support the CRC is served."""
+    """For a client that does not support the CRC."""
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127, crc=False), value, "value")
 
 
-@case(_CASES, "canopen.sdo-block.upload-big", "block upload of many blocks", f"{CLAUSE}.13")
+@SDO_BLOCK.case("upload-big", "block upload of many blocks", "CiA 301 7.2.4.3.13")
 def upload_big(probe: CanopenProbe) -> None:
     """The longest object up to 200 kB, with size and CRC."""
     item, _ = _big(probe)
@@ -142,14 +143,9 @@ def upload_big(probe: CanopenProbe) -> None:
         raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
 
 
-@case(
-    _CASES,
-    "canopen.sdo-block.upload-repeat",
-    "segments that were not confirmed are sent again",
-    f"{CLAUSE}.14",
-)
+@SDO_BLOCK.case("upload-repeat", "segments that were not confirmed are sent again", "CiA 301 7.2.4.3.14")
 def upload_repeat(probe: CanopenProbe) -> None:
-    """Confirm the first of three, then none, then all."""
+    """Confirm the first of three segments, then none, then all."""
     item, value = long_text(probe)
     _begin(probe, item, 3)
     first = _segments(probe, b"\xa3", 3)
@@ -161,9 +157,9 @@ def upload_repeat(probe: CanopenProbe) -> None:
     probe.abandon_transfer()
 
 
-@case(_CASES, "canopen.sdo-block.upload-block-size", "block size 0 and above 127", f"{CLAUSE}.17")
+@SDO_BLOCK.case("upload-block-size", "block size 0 and above 127")
 def upload_block_size(probe: CanopenProbe) -> None:
-    """Abort 0504 0002h at the beginning and in a confirmation."""
+    """Abort 0504 0002h at the start and in a confirmation."""
     item, _ = long_text(probe)
     for size in (0, 128):
         probe.check_abort(_begin(probe, item, size), ABORT_BLOCK_SIZE, multiplexer=mux(item))
@@ -173,7 +169,7 @@ def upload_block_size(probe: CanopenProbe) -> None:
         probe.check_abort(probe.ask(bytes([0xA2, 1, size])), ABORT_BLOCK_SIZE, multiplexer=mux(item))
 
 
-@case(_CASES, "canopen.sdo-block.upload-sequence", "more segments confirmed than were sent", f"{CLAUSE}.17")
+@SDO_BLOCK.case("upload-sequence", "more segments confirmed than were sent")
 def upload_sequence(probe: CanopenProbe) -> None:
     """Abort 0504 0003h."""
     item, _ = long_text(probe)
@@ -182,9 +178,9 @@ def upload_sequence(probe: CanopenProbe) -> None:
     probe.check_abort(probe.ask("a2 03 02"), ABORT_SEQUENCE, multiplexer=mux(item))
 
 
-@case(_CASES, "canopen.sdo-block.upload-order", "requests of a block upload out of order", f"{CLAUSE}.17")
+@SDO_BLOCK.case("upload-order", "requests of a block upload out of order")
 def upload_order(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for a confirmation before the start, an end before its time, a segment request."""
+    """Abort 0504 0001h for a confirmation before the start, an early end, a segment request."""
     item, _ = long_text(probe)
     for request in ("a2 01 01", "a1", "60"):
         _begin(probe, item, 1)
@@ -194,9 +190,9 @@ def upload_order(probe: CanopenProbe) -> None:
     probe.check_abort(probe.ask("a1"), ABORT_COMMAND, multiplexer="")
 
 
-@case(_CASES, "canopen.sdo-block.threshold", "protocol switch threshold", f"{CLAUSE}.13")
+@SDO_BLOCK.case("threshold", "protocol switch threshold", "CiA 301 7.2.4.3.13")
 def threshold(probe: CanopenProbe) -> None:
-    """An object not above the threshold comes by the upload protocol or by blocks, one above it by blocks."""
+    """At most as long as the threshold: segmented or block upload; longer: block upload."""
     item, value = long_text(probe)
     answer = _begin(probe, item, 127, threshold=min(255, len(value)))
     check(answer[0] in {0x41, 0xC6, 0xC4, 0xC2, 0xC0}, "answer 41h or C6h", answer)
@@ -206,7 +202,7 @@ def threshold(probe: CanopenProbe) -> None:
     probe.abandon_transfer()
 
 
-@case(_CASES, "canopen.sdo-block.upload-refused", "block upload of what cannot be read", f"{CLAUSE}.17")
+@SDO_BLOCK.case("upload-refused", "block upload of objects that cannot be read")
 def upload_refused(probe: CanopenProbe) -> None:
     """Abort 0602 0000h and 0601 0001h."""
     probe.expect_abort("a4 05 00 00 7f 00", ABORT_NO_OBJECT)
@@ -214,14 +210,9 @@ def upload_refused(probe: CanopenProbe) -> None:
     probe.expect_abort(b"\xa4" + multiplexer(item.index, item.subindex) + b"\x7f\0", ABORT_WRITE_ONLY)
 
 
-@case(
-    _CASES,
-    "canopen.sdo-block.upload-time-out",
-    "a block upload whose client falls silent ends",
-    f"{CLAUSE}.17",
-)
+@SDO_BLOCK.case("upload-time-out", "a block upload whose client stops sending times out")
 def upload_time_out(probe: CanopenProbe) -> None:
-    """Abort 0504 0000h in some seconds."""
+    """Abort 0504 0000h within 12 s."""
     item, _ = long_text(probe)
     _begin(probe, item, 2)
     _segments(probe, b"\xa3", 2)
@@ -246,9 +237,12 @@ def _end(probe: CanopenProbe, unused: int, crc: int) -> bytes | None:
     return probe.ask(bytes([0xC1 | unused << 2]) + crc.to_bytes(2, "little"))
 
 
-@case(_CASES, "canopen.sdo-block.download", "block download with CRC", f"{CLAUSE}.9", intrusive=True)
+@SDO_BLOCK.case("download", "block download with CRC", "CiA 301 7.2.4.3.9", intrusive=True)
 def download(probe: CanopenProbe) -> None:
-    """A 16-bit number in one segment: A4h, A2h with number 1, A1h; with and without size and CRC."""
+    """A 16-bit number in one segment: A4h, A2h with number 1, A1h.
+
+    With and without size and CRC.
+    """
     item = writable_number(probe)
     for size, crc, value in ((2, True, b"\x39\x30"), (None, True, b"\x38\x30"), (2, False, b"\x37\x30")):
         _begin_download(probe, item, size, crc=crc)
@@ -260,9 +254,7 @@ def download(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(
-    _CASES, "canopen.sdo-block.download-crc", "wrong CRC of a block download", f"{CLAUSE}.17", intrusive=True
-)
+@SDO_BLOCK.case("download-crc", "wrong CRC of a block download", intrusive=True)
 def download_crc(probe: CanopenProbe) -> None:
     """Abort 0504 0004h; the object keeps its value."""
     item = writable_number(probe)
@@ -274,15 +266,12 @@ def download_crc(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(
-    _CASES,
-    "canopen.sdo-block.download-gap",
-    "a lost segment is asked for again",
-    f"{CLAUSE}.11",
-    intrusive=True,
-)
+@SDO_BLOCK.case("download-gap", "a lost segment is requested again", "CiA 301 7.2.4.3.11", intrusive=True)
 def download_gap(probe: CanopenProbe) -> None:
-    """The last segment with number 2 after none: A2h with number 0; then the block again."""
+    """The block begins with number 2: confirmation A2h with number 0.
+
+    Then the block is repeated.
+    """
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x82\x39\x30")
@@ -293,9 +282,9 @@ def download_gap(probe: CanopenProbe) -> None:
     check_equal(answer, b"\xa1" + bytes(7), "end")
 
 
-@case(_CASES, "canopen.sdo-block.download-zero", "segment number 0", f"{CLAUSE}.17", intrusive=True)
+@SDO_BLOCK.case("download-zero", "segment number 0", intrusive=True)
 def download_zero(probe: CanopenProbe) -> None:
-    """Abort 0504 0003h, or the segment is passed over; no confirmation of it, and the node is not stuck."""
+    """Abort 0504 0003h, or no answer; afterwards the node serves requests."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x00\x39\x30")
@@ -306,11 +295,9 @@ def download_zero(probe: CanopenProbe) -> None:
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
 
 
-@case(
-    _CASES, "canopen.sdo-block.download-length", "lengths of block downloads", f"{CLAUSE}.17", intrusive=True
-)
+@SDO_BLOCK.case("download-length", "lengths of block downloads", intrusive=True)
 def download_length(probe: CanopenProbe) -> None:
-    """One byte too many, too few, and other than announced, each refused."""
+    """One byte too many, too few, and not as announced: each is refused."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     for size, unused in ((None, 4), (None, 6), (2, 6)):
@@ -322,13 +309,7 @@ def download_length(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@case(
-    _CASES,
-    "canopen.sdo-block.download-announced",
-    "announced size that the object has not",
-    f"{CLAUSE}.17",
-    intrusive=True,
-)
+@SDO_BLOCK.case("download-announced", "announced size that differs from the object's", intrusive=True)
 def download_announced(probe: CanopenProbe) -> None:
     """Refused at once or at the end."""
     item = writable_number(probe)
@@ -339,15 +320,9 @@ def download_announced(probe: CanopenProbe) -> None:
     probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
 
 
-@case(
-    _CASES,
-    "canopen.sdo-block.download-abort",
-    "an abort of the client ends a block download",
-    f"{CLAUSE}.17",
-    intrusive=True,
-)
+@SDO_BLOCK.case("download-abort", "an abort of the client ends a block download", intrusive=True)
 def download_abort(probe: CanopenProbe) -> None:
-    """80h is no segment."""
+    """80h is not a segment."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     probe.send(
@@ -357,17 +332,11 @@ def download_abort(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@case(
-    _CASES,
-    "canopen.sdo-block.download-refused",
-    "block download to what cannot be written",
-    f"{CLAUSE}.17",
-    intrusive=True,
-)
+@SDO_BLOCK.case("download-refused", "block download to objects that cannot be written", intrusive=True)
 def download_refused(probe: CanopenProbe) -> None:
     """Abort 0601 0002h and 0602 0000h."""
     probe.expect_abort("c2 00 10 00 04 00 00 00", ABORT_READ_ONLY)
     probe.expect_abort("c2 05 00 00 04 00 00 00", ABORT_NO_OBJECT)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*SDO_BLOCK.cases,)

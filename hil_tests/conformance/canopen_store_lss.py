@@ -14,9 +14,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     STOP,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+STORE: Final = CaseArea[CanopenProbe]("canopen.store", "CiA 301 7.5.2.11", intrusive=True)
+LSS: Final = CaseArea[CanopenProbe]("canopen.lss", "CiA 305 states", intrusive=True)
 SIGNATURE_REFUSED: Final = (ABORT_NOT_STORED, 0x08000021, 0x08000022)
 
 
@@ -26,15 +27,15 @@ def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
     probe.expect_boot_up()
 
 
-@case(_CASES, "canopen.store.ability", "1010h and 1011h tell what they can do", "CiA 301 7.5.2.11")
+@STORE.case("ability", "1010h and 1011h describe their abilities", intrusive=False)
 def ability(probe: CanopenProbe) -> None:
-    """Bit 0: on command, bit 1: by itself; the others are zero."""
+    """Bit 0: on command; bit 1: autonomously; all others are 0."""
     for index in (0x1010, 0x1011):
         if index in probe.od:
             check(probe.number(index, 1) & ~0x03 == 0, f"{index:04X}h:01h 0 to 3", probe.number(index, 1))
 
 
-@case(_CASES, "canopen.store.signature", "wrong signatures are refused", "CiA 301 7.5.2.11", intrusive=True)
+@STORE.case("signature", "wrong signatures are refused")
 def signature(probe: CanopenProbe) -> None:
     """Abort 0800 002xh for anything but `save` and `load`, and for the two exchanged."""
     probe.require(0x1010)
@@ -44,15 +45,9 @@ def signature(probe: CanopenProbe) -> None:
                 probe.expect_refusal(index, 1, value, 4, *SIGNATURE_REFUSED)
 
 
-@case(
-    _CASES,
-    "canopen.store.save",
-    "stored parameters are back after a reset",
-    "CiA 301 7.5.2.11",
-    intrusive=True,
-)
+@STORE.case("save", "stored parameters are back after a reset")
 def save(probe: CanopenProbe) -> None:
-    """After reset node and reset communication; what was changed afterwards is not."""
+    """After reset node and reset communication; later changes are lost."""
     probe.require(0x1010)
     probe.set(0x1017, 0, 777, 2)
     probe.set(0x1010, 1, b"save")
@@ -68,13 +63,7 @@ def _restore(probe: CanopenProbe) -> None:
     _reset(probe)
 
 
-@case(
-    _CASES,
-    "canopen.store.restore",
-    "defaults hold from the next reset on",
-    "CiA 301 7.5.2.12",
-    intrusive=True,
-)
+@STORE.case("restore", "defaults take effect at the next reset", "CiA 301 7.5.2.12")
 def restore(probe: CanopenProbe) -> None:
     """`load` changes nothing until then."""
     probe.require(0x1010)
@@ -88,15 +77,9 @@ def restore(probe: CanopenProbe) -> None:
     check_equal(probe.number(0x1017), 0 if default is None else default.default, "1017h after the reset")
 
 
-@case(
-    _CASES,
-    "canopen.store.groups",
-    "communication and application are stored apart",
-    "CiA 301 7.5.2.11",
-    intrusive=True,
-)
+@STORE.case("groups", "communication and application parameters are stored separately")
 def groups(probe: CanopenProbe) -> None:
-    """Storing the application's leaves the communication profile as it was stored."""
+    """Storing the application parameters does not store the communication parameters."""
     probe.require(0x1010)
     if probe.od.get_variable(0x1010, 3) is None:
         raise CaseSkipped("1010h has no sub-index 3")
@@ -108,15 +91,9 @@ def groups(probe: CanopenProbe) -> None:
     _restore(probe)
 
 
-@case(
-    _CASES,
-    "canopen.store.pdo",
-    "a stored PDO configuration is back after a reset",
-    "CiA 301 7.5.2.11",
-    intrusive=True,
-)
+@STORE.case("pdo", "a stored PDO configuration is back after a reset")
 def pdo(probe: CanopenProbe) -> None:
-    """Transmission type of the first TPDO."""
+    """The transmission type of the first TPDO."""
     probe.require(0x1010)
     probe.require(0x1800)
     probe.set(0x1800, 2, 17, 1)
@@ -142,7 +119,7 @@ def _identity(probe: CanopenProbe) -> list[int]:
 def _select(probe: CanopenProbe) -> list[int]:
     """Select the node by its identity; skip the case if it has no LSS."""
     if not probe.od.device_information.LSS_supported:
-        raise CaseSkipped("the data sheet has no LSS")
+        raise CaseSkipped("the EDS has no LSS")
     identity = _identity(probe)
     answer = None
     for step, number in enumerate(identity):
@@ -155,29 +132,23 @@ def _wait(probe: CanopenProbe) -> None:
     probe.send(LSS_TO_SLAVE, b"\x04" + bytes(7))
 
 
-@case(
-    _CASES,
-    "canopen.lss.selective",
-    "switch state selective",
-    "CiA 305 switch state selective",
-    intrusive=True,
-)
+@LSS.case("selective", "switch state selective", "CiA 305 switch state selective")
 def selective(probe: CanopenProbe) -> None:
-    """The identity selects the node; any other does not."""
+    """The identity selects the node; no other identity does."""
     identity = _select(probe)
     check(_lss(probe, "5e") is not None, "configuration state", "waiting")
     _wait(probe)
     for wrong in range(4):
-        parts = [number ^ (1 << 20 if place == wrong else 0) for place, number in enumerate(identity)]
+        parts = [number ^ (1 << 20 if part == wrong else 0) for part, number in enumerate(identity)]
         for step, number in enumerate(parts):
             answer = _lss(probe, bytes([0x40 + step]) + number.to_bytes(4, "little"), 0.05)
             check(answer is None, "no answer to another identity", answer)
     check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
 
 
-@case(_CASES, "canopen.lss.global", "switch state global", "CiA 305 switch state global", intrusive=True)
+@LSS.case("global", "switch state global", "CiA 305 switch state global")
 def global_(probe: CanopenProbe) -> None:
-    """Into configuration and back, unanswered."""
+    """To configuration and back, without an answer."""
     _select(probe)
     check(_lss(probe, "04 00", 0.1) is None, "no answer to switch state global", "one")
     check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
@@ -186,7 +157,7 @@ def global_(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@case(_CASES, "canopen.lss.inquire", "inquire identity and node-ID", "CiA 305 inquire", intrusive=True)
+@LSS.case("inquire", "inquire identity and node-ID", "CiA 305 inquire")
 def inquire(probe: CanopenProbe) -> None:
     """The four numbers of 1018h, and the node-ID in use."""
     identity = _select(probe)
@@ -197,9 +168,7 @@ def inquire(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@case(
-    _CASES, "canopen.lss.waiting", "a waiting node obeys no configuration", "CiA 305 states", intrusive=True
-)
+@LSS.case("waiting", "a waiting node obeys no configuration command")
 def waiting(probe: CanopenProbe) -> None:
     """Node-ID, bit timing, store and inquiries are not answered."""
     _select(probe)
@@ -209,9 +178,12 @@ def waiting(probe: CanopenProbe) -> None:
         check(answer is None, f"no answer to {data}", answer)
 
 
-@case(_CASES, "canopen.lss.node-id", "configure node-ID", "CiA 305 configure node-ID", intrusive=True)
+@LSS.case("node-id", "configure node-ID", "CiA 305 configure node-ID")
 def node_id(probe: CanopenProbe) -> None:
-    """Numbers that are none are refused; a new one holds from the reset of the communication on, and back."""
+    """Invalid node-IDs are refused.
+
+    A new one takes effect with the communication reset, and is then set back.
+    """
     _select(probe)
     for value in (0, 128, 254):
         check_equal(_lss(probe, bytes([0x11, value])), b"\x11\x01" + bytes(6), f"answer to node-ID {value}")
@@ -234,11 +206,12 @@ def node_id(probe: CanopenProbe) -> None:
     probe.expect_boot_up()
 
 
-@case(
-    _CASES, "canopen.lss.bit-timing", "configure bit timing", "CiA 305 configure bit timing", intrusive=True
-)
+@LSS.case("bit-timing", "configure bit timing", "CiA 305 configure bit timing")
 def bit_timing(probe: CanopenProbe) -> None:
-    """Rates of the data sheet are taken, index 5, 9 and other tables refused; nothing is activated."""
+    """The bit rates of the EDS are accepted, indices 5 and 255 and other tables refused.
+
+    Nothing is activated.
+    """
     _select(probe)
     table = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
     rates = probe.od.device_information.allowed_baudrates
@@ -253,11 +226,9 @@ def bit_timing(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@case(
-    _CASES, "canopen.lss.identify", "identify remote slave", "CiA 305 identify remote slave", intrusive=True
-)
+@LSS.case("identify", "identify remote slave", "CiA 305 identify remote slave")
 def identify(probe: CanopenProbe) -> None:
-    """Answered by 4Fh if the node is within the ranges, not otherwise."""
+    """Answered with 4Fh only if the identity is within the ranges."""
     _select(probe)
     _wait(probe)
     vendor, product, revision, serial = _identity(probe)
@@ -281,13 +252,7 @@ def identify(probe: CanopenProbe) -> None:
             check(answer is None, "no answer", answer)
 
 
-@case(
-    _CASES,
-    "canopen.lss.configured",
-    "a configured node takes no part in fastscan",
-    "CiA 305 fastscan",
-    intrusive=True,
-)
+@LSS.case("configured", "a configured node takes no part in fastscan", "CiA 305 fastscan")
 def configured(probe: CanopenProbe) -> None:
     """Neither fastscan nor identify non-configured is answered."""
     _select(probe)
@@ -297,15 +262,12 @@ def configured(probe: CanopenProbe) -> None:
         check(answer is None, f"no answer to {data}", answer)
 
 
-@case(
-    _CASES,
-    "canopen.lss.fastscan",
-    "fastscan finds a node without a node-ID",
-    "CiA 305 fastscan",
-    intrusive=True,
-)
+@LSS.case("fastscan", "fastscan finds a node without a node-ID", "CiA 305 fastscan")
 def fastscan(probe: CanopenProbe) -> None:
-    """The node-ID is taken away, the identity found bit by bit, the node-ID given back; only without other such nodes."""
+    """The node-ID is removed, the identity found bit by bit, the node-ID set back.
+
+    Only without other such nodes.
+    """
     identity = _select(probe)
     old = probe.node
     check_equal(_lss(probe, "11 ff"), b"\x11\0" + bytes(6), "answer to node-ID 255")
@@ -344,9 +306,9 @@ def _scan(probe: CanopenProbe) -> list[int]:
     return identity
 
 
-@case(_CASES, "canopen.lss.states", "LSS works in every NMT state", "CiA 305 states", intrusive=True)
+@LSS.case("states", "LSS works in every NMT state")
 def states(probe: CanopenProbe) -> None:
-    """The node is selected in OPERATIONAL and asked in STOPPED."""
+    """The node is selected in OPERATIONAL and in STOPPED."""
     _select(probe)
     _wait(probe)
     for command in (START, STOP):
@@ -356,4 +318,7 @@ def states(probe: CanopenProbe) -> None:
         _wait(probe)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (
+    *STORE.cases,
+    *LSS.cases,
+)

@@ -7,17 +7,16 @@ from typing import Final
 from starhil.hil_tests.conformance.canopen_probe import (
     ABORT_DEVICE_STATE,
     ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
     NO_RTR,
+    RESTRICTED_IDS,
     STOP,
+    VALUE_ABORTS,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
-REFUSED: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
-FORBIDDEN: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
+SYNC: Final = CaseArea[CanopenProbe]("canopen.sync", "CiA 301 7.5.2.5", intrusive=True)
+TIME: Final = CaseArea[CanopenProbe]("canopen.time", "CiA 301 7.5.2.13", intrusive=True)
 
 
 def _quiet(probe: CanopenProbe) -> None:
@@ -28,38 +27,28 @@ def _quiet(probe: CanopenProbe) -> None:
 # SYNC
 
 
-@case(
-    _CASES, "canopen.sync.identifier", "identifiers that SYNC may not have", "CiA 301 7.5.2.5", intrusive=True
-)
+@SYNC.case("identifier", "identifiers that SYNC may not have")
 def sync_identifier(probe: CanopenProbe) -> None:
-    """Restricted ones and the extended format are refused by 0609 0030h."""
+    """Restricted CAN-IDs and the extended format are refused with 0609 0030h."""
     probe.require(0x1005)
-    for identifier in (*FORBIDDEN, 0x2000_0080):
-        probe.expect_refusal(0x1005, 0, identifier, 4, *REFUSED)
+    for identifier in (*RESTRICTED_IDS, 0x2000_0080):
+        probe.expect_refusal(0x1005, 0, identifier, 4, *VALUE_ABORTS)
     check_equal(probe.number(0x1005) & 0x7FF, 0x80, "1005h as before")
 
 
-@case(
-    _CASES, "canopen.sync.counter-range", "values of the counter overflow", "CiA 301 7.5.2.22", intrusive=True
-)
+@SYNC.case("counter-range", "values of the counter overflow", "CiA 301 7.5.2.22")
 def sync_counter_range(probe: CanopenProbe) -> None:
-    """1 and 241 to 255 are refused by 0609 0030h, 2 to 240 taken."""
+    """1 and 241 to 255 are refused with 0609 0030h, 2 to 240 accepted."""
     probe.require(0x1019)
     for value in (1, 241, 255):
-        probe.expect_refusal(0x1019, 0, value, 1, *REFUSED)
+        probe.expect_refusal(0x1019, 0, value, 1, *VALUE_ABORTS)
     for value in (2, 240, 0):
         probe.set(0x1019, 0, value, 1)
 
 
-@case(
-    _CASES,
-    "canopen.sync.counter-fixed",
-    "counter overflow is fixed while a period is set",
-    "CiA 301 7.5.2.22",
-    intrusive=True,
-)
+@SYNC.case("counter-fixed", "counter overflow is fixed while a period is set", "CiA 301 7.5.2.22")
 def sync_counter_fixed(probe: CanopenProbe) -> None:
-    """Abort 0800 0022h with 1006h set."""
+    """Abort 0800 0022h while 1006h is not 0."""
     probe.require(0x1019)
     probe.require(0x1006)
     probe.set(0x1006, 0, 100_000)
@@ -68,9 +57,7 @@ def sync_counter_fixed(probe: CanopenProbe) -> None:
     probe.set(0x1019, 0, 10, 1)
 
 
-@case(
-    _CASES, "canopen.sync.length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3", intrusive=True
-)
+@SYNC.case("length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3")
 def sync_length(probe: CanopenProbe) -> None:
     """EMCY 8240h for a counter that is not configured, and for one that is missing."""
     probe.require(0x1014)
@@ -86,9 +73,9 @@ def sync_length(probe: CanopenProbe) -> None:
         check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
 
 
-@case(_CASES, "canopen.sync.producer", "SYNC producer", "CiA 301 7.5.2.5", intrusive=True)
+@SYNC.case("producer", "SYNC producer")
 def sync_producer(probe: CanopenProbe) -> None:
-    """Bit 30 of 1005h and 1006h make SYNCs at their period with the counter from 1, or are refused by 0609 0030h."""
+    """Bit 30 of 1005h starts SYNCs with the period 1006h, counted from 1; else abort 0609 0030h."""
     probe.require(0x1006)
     _quiet(probe)
     if 0x1019 in probe.od:
@@ -110,31 +97,26 @@ def sync_producer(probe: CanopenProbe) -> None:
 # TIME
 
 
-@case(
-    _CASES,
-    "canopen.time.identifier",
-    "identifiers that TIME may not have",
-    "CiA 301 7.5.2.13",
-    intrusive=True,
-)
+@TIME.case("identifier", "identifiers that TIME may not have")
 def time_identifier(probe: CanopenProbe) -> None:
-    """Restricted ones and the extended format are refused by 0609 0030h, a change while it is consumed too."""
+    """Restricted CAN-IDs, the extended format, and a change while in use: abort 0609 0030h."""
     probe.require(0x1012)
     probe.set(0x1012, 0, 0x100)
-    for identifier in (*FORBIDDEN, 0x2000_0100):
-        probe.expect_refusal(0x1012, 0, identifier, 4, *REFUSED)
+    for identifier in (*RESTRICTED_IDS, 0x2000_0100):
+        probe.expect_refusal(0x1012, 0, identifier, 4, *VALUE_ABORTS)
     probe.set(0x1012, 0, 0x8000_0100)
-    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *REFUSED)
+    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *VALUE_ABORTS)
 
 
-@case(
-    _CASES, "canopen.time.malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3", intrusive=True
-)
+@TIME.case("malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3")
 def time_malformed(probe: CanopenProbe) -> None:
-    """Five and seven bytes, and more milliseconds than a day has; the node goes on."""
+    """Five and seven bytes, and more milliseconds than a day has."""
     for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
         probe.send(0x100, data)
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
 
 
-CASES = tuple(_CASES)
+CASES: Final = (
+    *SYNC.cases,
+    *TIME.cases,
+)

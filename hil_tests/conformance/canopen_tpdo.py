@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from canopen.objectdictionary import ODVariable
 
 from starhil.hil_tests.conformance.canopen_pdo import (
     EVENT,
     FIXED,
-    FORBIDDEN,
-    REFUSED,
     SYNCHRONOUS,
     after_event,
     constant,
@@ -27,20 +27,22 @@ from starhil.hil_tests.conformance.canopen_probe import (
     NOBODY,
     PDO_OFF,
     PRE_OPERATIONAL,
+    RESTRICTED_IDS,
     START,
     STOP,
+    VALUE_ABORTS,
     CanopenProbe,
     is_integer,
     size_of,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-_CASES: list[Case[CanopenProbe]] = []
+TPDO: Final = CaseArea[CanopenProbe]("canopen.tpdo", "CiA 301 7.5.2.37", intrusive=True)
 
 
-@case(_CASES, "canopen.tpdo.cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2", intrusive=True)
+@TPDO.case("cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2")
 def cyclic(probe: CanopenProbe) -> None:
-    """Types 1 and 3: the mapped value, at the SYNCs it has to come at, and at no other."""
+    """Types 1 and 3: the mapped value at every nth SYNC, and at no other."""
     index, item = first(probe, 0x1800), constant(probe)
     value = probe.read(item.index, item.subindex)
     for kind in (1, 3):
@@ -56,13 +58,7 @@ def cyclic(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.not-without-sync",
-    "synchronous TPDO waits for SYNC",
-    "CiA 301 7.2.2.2",
-    intrusive=True,
-)
+@TPDO.case("not-without-sync", "synchronous TPDO waits for SYNC", "CiA 301 7.2.2.2")
 def not_without_sync(probe: CanopenProbe) -> None:
     """Nothing in half a second without a SYNC."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
@@ -70,15 +66,12 @@ def not_without_sync(probe: CanopenProbe) -> None:
     probe.expect_silence(identifier, "TPDO without SYNC", 0.5)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.acyclic",
-    "acyclic TPDO at the SYNC after an event only",
-    "CiA 301 7.5.2.37",
-    intrusive=True,
-)
+@TPDO.case("acyclic", "acyclic TPDO at the SYNC after an event only")
 def acyclic(probe: CanopenProbe) -> None:
-    """Type 0: a write to the mapped object is the event; the next SYNC sends, the one after does not."""
+    """Type 0: a write to the mapped object is the event.
+
+    The next SYNC sends the TPDO, the one after does not.
+    """
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
     probe.command(START)
@@ -99,7 +92,7 @@ def acyclic(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.tpdo.sync-start", "SYNC start value", "CiA 301 7.5.2.37", intrusive=True)
+@TPDO.case("sync-start", "SYNC start value")
 def sync_start(probe: CanopenProbe) -> None:
     """Type 2 with start value 3 is sent at counters 3, 5 and 7."""
     probe.require(0x1019)
@@ -115,7 +108,7 @@ def sync_start(probe: CanopenProbe) -> None:
     check_equal(sent, [3, 5, 7], "counters")
 
 
-@case(_CASES, "canopen.tpdo.event", "event-driven TPDO after a change", "CiA 301 7.2.2.2", intrusive=True)
+@TPDO.case("event", "event-driven TPDO after a change", "CiA 301 7.2.2.2")
 def event(probe: CanopenProbe) -> None:
     """A write to the mapped object sends it; SYNC does not."""
     item = writable(probe)
@@ -131,9 +124,9 @@ def event(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.tpdo.event-timer", "event timer", "CiA 301 7.5.2.37", intrusive=True)
+@TPDO.case("event-timer", "event timer")
 def event_timer(probe: CanopenProbe) -> None:
-    """With 50 ms the TPDO comes every 50 ms, within a fifth."""
+    """With 50 ms, a mean period within 20 %."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
     probe.command(START)
     probe.wait_for(identifier, 0.1)
@@ -143,9 +136,9 @@ def event_timer(probe: CanopenProbe) -> None:
     check(0.04 <= mean <= 0.06, "period 0.05 s", f"{mean:.4f} s")
 
 
-@case(_CASES, "canopen.tpdo.inhibit", "inhibit time", "CiA 301 7.5.2.37", intrusive=True)
+@TPDO.case("inhibit", "inhibit time")
 def inhibit(probe: CanopenProbe) -> None:
-    """Two events at once with 100 ms: the second is sent 100 ms after the first, with the newest value."""
+    """The second of two events is sent after the 100 ms, with the newest value."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
@@ -163,9 +156,9 @@ def inhibit(probe: CanopenProbe) -> None:
     probe.set(item.index, item.subindex, before)
 
 
-@case(_CASES, "canopen.tpdo.gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5", intrusive=True)
+@TPDO.case("gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def gate(probe: CanopenProbe) -> None:
-    """By SYNC and by timer, neither in PRE-OPERATIONAL nor in STOPPED, again in OPERATIONAL."""
+    """By SYNC and by timer: not in PRE-OPERATIONAL and STOPPED, again in OPERATIONAL."""
     index, item = first(probe, 0x1800), constant(probe)
     for kind, event_ms in ((SYNCHRONOUS, 0), (EVENT, 20)):
         identifier = set_up(probe, index, [entry(item)], kind, event_ms=event_ms)
@@ -179,9 +172,9 @@ def gate(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@case(_CASES, "canopen.tpdo.mapping", "remapping at run time", "CiA 301 7.5.2.38", intrusive=True)
+@TPDO.case("mapping", "remapping while the node runs", "CiA 301 7.5.2.38")
 def mapping(probe: CanopenProbe) -> None:
-    """Two objects in one order and in the other."""
+    """Two objects in both orders."""
     index = first(probe, 0x1800)
     fitting = [
         item
@@ -201,11 +194,9 @@ def mapping(probe: CanopenProbe) -> None:
         probe.command(PRE_OPERATIONAL)
 
 
-@case(
-    _CASES, "canopen.tpdo.identifier", "a TPDO under another identifier", "CiA 301 7.5.2.37", intrusive=True
-)
+@TPDO.case("identifier", "a TPDO under another identifier")
 def identifier_moves(probe: CanopenProbe) -> None:
-    """It is sent under the new identifier and not under the old one."""
+    """It is sent with the new CAN-ID and not with the old one."""
     index, item = first(probe, 0x1800), constant(probe)
     old = set_up(probe, index, [entry(item)], SYNCHRONOUS)
     new = set_up(probe, index, [entry(item)], SYNCHRONOUS, identifier=0x3F1)
@@ -216,27 +207,19 @@ def identifier_moves(probe: CanopenProbe) -> None:
     probe.expect_silence(old, "TPDO under its old identifier")
 
 
-@case(
-    _CASES, "canopen.tpdo.forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5", intrusive=True
-)
+@TPDO.case("forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5")
 def forbidden(probe: CanopenProbe) -> None:
-    """Restricted ones and the extended format, abort 0609 0030h."""
+    """Restricted CAN-IDs and the extended format: abort 0609 0030h."""
     index = first(probe, 0x1800)
     set_up(probe, index, [entry(constant(probe))], SYNCHRONOUS)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
-    for identifier in (*FORBIDDEN, 0x2000_0181):
-        probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *REFUSED)
+    for identifier in (*RESTRICTED_IDS, 0x2000_0181):
+        probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *VALUE_ABORTS)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.fixed",
-    "what a TPDO in use does not let be changed",
-    "CiA 301 7.5.2.37",
-    intrusive=True,
-)
+@TPDO.case("fixed", "settings of a TPDO in use that cannot be changed")
 def fixed(probe: CanopenProbe) -> None:
-    """Identifier, inhibit time, SYNC start value, mapping."""
+    """CAN-ID, inhibit time, SYNC start value, mapping."""
     index, item = first(probe, 0x1800), constant(probe)
     set_up(probe, index, [entry(item)], SYNCHRONOUS)
     record = probe.od.indices[index]
@@ -253,40 +236,28 @@ def fixed(probe: CanopenProbe) -> None:
     probe.set(index + 0x200, 1, entry(item))
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.types",
-    "transmission types that there are none of",
-    "CiA 301 7.5.2.37",
-    intrusive=True,
-)
+@TPDO.case("types", "reserved transmission types")
 def types(probe: CanopenProbe) -> None:
-    """241 to 251 are reserved, abort 0609 0030h."""
+    """241 to 251 are reserved: abort 0609 0030h."""
     index = first(probe, 0x1800)
     for value in (241, 251):
-        probe.expect_refusal(index, 2, value, 1, *REFUSED)
+        probe.expect_refusal(index, 2, value, 1, *VALUE_ABORTS)
     for value in (0, 1, 240, 254, 255):
         probe.set(index, 2, value, 1)
 
 
-@case(_CASES, "canopen.tpdo.reserved", "sub-index 4 of a TPDO is not served", "CiA 301 7.5.2.37")
+@TPDO.case("reserved", "sub-index 4 of a TPDO is not served", intrusive=False)
 def reserved(probe: CanopenProbe) -> None:
-    """Abort 0609 0011h unless the data sheet has it."""
+    """Abort 0609 0011h."""
     index = first(probe, 0x1800)
     if probe.od.get_variable(index, 4) is not None:
-        raise CaseSkipped("the data sheet has it")
+        raise CaseSkipped("the EDS has it")
     probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), ABORT_NO_SUBINDEX)
 
 
-@case(
-    _CASES,
-    "canopen.tpdo.mapping-refused",
-    "mapping of what cannot be mapped",
-    "CiA 301 7.5.2.38",
-    intrusive=True,
-)
+@TPDO.case("mapping-refused", "mapping of objects that cannot be mapped", "CiA 301 7.5.2.38")
 def mapping_refused(probe: CanopenProbe) -> None:
-    """No such object, not mappable, wrong length, more than 64 bits, too many objects."""
+    """Missing object, not mappable, wrong length, write-only."""
     index, item = first(probe, 0x1800), constant(probe)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
     probe.set(index + 0x200, 0, 0, 1)
@@ -303,9 +274,7 @@ def mapping_refused(probe: CanopenProbe) -> None:
         probe.expect_refusal(index + 0x200, 1, entry(hidden), 4, ABORT_NOT_MAPPABLE)
 
 
-@case(
-    _CASES, "canopen.tpdo.mapping-length", "mapping of more than 64 bits", "CiA 301 7.5.2.38", intrusive=True
-)
+@TPDO.case("mapping-length", "mapping of more than 64 bits", "CiA 301 7.5.2.38")
 def mapping_length(probe: CanopenProbe) -> None:
     """Abort 0604 0042h for the sum and for the number of objects."""
     index = first(probe, 0x1800)
@@ -317,8 +286,8 @@ def mapping_length(probe: CanopenProbe) -> None:
     for position in (1, 2, 3):
         probe.set(index + 0x200, position, entry(wide))
     probe.expect_refusal(index + 0x200, 0, 3, 1, ABORT_PDO_LENGTH)
-    probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *REFUSED)
+    probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *VALUE_ABORTS)
     probe.set(index + 0x200, 0, 2, 1)
 
 
-CASES = tuple(_CASES)
+CASES: Final = (*TPDO.cases,)

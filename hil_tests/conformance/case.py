@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 ProbeType = TypeVar("ProbeType")
 
 
 class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
-    """The device did something else than it has to.
+    """The device behaved differently from the rule.
 
     Attributes
     ----------
     expected, seen
-        What had to come and what came, one line each.
+        What was expected and what was seen, one line each.
     """
 
     def __init__(self, expected: str, seen: str) -> None:
@@ -56,21 +56,48 @@ class Case(Generic[ProbeType]):
     intrusive: bool = False
 
 
-def case(
-    cases: list[Case[ProbeType]], identifier: str, title: str, clause: str, *, intrusive: bool = False
-) -> Callable[[Callable[[ProbeType], None]], Callable[[ProbeType], None]]:
-    """Enter a function in a table of cases; the area is the identifier without its last part."""
+@dataclass(frozen=True)
+class CaseArea(Generic[ProbeType]):
+    """The cases of one area of the protocol.
 
-    def enter(run: Callable[[ProbeType], None]) -> Callable[[ProbeType], None]:
-        area = identifier.rpartition(".")[0]
-        cases.append(Case(identifier, area, title, clause, run, intrusive))
-        return run
+    Attributes
+    ----------
+    name
+        Dotted name, with which the IDs of the cases begin.
+    clause, intrusive
+        Defaults of the cases.
+    cases
+        Cases in the order of their declaration.
+    """
 
-    return enter
+    name: str
+    clause: str
+    intrusive: bool = False
+    cases: list[Case[ProbeType]] = field(default_factory=list)
+
+    def case(
+        self, name: str, title: str, clause: str | None = None, *, intrusive: bool | None = None
+    ) -> Callable[[Callable[[ProbeType], None]], Callable[[ProbeType], None]]:
+        """Register a function as a case."""
+
+        def register(run: Callable[[ProbeType], None]) -> Callable[[ProbeType], None]:
+            self.cases.append(
+                Case(
+                    f"{self.name}.{name}",
+                    self.name,
+                    title,
+                    self.clause if clause is None else clause,
+                    run,
+                    self.intrusive if intrusive is None else intrusive,
+                )
+            )
+            return run
+
+        return register
 
 
 def rule(number: int) -> str:
-    """Return the clause of a rule of this product, for what no standard and no public source settles."""
+    """Return the clause of a rule of this product, where no standard or public source applies."""
     return f"R{number}, docs/rules.md"
 
 

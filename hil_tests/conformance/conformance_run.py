@@ -1,4 +1,4 @@
-"""A conformance run from the options to the reports: unit, links, cases, and what to do with the results."""
+"""A complete conformance run: options, links, cases, interruption."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.own_hub import OwnBus
+from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.results import FAILED
-from starhil.hil_tests.scratch import scratch_folder
+from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.icd import InterfaceDefinition, load_icd
 
 DEFAULT_BAUD: Final = 115200
@@ -28,7 +28,7 @@ DEFAULT_BAUD: Final = 115200
 
 @dataclass(frozen=True)
 class ConformanceRequest:
-    """What a user asks for; see `starhil conformance --help`."""
+    """Options of the user; see `starhil conformance --help`."""
 
     serial: str | None = None
     can: str | None = None
@@ -79,12 +79,14 @@ class ConformanceResult:
 def run_conformance(
     request: ConformanceRequest, on_outcome: Callable[[Outcome], None] = lambda _outcome: None
 ) -> ConformanceResult:
-    """Run the cases on the links that are asked for; those that an interruption leaves are marked as not run.
+    """Run the cases on the links that are asked for.
+
+    Those that an interruption leaves are marked as not run.
 
     Raises
     ------
     BenchError, ProtocolError
-        A port, a bus or the emulator cannot be had.
+        A port, a bus or the emulator is not available.
     """
     icd = load_icd()
     cases = all_cases(request, icd)
@@ -145,7 +147,10 @@ def _run_on_links(
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:
-    """Return the outcome that says that the emulator did not last; what was found until then stays."""
+    """Return the outcome that says that the emulator did not last.
+
+    What was found until then stays.
+    """
     return Outcome(
         "emulator.end",
         "emulator",
@@ -162,11 +167,11 @@ def _fallen(error: EmulatorProcessError) -> Outcome:
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, str | None]:
     """Start an emulator with the links that are asked for; return port and channel."""
-    folder = stack.enter_context(scratch_folder("starhil-conformance-"))
+    folder = stack.enter_context(temporary_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"
     if needs_bus:
-        channel = stack.enter_context(OwnBus()) if request.can in (None, "auto") else str(request.can)
+        channel = stack.enter_context(PrivateCanBus()) if request.can in (None, "auto") else str(request.can)
     extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
     if request.speed != 1.0:
         extra += ["--clock", f"scaled:{request.speed:g}"]
@@ -186,27 +191,27 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
 def _run_canopen(
     request: ConformanceRequest, can: str, cases: Sequence[Case[Any]], on_outcome: Callable[[Outcome], None]
 ) -> None:
-    """Run the CANopen cases; the data sheet is the one given, else that of the product."""
+    """Run the CANopen cases with the EDS of the request, else that of the product."""
     import canopen
     from canopen.objectdictionary import import_od
 
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
     node = int(request.canopen_node or 0)
-    text = _data_sheet(request.eds)
-    with scratch_folder("starhil-eds-") as folder:
+    text = _eds_text(request.eds)
+    with temporary_folder("starhil-eds-") as folder:
         path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
         try:
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
-            raise BenchError(f"{request.eds}: not a data sheet that can be read: {error}") from None
+            raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
     with live_can(can, request.speed) as bus:
         probe = CanopenProbe(bus, node, dictionary, text)
         run_cases(probe, cases, on_outcome, port=f"{can} at node {node}")
 
 
-def _data_sheet(path: Path | None) -> str:
+def _eds_text(path: Path | None) -> str:
     if path is None:
         from starhil.protocol.canopen import build_dictionary, build_eds
 
@@ -214,4 +219,4 @@ def _data_sheet(path: Path | None) -> str:
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise BenchError(f"{path}: the data sheet cannot be read: {error.strerror}") from None
+        raise BenchError(f"{path}: the EDS cannot be read: {error.strerror}") from None

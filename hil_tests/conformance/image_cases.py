@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, CaseFailed, case, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
 from starhil.hil_tests.images import bmp_file_size, decode_bmp
 from starhil.protocol.values import Value
 
-FRAMES: Final = "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)"
-BURSTS: Final = "CubeComputer TC 112, 119 to 127 and TLM 242 (AlbertaSat, CTS)"
-SAVE: Final = "CubeComputer TC 80, TLM 233 (AlbertaSat, CTS)"
 EDGE: Final = 64
 FRAME: Final = 128
 PACKET: Final = 20
 
-_CASES: list[Case[LinkProbe]] = []
+IMAGES: Final = CaseArea[LinkProbe](
+    "images", "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)", intrusive=True
+)
+BURSTS: Final = CaseArea[LinkProbe](
+    "bursts", "CubeComputer TC 112, 119 to 127 and TLM 242 (AlbertaSat, CTS)", intrusive=True
+)
 
 
 def _save(probe: LinkProbe) -> None:
@@ -26,18 +28,16 @@ def _save(probe: LinkProbe) -> None:
     probe.wait_for("image_status", {"percent": 100, "status": "ok"}, probe.times.image_s)
 
 
-@case(
-    _CASES, "images.none", "without a stored image a download is refused with code 7", FRAMES, intrusive=True
-)
+@IMAGES.case("none", "without a stored image a download is refused with code 7")
 def no_image(probe: LinkProbe) -> None:
-    """After a reset."""
+    """The device has just been reset."""
     probe.reset()
     for name, values in (("init_image_download", {"image_size": "size_64"}), ("advance_image_download", {"next_frame": 0}), ("start_burst", {})):  # fmt: skip
         row = probe.icd.telecommands[name]
         probe.expect_refusal(row.id, row.encode(values), SEQUENCE)
 
 
-@case(_CASES, "images.other-camera", "only the star camera exists", SAVE, intrusive=True)
+@IMAGES.case("other-camera", "only the star camera exists", "CubeComputer TC 80, TLM 233 (AlbertaSat, CTS)")
 def other_camera(probe: LinkProbe) -> None:
     """Cameras 1 and 2 are refused with code 3."""
     row = probe.icd.telecommands["save_image"]
@@ -47,15 +47,9 @@ def other_camera(probe: LinkProbe) -> None:
         )
 
 
-@case(
-    _CASES,
-    "images.frames",
-    "an image comes in frames of 128 bytes, each with its number and checksum",
-    FRAMES,
-    intrusive=True,
-)
+@IMAGES.case("frames", "an image comes in frames of 128 bytes, each with its number and checksum")
 def frames(probe: LinkProbe) -> None:
-    """All 32 frames of 64 x 64 pixels; a second look at a frame shows the same."""
+    """All 32 frames of 64 x 64 pixels; reading a frame twice gives the same data."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     for number in range(EDGE * EDGE // FRAME):
@@ -69,9 +63,9 @@ def frames(probe: LinkProbe) -> None:
         check_equal(probe.telemetry("image_frame")["data"], data, "the same frame")
 
 
-@case(_CASES, "images.beyond", "a frame beyond the last is refused with code 3", FRAMES, intrusive=True)
+@IMAGES.case("beyond", "a frame beyond the last is refused with code 3")
 def beyond(probe: LinkProbe) -> None:
-    """The loaded frame stays."""
+    """The loaded frame stays the same."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     probe.command("advance_image_download", next_frame=31)
@@ -80,9 +74,8 @@ def beyond(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("image_frame_info")["frame"], 31, "loaded frame")
 
 
-@case(_CASES, "images.jump", "frames may be asked for in any order, and again", FRAMES, intrusive=True)
+@IMAGES.case("jump", "frames may be requested in any order, and again")
 def jump(probe: LinkProbe) -> None:
-    """Forward, backward."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     first = probe.telemetry("image_frame")["data"]
@@ -120,15 +113,9 @@ def _burst(probe: LinkProbe, count: int, *, everything: bool) -> list[tuple[int,
     return packets
 
 
-@case(
-    _CASES,
-    "bursts.block",
-    "a block comes in numbered packets of 20 bytes with the right checksum",
-    BURSTS,
-    intrusive=True,
-)
+@BURSTS.case("block", "a block comes in numbered packets of 20 bytes with the right checksum")
 def block(probe: LinkProbe) -> None:
-    """990 bytes: 50 packets, the last filled up."""
+    """990 bytes: 50 packets, the last one padded."""
     _save(probe)
     _load(probe, 0, 990)
     wanted = probe.telemetry("file_block")["checksum"]
@@ -139,7 +126,7 @@ def block(probe: LinkProbe) -> None:
     check(bmp_file_size(data) > EDGE * EDGE, "a file larger than its pixels", bmp_file_size(data))
 
 
-@case(_CASES, "bursts.holes", "with a hole map only what is missing comes", BURSTS, intrusive=True)
+@BURSTS.case("holes", "with a hole map only what is missing comes")
 def holes(probe: LinkProbe) -> None:
     """Packets 0, 7 and 49 of 50."""
     _save(probe)
@@ -152,15 +139,8 @@ def holes(probe: LinkProbe) -> None:
     check_equal(again, {number: whole[number] for number in (0, 7, 49)}, "the same packets")
 
 
-@case(
-    _CASES,
-    "bursts.file",
-    "the whole file is a picture of the size that was asked for",
-    BURSTS,
-    intrusive=True,
-)
+@BURSTS.case("file", "the whole file is an image of the requested size")
 def whole_file(probe: LinkProbe) -> None:
-    """Block after block."""
     _save(probe)
     _load(probe, 0, 54)
     size = bmp_file_size(b"".join(part for _, part in _burst(probe, 3, everything=True)))
@@ -170,15 +150,9 @@ def whole_file(probe: LinkProbe) -> None:
     check_equal((width, height), (EDGE, EDGE), "width and height")
 
 
-@case(
-    _CASES,
-    "bursts.range",
-    "a block outside the file is refused with code 3 and flagged",
-    BURSTS,
-    intrusive=True,
-)
+@BURSTS.case("range", "a block outside the file is refused with code 3 and flagged")
 def out_of_range(probe: LinkProbe) -> None:
-    """Beyond the end; and a burst without a block is refused."""
+    """A burst without a block is refused too."""
     _save(probe)
     row = probe.icd.telecommands["load_file_block"]
     values: dict[str, Value] = {"file_type": "bmp", "file_counter": 0, "offset": 1 << 24, "length": 100}
@@ -189,4 +163,7 @@ def out_of_range(probe: LinkProbe) -> None:
     probe.expect_refusal(row.id, row.encode({}), SEQUENCE)
 
 
-CASES: Final = tuple(_CASES)
+CASES: Final = (
+    *IMAGES.cases,
+    *BURSTS.cases,
+)

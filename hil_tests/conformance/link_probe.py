@@ -1,6 +1,7 @@
-"""The tester's side of a device on a serial line or on CAN: requests, strict reading of the answers, and a log of both.
+"""The tester's side of a serial or CAN link: requests, strict decoding of answers, and a log.
 
-The framing here is written anew from its public description; it shares no code with the codecs of the product.
+The framing is an independent implementation of the public description; it shares no code with the
+codecs of the product.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ SEQUENCE: Final = 7
 FIRST_TELEMETRY: Final = 128
 BURST_ID: Final = 119
 
+LONG_PAUSE_S: Final = 0.8
+"""Longer than the device waits for the rest of a message (0.5 s)."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, for time-outs of the device to pass."""
 
@@ -38,12 +41,13 @@ AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malfor
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back.
+    """An answer of the device.
 
     Attributes
     ----------
     kind
-        Which form it had; `none` for nothing within the time-out, `malformed` for what has no form.
+        Kind of answer: `none` for no answer within the time-out, `malformed` for an undecodable
+        one.
     code
         Error code of a refusal.
     data
@@ -111,20 +115,24 @@ class LinkProbe(ABC):
         """Send a request without waiting."""
 
     @abstractmethod
+    def send_text(self, text: str) -> None:
+        """Send hexadecimal bytes, or a CAN frame in which HH and DD stand for host and device."""
+
+    @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next answer that was not yet looked at; unsolicited telemetry is passed over."""
+        """Return the next unread answer; skip unsolicited telemetry."""
 
     @abstractmethod
-    def surplus(self, quiet_s: float) -> Answer:
-        """Return what comes without having been asked for within a time."""
+    def unexpected_answer(self, quiet_s: float) -> Answer:
+        """Return an unexpected answer within a time."""
 
     @abstractmethod
-    def unasked(self, seconds: float) -> list[Answer]:
+    def receive_unsolicited(self, seconds: float) -> list[Answer]:
         """Return the messages of unsolicited telemetry that come within a time."""
 
     @abstractmethod
     def drain(self) -> None:
-        """Let go of all that has come."""
+        """Discard everything received."""
 
     @abstractmethod
     def now(self) -> float:
@@ -132,7 +140,7 @@ class LinkProbe(ABC):
 
     @abstractmethod
     def sleep(self, seconds: float) -> None:
-        """Let time pass; what comes meanwhile is kept."""
+        """Let time pass; received data are kept."""
 
     # --- requests ---
 
@@ -177,7 +185,7 @@ class LinkProbe(ABC):
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
         """Fail the case if anything comes within a time."""
-        answer = self.surplus(self.times.quiet_s if seconds is None else seconds)
+        answer = self.unexpected_answer(self.times.quiet_s if seconds is None else seconds)
         if answer.kind != "none":
             raise CaseFailed(f"nothing ({why})", str(answer))
 
@@ -193,7 +201,10 @@ class LinkProbe(ABC):
     # --- state of the device ---
 
     def wait_for(self, name: str, wanted: Mapping[str, Value], within_s: float) -> dict[str, Value]:
-        """Read a row until its fields have the wanted values; the case fails if they do not get them in time."""
+        """Read a row until its fields have the wanted values.
+
+        The case fails if they do not get them in time.
+        """
         end = self.now() + within_s
         while True:
             answer = self.ask(self.icd.telemetry[name].id)
@@ -231,8 +242,8 @@ class LinkProbe(ABC):
         self.command("set_parameter", parameter=self.icd.parameters[name].id, value=number)
 
     @contextmanager
-    def kept(self, *names: str) -> Iterator[None]:
-        """Put parameters back to what they were before, whatever happens."""
+    def parameters_kept(self, *names: str) -> Iterator[None]:
+        """Restore the values of parameters afterwards."""
         before = {name: float(self.parameter(name)["value"]) for name in names}
         try:
             yield
@@ -249,7 +260,9 @@ class LinkProbe(ABC):
     # --- around a run ---
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return what came in place of answers to three rows of telemetry; None if one of them was answered well.
+        """Read three telemetry rows.
+
+        Return the invalid answer, None if one of them is answered correctly.
 
         A unit that may be booting is asked again until it must have booted.
         """
@@ -262,7 +275,10 @@ class LinkProbe(ABC):
                 return next((text for text in seen if text != "nothing"), "nothing")
 
     def _bad_answer(self, name: str) -> Answer | None:
-        """Ask for a row; return the answer unless it is telemetry of the row's length or a published refusal."""
+        """Ask for a row.
+
+        Return the answer unless it is telemetry of the row's length or a published refusal.
+        """
         self.drain()
         row = self.icd.telemetry[name]
         answer = self.ask(row.id)

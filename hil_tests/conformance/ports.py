@@ -1,4 +1,4 @@
-"""What the cases send on and receive from: a port or bus with its own time, live here, simulated in the tests."""
+"""Ports and buses for the cases, each with its own clock."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Port(Protocol[Item]):
 
 
 class LivePort(Generic[Item]):
-    """A port over one of the asyncio transports, whose loop runs in a thread of its own; a context manager.
+    """A port over an asyncio transport, whose loop runs in a separate thread; a context manager.
 
     Parameters
     ----------
     transport
         What carries the items.
     speed
-        Seconds that pass on this port's clock in a second of the wall clock.
+        Seconds on this port's clock per second of the wall clock.
     """
 
     def __init__(self, transport: Transport[Item], speed: float = 1.0) -> None:

@@ -1,4 +1,4 @@
-"""Conformance results for people and machines: lines and a table on the terminal, JUnit, HTML, JSON."""
+"""Conformance reports: terminal, JUnit, HTML, JSON."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def count(outcomes: Sequence[Outcome], status: str) -> int:
 
 
 def to_json(outcomes: Sequence[Outcome], unit: str) -> dict[str, Any]:
-    """Return all results as JSON takes them."""
+    """Return all results as JSON data."""
     return {
         "unit": unit,
         "cases": len(outcomes),
@@ -61,7 +61,7 @@ def to_json(outcomes: Sequence[Outcome], unit: str) -> dict[str, Any]:
 
 
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
-    """Print a line for a case; of those that passed or were not run only where that is wished."""
+    """Print a line for a case; passed cases and those not run only if `verbose`."""
     if outcome.status in SHOWN_IF_VERBOSE and not verbose:
         return
     mark, style = STYLES[outcome.status]
@@ -111,7 +111,7 @@ def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> None:
-    """Write a page of its own with all cases: clause, result, what was sent, expected and seen."""
+    """Write an HTML page with all cases: clause, result, traffic, expected and seen."""
     rows = []
     for area in areas_of(outcomes):
         mine = [outcome for outcome in outcomes if outcome.area == area]

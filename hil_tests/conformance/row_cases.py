@@ -1,4 +1,4 @@
-"""Conformance to the interface definition, row by row, on any link: identifiers, lengths, values, limits."""
+"""Conformance to the interface definition, row by row: row IDs, lengths, values, limits."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
+from starhil.hil_tests.conformance.case import Case, CaseArea, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -21,7 +21,6 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import Parameter
 
 CODES: Final = "published error codes 0 to 4 (AlbertaSat, CTS)"
-IDENTIFIERS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
 PARTNERS: Final = {
     "max_star_pixels": ("min_star_pixels", 1.0),
     "min_star_pixels": ("max_star_pixels", 255.0),
@@ -35,6 +34,11 @@ UNSET: Final = frozenset({"unsolicited_rate"})
 """Parameters whose greatest value would flood the line."""
 
 
+IDENTIFIERS: Final = CaseArea[LinkProbe](
+    "identifiers", "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
+)
+
+
 def clause_of(row: Row) -> str:
     """Where a row is written."""
     return f"configs/icd {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
@@ -42,7 +46,7 @@ def clause_of(row: Row) -> str:
 
 def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
     """Make the cases of a definition."""
-    cases: list[Case[LinkProbe]] = list(_IDENTIFIER_CASES)
+    cases: list[Case[LinkProbe]] = list(IDENTIFIERS.cases)
     cases.extend(_telemetry_case(row) for row in icd.telemetry.values())
     for row in icd.telecommands.values():
         cases.extend(_length_cases(row))
@@ -54,45 +58,27 @@ def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
 
 # --- identifiers ---
 
-_IDENTIFIER_CASES: list[Case[LinkProbe]] = []
 
-
-@case(
-    _IDENTIFIER_CASES,
-    "identifiers.telemetry",
-    "each unknown telemetry identifier is refused with code 1",
-    IDENTIFIERS,
-)
+@IDENTIFIERS.case("telemetry", "each unknown telemetry identifier is refused with code 1")
 def unknown_telemetry(probe: LinkProbe) -> None:
-    """All of them."""
     for identifier in range(128, 256):
         if identifier not in probe.icd.telemetry_by_id:
             probe.expect_refusal(identifier, b"", INVALID_ID)
 
 
-@case(
-    _IDENTIFIER_CASES,
-    "identifiers.telecommands",
-    "each unknown telecommand is refused with code 1",
-    IDENTIFIERS,
-    intrusive=True,
-)
+@IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
 def unknown_telecommands(probe: LinkProbe) -> None:
-    """All of them, with and without data."""
+    """With and without data."""
     for identifier in range(128):
         if identifier not in probe.icd.telecommands_by_id:
             probe.expect_refusal(identifier, b"", INVALID_ID)
             probe.expect_refusal(identifier, b"\x01\x02", INVALID_ID)
 
 
-@case(
-    _IDENTIFIER_CASES,
-    "identifiers.telemetry-with-data",
-    "a request of telemetry with data is refused for its length",
-    rule(5),
+@IDENTIFIERS.case(
+    "telemetry-with-data", "a request of telemetry with data is refused for its length", rule(5)
 )
 def telemetry_with_data(probe: LinkProbe) -> None:
-    """Every row."""
     for row in probe.icd.telemetry.values():
         probe.expect_refusal(row.id, b"\x00", INVALID_LENGTH)
 
@@ -221,7 +207,7 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
 
     def values(probe: LinkProbe) -> None:
         partner, room = PARTNERS.get(parameter.name, (parameter.name, None))
-        with probe.kept(parameter.name, partner):
+        with probe.parameters_kept(parameter.name, partner):
             if room is not None:
                 probe.set_parameter(partner, room)
             for good in _inside(parameter, float(probe.parameter(parameter.name)["value"])):

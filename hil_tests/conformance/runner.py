@@ -1,4 +1,4 @@
-"""Running conformance cases: which, in what order, and what came of each."""
+"""Selection and execution of conformance cases."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starhil.protocol.errors import ProtocolError
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """Outcome of a case.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Outcome:
     log: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON takes it; the log only where the case failed."""
+        """Return the outcome as JSON data, with the log of a failed case only."""
         value = dict(vars(self))
         value["seconds"] = round(self.seconds, 4)
         value["log"] = list(self.log) if self.status == FAILED else []
@@ -52,7 +52,7 @@ class Outcome:
 def select_cases(
     cases: Iterable[Case[Any]], patterns: Sequence[str] = (), *, safe_only: bool = False
 ) -> list[Case[Any]]:
-    """Return the cases whose identifier matches one of the patterns (`*` and `?`; a bare name takes what begins so).
+    """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
 
     Raises
     ------
@@ -84,7 +84,7 @@ class Probe(Protocol):
     """What was sent and received."""
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return what comes in place of good answers; None if the device answers."""
+        """Return the invalid answer, or `nothing`; None if the device answers."""
 
     def prepare(self) -> None:
         """Note the settings of the device before cases that change them."""
@@ -96,7 +96,10 @@ class Probe(Protocol):
         """Get ready for a case."""
 
     def end(self, *, intrusive: bool, passed: bool) -> None:
-        """Check what must hold after a case, and leave the device to the next one; `CaseFailed` if it is not so."""
+        """Check what must hold after a case, and leave the device to the next one.
+
+        `CaseFailed` if it is not so.
+        """
 
     def recover(self) -> None:
         """Let what a failed case has left pass."""
@@ -136,7 +139,7 @@ def run_case(probe: Probe, case: Case[Any]) -> Outcome:
 
 @dataclass(frozen=True)
 class _Verdict:
-    """What came of one part of a case."""
+    """Outcome of one part of a case."""
 
     status: str
     expected: str = ""
@@ -147,7 +150,8 @@ class _Verdict:
 def _attempt(probe: Probe, act: Callable[[], None]) -> _Verdict:
     """Do a part of a case.
 
-    Frames that no case has thought of, such as an empty heartbeat, show as errors of the code that takes them apart.
+    Frames that no case has thought of, such as an empty heartbeat, show as errors of the code that
+    takes them apart.
     """
     try:
         act()
@@ -174,9 +178,10 @@ def run_cases(
 ) -> list[Outcome]:
     """Run the cases of one link in order.
 
-    A device that answers nothing ends the run: a failed outcome names the port, and the cases that are left are not run.
-    Before the first case that changes settings these are noted; after the last one they are put back, also when the run is
-    interrupted. An outcome is added only if that fails.
+    A device that answers nothing ends the run: a failed outcome names the port, and the cases that
+    are left are not run. Before the first case that changes settings these are noted; after the
+    last one they are put back, also when the run is interrupted. An outcome is added only if that
+    fails.
     """
     waiting = list(cases)
     outcomes: list[Outcome] = []
@@ -240,7 +245,10 @@ def _outcome_of_run(link: str, what: str, title: str, verdict: _Verdict, log: tu
 
 
 def _mute(probe: Probe, port: str, *, booting: bool) -> _Verdict | None:
-    """Return the verdict on a device that does not answer; None if it answers, or if the link itself is gone."""
+    """Return the verdict on a device that does not answer.
+
+    None if it answers, or if the link itself is gone.
+    """
     seen: str | None = None
 
     def listen() -> None:

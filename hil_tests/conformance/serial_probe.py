@@ -59,10 +59,10 @@ class SerialProbe(LinkProbe):
         return self.port.now()
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass; what comes meanwhile is kept."""
+        """Let time pass; received data are kept."""
         end = self.now() + seconds
         while (left := end - self.now()) > 0:
-            self._take(left)
+            self._receive_into_buffer(left)
 
     def post(self, identifier: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
@@ -74,15 +74,19 @@ class SerialProbe(LinkProbe):
         self._asked.extend(identifiers)
 
     def send(self, data: bytes) -> None:
-        """Send bytes as they stand."""
+        """Send raw bytes."""
         self._note("->", data)
         self.port.send(data)
+
+    def send_text(self, text: str) -> None:
+        """Send bytes written in hexadecimal."""
+        self.send(bytes.fromhex(text))
 
     def _note(self, way: str, data: bytes) -> None:
         more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
         self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
 
-    def _take(self, timeout_s: float) -> bool:
+    def _receive_into_buffer(self, timeout_s: float) -> bool:
         data = self.port.receive(timeout_s)
         if data is None:
             return False
@@ -91,14 +95,14 @@ class SerialProbe(LinkProbe):
         return True
 
     def drain(self) -> None:
-        """Let go of all that has come."""
+        """Discard everything received."""
         while self.port.receive(0.0) is not None:
             pass
         self._buffer.clear()
         self._asked.clear()
 
-    def surplus(self, quiet_s: float) -> Answer:
-        """Return what comes without having been asked for."""
+    def unexpected_answer(self, quiet_s: float) -> Answer:
+        """Return an unexpected answer."""
         self.sleep(quiet_s)
         while (packet := self._packet()) is not None:
             answer = self._answer(*packet)
@@ -106,8 +110,11 @@ class SerialProbe(LinkProbe):
                 return answer
         return self._malformed() if self._buffer else Answer("none")
 
-    def unasked(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that come within a time; anything else fails the case."""
+    def receive_unsolicited(self, seconds: float) -> list[Answer]:
+        """Return the messages of unsolicited telemetry that come within a time.
+
+        Anything else fails the case.
+        """
         self.sleep(seconds)
         found = []
         while (packet := self._packet()) is not None:
@@ -118,7 +125,7 @@ class SerialProbe(LinkProbe):
         return found
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next answer that was not yet looked at."""
+        """Return the next unread answer."""
         end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
         while True:
             if (packet := self._packet()) is not None:
@@ -129,7 +136,7 @@ class SerialProbe(LinkProbe):
             if len(self._buffer) >= 2 and not self._starts_well():
                 return self._malformed()
             left = end - self.now()
-            if left <= 0 or not self._take(left):
+            if left <= 0 or not self._receive_into_buffer(left):
                 self._asked.clear()
                 return self._malformed() if self._buffer else Answer("none")
 
@@ -143,7 +150,10 @@ class SerialProbe(LinkProbe):
         return Answer("malformed", data=data)
 
     def _packet(self) -> tuple[int, bytes] | None:
-        """Take a whole packet off the buffer: its start byte and its body without stuffing; None if none is whole."""
+        """Take a whole packet off the buffer: its start byte and its body without stuffing.
+
+        None if none is whole.
+        """
         if len(self._buffer) < 2 or not self._starts_well():
             return None
         body = bytearray()
@@ -183,7 +193,7 @@ class SerialProbe(LinkProbe):
         return self._plain(body[0], body[1:], body[0])
 
     def _expects(self, size: int) -> bool:
-        """Tell whether the row that is asked for in dialect b has as many bytes as a burst packet."""
+        """Return whether the requested row has the size of a burst packet, in dialect b."""
         row = self.icd.telemetry_by_id.get(self._asked[0]) if self._asked and self.dialect == "b" else None
         return row is not None and row.size == size
 

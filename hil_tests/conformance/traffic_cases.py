@@ -1,4 +1,4 @@
-"""Conformance of the traffic on any link: how soon a reply comes, unsolicited telemetry, recovery from noise and floods."""
+"""Conformance on any link: latency, unsolicited telemetry, recovery from noise and floods."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import random
 from typing import Final
 
 from starhil.hil_tests.conformance.can_probe import CanProbe
-from starhil.hil_tests.conformance.case import Case, case, check, check_equal, rule
+from starhil.hil_tests.conformance.case import CaseArea, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, Answer, LinkProbe, checked_values
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.protocol.can_framing import CanFrame
@@ -14,20 +14,21 @@ from starhil.protocol.can_framing import CanFrame
 HOST_TIMEOUT_S: Final = 0.3
 """Time-out of the most impatient published flight software (AlbertaSat, first version)."""
 
-_CASES: list[Case[LinkProbe]] = []
+TIMING: Final = CaseArea[LinkProbe]("timing", "host time-out of AlbertaSat, first version")
+UNSOLICITED: Final = CaseArea[LinkProbe](
+    "unsolicited",
+    "types 10 to 12, start bytes 1F 4F (libCubeObc); serial dialects a and b have none: R20, docs/rules.md",
+    intrusive=True,
+)
+RECOVERY: Final = CaseArea[LinkProbe]("recovery", rule(9))
 
 
 # --- time ---
 
 
-@case(
-    _CASES,
-    "timing.reply",
-    "fifty requests are each answered within 300 ms",
-    "host time-out of AlbertaSat, first version",
-)
+@TIMING.case("reply", "fifty requests are each answered within 300 ms")
 def reply_time(probe: LinkProbe) -> None:
-    """The longest of them counts."""
+    """The slowest of them counts."""
     worst = 0.0
     for _ in range(50):
         begin = probe.now()
@@ -38,46 +39,36 @@ def reply_time(probe: LinkProbe) -> None:
 
 # --- unsolicited telemetry ---
 
-UNSOLICITED: Final = (
-    "types 10 to 12, start bytes 1F 4F (libCubeObc); serial dialects a and b have none: R20, docs/rules.md"
-)
 
-
-def _unasked(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[Answer]:
-    """Return what comes of a row within a time; nothing may come in a serial dialect that has none."""
+def _unsolicited_rows(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[Answer]:
+    """Return the unsolicited telemetry of a row within a time."""
     row = probe.icd.telemetry[name]
     probe.command("set_unsolicited", telemetry=row.id, rate=rate)
     try:
-        return probe.unasked(seconds)
+        return probe.receive_unsolicited(seconds)
     finally:
         probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
 
 
-@case(
-    _CASES,
-    "unsolicited.rate",
-    "unsolicited telemetry comes at its rate, and stops",
-    UNSOLICITED,
-    intrusive=True,
-)
+@UNSOLICITED.case("rate", "unsolicited telemetry comes at its rate, and stops")
 def unsolicited(probe: LinkProbe) -> None:
     """identification, 8 bytes, at 10 Hz for two seconds."""
     row = probe.icd.telemetry["identification"]
-    seen = _unasked(probe, "identification", 10.0, 2.0)
+    seen = _unsolicited_rows(probe, "identification", 10.0, 2.0)
     if isinstance(probe, SerialProbe) and probe.dialect != "c":
         check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
         return
     check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
     check_equal({(item.identifier, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
-    after = probe.unasked(0.5)
+    after = probe.receive_unsolicited(0.5)
     check(len(after) <= 1, "no more", f"{len(after)} messages")
 
 
-@case(_CASES, "unsolicited.long", "a long row comes unsolicited as a whole", UNSOLICITED, intrusive=True)
+@UNSOLICITED.case("long", "a long row comes unsolicited as a whole")
 def unsolicited_long(probe: LinkProbe) -> None:
     """star_tracker, 54 bytes, with all values within their limits."""
     row = probe.icd.telemetry["star_tracker"]
-    seen = _unasked(probe, "star_tracker", 5.0, 1.0)
+    seen = _unsolicited_rows(probe, "star_tracker", 5.0, 1.0)
     if isinstance(probe, SerialProbe) and probe.dialect != "c":
         check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
         return
@@ -87,15 +78,10 @@ def unsolicited_long(probe: LinkProbe) -> None:
         checked_values(row, item.data)
 
 
-@case(
-    _CASES,
-    "unsolicited.refused",
-    "unsolicited telemetry of a row that does not exist is refused",
-    "published error codes",
-    intrusive=True,
+@UNSOLICITED.case(
+    "refused", "unsolicited telemetry of a row that does not exist is refused", "published error codes"
 )
 def unsolicited_refused(probe: LinkProbe) -> None:
-    """Number 200."""
     row = probe.icd.telecommands["set_unsolicited"]
     probe.expect_refusal(row.id, row.encode({"telemetry": 200, "rate": 1.0}), INVALID_PARAMETER)
 
@@ -103,7 +89,7 @@ def unsolicited_refused(probe: LinkProbe) -> None:
 # --- recovery ---
 
 
-@case(_CASES, "recovery.noise", "after noise the next good request is answered", rule(9))
+@RECOVERY.case("noise", "after noise the next good request is answered")
 def noise(probe: LinkProbe) -> None:
     """Serial: 4000 random bytes; CAN: 400 random frames that are no requests."""
     rng = random.Random(7)  # noqa: S311 -- noise, not a secret
@@ -121,7 +107,7 @@ def noise(probe: LinkProbe) -> None:
     probe.expect_alive()
 
 
-@case(_CASES, "recovery.flood", "a flood of requests is answered whole and in order", rule(10))
+@RECOVERY.case("flood", "a flood of requests is answered whole and in order", rule(10))
 def flood(probe: LinkProbe) -> None:
     """Two rows in turn, a hundred times."""
     rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]
@@ -133,4 +119,8 @@ def flood(probe: LinkProbe) -> None:
             probe.expect_telemetry(row.id, 2.0)
 
 
-CASES: Final = tuple(_CASES)
+CASES: Final = (
+    *TIMING.cases,
+    *UNSOLICITED.cases,
+    *RECOVERY.cases,
+)

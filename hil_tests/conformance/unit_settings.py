@@ -1,4 +1,4 @@
-"""What a conformance run changes in a unit, and how it is put back: its parameters, those that it stores, its mode."""
+"""The settings of a unit that a conformance run changes and restores: parameters, store, mode."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ class UnitSettings:
 
     @staticmethod
     def read(probe: LinkProbe) -> UnitSettings:
-        """Read the settings; where stored parameters differ from those in use, they are in use afterwards."""
+        """Read the settings.
+
+        Where stored parameters differ from those in use, they are in use afterwards.
+        """
         status = probe.telemetry("device_status")
         rows = _read_parameters(probe)
         running = {name: row["value"] for name, row in rows.items()}
@@ -62,7 +65,7 @@ class UnitSettings:
         save_parameters(probe)
         if self.running != self.stored:
             set_parameters(probe, self.running)
-        if self.mode != "standby":  # tracking comes by itself once there is an attitude again
+        if self.mode != "standby":  # the device resumes tracking after its next attitude
             probe.command("set_mode", mode="lost_in_space" if self.mode == "tracking" else self.mode)
 
     def __str__(self) -> str:
@@ -82,7 +85,7 @@ def _read_parameters(probe: LinkProbe) -> dict[str, dict[str, float]]:
 
 
 def set_parameters(probe: LinkProbe, values: Mapping[str, float]) -> None:
-    """Set parameters, in any order: one that another one bounds is set in a second round."""
+    """Set parameters in any order; those that another one bounds are set in a second pass."""
     refused: list[str] = []
     for name, value in values.items():
         try:

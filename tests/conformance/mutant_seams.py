@@ -1,7 +1,7 @@
 """Mutants of the device: what a mutant is, and the seams at which a defect is put in.
 
-A defect is put at a seam of the healthy device, just before it is switched on: into what its links receive, what they
-send, how requests are handled, or into one of its parts.
+A defect is put at a seam of the healthy device, just before it is switched on: into what its links
+receive, what they send, how requests are handled, or into one of its parts.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from starhil.emulator.device.device import Device
-from starhil.protocol.messages import FaultKind, Reply, Request
+from starhil.protocol.messages import FaultKind, Reply, ReplyKind, Request
 from tests.conformance.simulated import SimulatedUnit
 
 Damage = Callable[[SimulatedUnit], None]
@@ -72,7 +72,7 @@ def incoming(change: Callable[[Any], list[Any]]) -> Damage:
 
 
 def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]], list[Reply]]) -> Damage:
-    """Come between the links and the device: the change gets device, request and the healthy handler."""
+    """Wrap the request handler; the change gets device, request and the healthy handler."""
 
     def damage(unit: SimulatedUnit) -> None:
         device, requests, handle = unit.device, unit.requests, unit.requests.handle
@@ -103,10 +103,21 @@ def enter(name: str, link: str, caught_by: str, damage: Damage) -> None:
 
 
 def without_faults(*kinds: FaultKind) -> Damage:
-    """Let the device not hear of some kinds of fault."""
+    """Hide some kinds of fault from the device."""
 
     def damage(unit: SimulatedUnit) -> None:
         requests, count_fault = unit.requests, unit.requests.count_fault
         requests.count_fault = lambda event: None if event.kind in kinds else count_fault(event)
 
     return damage
+
+
+def only_acknowledged(row_id: int, data: bytes | None = None) -> Damage:
+    """Acknowledge a telecommand, or only one with these parameters, without carrying it out."""
+
+    def change(_device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+        if request.id == row_id and data in (None, request.data):
+            return [Reply(ReplyKind.ACK, row_id, destination=request.source)]
+        return handle(request)
+
+    return handling(change)

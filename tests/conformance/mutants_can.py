@@ -161,7 +161,7 @@ def mixed_hosts(unit: SimulatedUnit) -> None:
     )
 
 
-@mutant("half messages are never given up", "can", "segments.half")
+@mutant("incomplete messages never time out", "can", "segments.half")
 def can_never_given_up(unit: SimulatedUnit) -> None:
     unit.link._receiver = CanDeviceReceiver(4, timeout_s=1e9)
 

@@ -11,6 +11,7 @@ from tests.conformance.mutant_seams import (
     enter,
     handling,
     mutant,
+    only_acknowledged,
 )
 from tests.conformance.simulated import SimulatedUnit
 
@@ -108,11 +109,7 @@ enter(
     "an image may be downloaded beyond its end",
     "both",
     "images.beyond",
-    handling(
-        lambda _d, r, h: (
-            [Reply(ReplyKind.ACK, 65, destination=r.source)] if r.id == 65 and r.data == b"\x20\x00" else h(r)
-        )
-    ),
+    only_acknowledged(65, b"\x20\x00"),
 )
 enter(
     "the hole map is not obeyed",

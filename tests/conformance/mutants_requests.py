@@ -11,6 +11,7 @@ from tests.conformance.mutant_seams import (
     Damage,
     enter,
     handling,
+    only_acknowledged,
 )
 
 
@@ -207,7 +208,7 @@ enter(
     ),
 )
 enter(
-    "the acknowledge tells another telecommand",
+    "the acknowledge names another telecommand",
     "both",
     "acknowledge.accepted",
     handling(
@@ -225,7 +226,7 @@ enter(
     ),
 )
 enter(
-    "the index of the refused field is not told",
+    "the index of the refused field is missing",
     "both",
     "fields.set_unix_time.milliseconds.high",
     handling(lambda d, r, h: (h(r), setattr(d.acknowledge, "parameter_index", 0))[0]),
@@ -252,13 +253,13 @@ enter(
     "default_parameters does nothing",
     "both",
     "store.defaults",
-    handling(lambda _d, r, h: [Reply(ReplyKind.ACK, r.id, destination=r.source)] if r.id == 102 else h(r)),
+    only_acknowledged(102),
 )
 enter(
     "restore_parameters does nothing",
     "both",
     "store.restore",
-    handling(lambda _d, r, h: [Reply(ReplyKind.ACK, r.id, destination=r.source)] if r.id == 101 else h(r)),
+    only_acknowledged(101),
 )
 enter(
     "reset needs no magic number",
@@ -276,31 +277,19 @@ enter(
     "reset does nothing",
     "both",
     "reset.acknowledged",
-    handling(
-        lambda _d, r, h: (
-            [Reply(ReplyKind.ACK, 1, destination=r.source)] if r.id == 1 and r.data == b"\x5a" else h(r)
-        )
-    ),
+    only_acknowledged(1, b"\x5a"),
 )
 enter(
     "tracking needs no attitude",
     "both",
     "modes.no-tracking",
-    handling(
-        lambda _d, r, h: (
-            [Reply(ReplyKind.ACK, 96, destination=r.source)] if r.id == 96 and r.data == b"\x03" else h(r)
-        )
-    ),
+    only_acknowledged(96, b"\x03"),
 )
 enter(
     "set_mode does nothing",
     "both",
     "modes.changes",
-    handling(
-        lambda _d, r, h: (
-            [Reply(ReplyKind.ACK, 96, destination=r.source)] if r.id == 96 and r.data == b"\x02" else h(r)
-        )
-    ),
+    only_acknowledged(96, b"\x02"),
 )
 enter(
     "standby goes on making frames", "both", "modes.frames", _after("set_mode", lambda d, _r: d.cycle.start())

@@ -84,12 +84,12 @@ enter(
 )
 
 
-@mutant("half messages are never given up", "serial", "framing.half")
+@mutant("incomplete messages never time out", "serial", "framing.half")
 def never_given_up(unit: SimulatedUnit) -> None:
     unit.link._receiver = DeviceReceiver(timeout_s=1e9)
 
 
-@mutant("messages are given up after 50 ms", "serial", "framing.pause")
+@mutant("messages time out after 50 ms", "serial", "framing.pause")
 def given_up_early(unit: SimulatedUnit) -> None:
     unit.link._receiver = DeviceReceiver(timeout_s=0.05)
 

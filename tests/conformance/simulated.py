@@ -1,4 +1,4 @@
-"""The real device with its real links in simulated time: a conformance run takes seconds, and always the same."""
+"""The real device with its real links in simulated time: fast and reproducible."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 
 
 class LoopClock:
-    """Run time of the device, from the loop."""
+    """Simulation time of the device, from the loop."""
 
     name = "real"
     speed = 1.0
@@ -146,8 +146,8 @@ class SimulatedPort:
 STARS = (MatchedStar(32349, 86.0, 824.6, -1.44, 900.0), MatchedStar(27989, 361.0, 282.7, 0.45, 600.0))
 
 
-class Picture:
-    """A pipeline that sees the truth without making pictures."""
+class TruthImager:
+    """A pipeline that returns the truth without rendering images."""
 
     def __init__(self) -> None:
         self.last = -1
@@ -198,7 +198,7 @@ class SimulatedUnit:
         return self
 
     async def _start(self) -> None:
-        self.imager = DirectImager(Picture().handle)
+        self.imager = DirectImager(TruthImager().handle)
         attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
         links = {"serial": {"dialect": self.dialect}}
         profile = Profile.model_validate({"links": links})

@@ -1,4 +1,7 @@
-"""A unit whose frames no case has thought of, or a bus that is gone, fails cases; it never ends the run."""
+"""A unit whose frames no case has thought of, or a bus that is gone, fails cases.
+
+It never ends the run.
+"""
 
 from __future__ import annotations
 

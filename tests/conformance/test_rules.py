@@ -1,4 +1,4 @@
-"""Rules of the product that cases check: each that is cited is written down, and each that is written down is checked."""
+"""Rules of the product: each rule that a case cites is documented, and each documented rule is checked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run on a whole unit: it stops where nothing answers, and leaves the unit's settings as it found them."""
+"""A run on a whole unit stops if nothing answers, and restores the settings of the unit."""
 
 from __future__ import annotations
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.own_hub import OwnHub
+from starhil.hil_tests.private_can_bus import HubThread
 
 
 @pytest.fixture
 def hub():
     """Channel of a CAN hub at a free port."""
-    with OwnHub() as own:
+    with HubThread() as own:
         yield own.channel

@@ -1,4 +1,4 @@
-"""A minimal device for tests of the bench itself: protocol codecs, canned telemetry, and switches for misbehaviour."""
+"""A minimal device for tests of the bench: canned telemetry, and switches for misbehaviour."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def bmp_file() -> bytes:
 
 @dataclass
 class FakeDevice:
-    """Answers like the device; what it says of itself is in `telemetry`, what it was told in `received`."""
+    """Answers like the device; its telemetry is in `telemetry`, its telecommands in `received`."""
 
     dialect: Dialect = Dialect.B
     telemetry: dict[str, dict] = field(default_factory=dict)
@@ -131,7 +131,7 @@ class FakeDevice:
         except ProtocolError as error:
             return [Reply(ReplyKind.NACK, request.id, code=error.code)]
         self.received.append((row.name, values))
-        return [Reply(ReplyKind.ACK, request.id), *self._act(row.name, values)]
+        return [Reply(ReplyKind.ACK, request.id), *self._perform(row.name, values)]
 
     def _telemetry(self, name: str) -> dict:
         if name == "parameter":
@@ -156,7 +156,7 @@ class FakeDevice:
             }
         return self.telemetry.get(name, {})
 
-    def _act(self, name: str, values: dict) -> list[Reply]:
+    def _perform(self, name: str, values: dict) -> list[Reply]:
         if name == "select_parameter":
             self.telemetry["selected"] = {"id": values["parameter"]}
         elif name == "set_parameter":

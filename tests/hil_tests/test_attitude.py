@@ -1,4 +1,4 @@
-"""The bench's own quaternion algebra against closed forms and against an independent implementation."""
+"""The quaternion algebra of the bench compared with closed forms and an independent implementation."""
 
 from __future__ import annotations
 

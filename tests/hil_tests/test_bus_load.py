@@ -1,4 +1,4 @@
-"""The load measurement: it tells a good device from one that loses, lies or is late."""
+"""The load measurement detects a device that loses, corrupts or delays replies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The OBC client over a pty (three dialects) and over the TCP hub, against a device of canned answers."""
+"""The OBC client over a pty (three dialects) and over the TCP hub, with a canned device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
-from starhil.hil_tests.raw_exchange import send_and_listen
+from starhil.hil_tests.raw_traffic import send_and_listen
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial_framing import Dialect
@@ -80,7 +80,7 @@ def test_names_that_are_not_in_the_definition_are_refused_before_anything_is_sen
     with pytest.raises(ProtocolError, match="set_mode"):
         client.command("set_mode", mode="dancing")
     assert device.received == []
-    assert client.transactions == []
+    assert not client.transactions
 
 
 def test_values_that_the_definition_does_not_allow_go_out_unchecked_if_asked(pair):
@@ -94,7 +94,7 @@ def test_values_that_the_definition_does_not_allow_go_out_unchecked_if_asked(pai
         client.transactions.clear()
         with pytest.raises(FieldError):
             send()
-        assert client.transactions == []
+        assert not client.transactions
         with contextlib.suppress(NackError):  # what the device thinks of it is its own affair
             send(checked=False)
         assert len(client.transactions) == 1
@@ -197,7 +197,7 @@ def test_unsolicited_telemetry_is_a_stream_of_its_own(hub):
         assert counts == [0, 1, 2]
         with pytest.raises(NoReplyError, match="unsolicited"):
             client.wait_unsolicited("precise_attitude", timeout_s=0.05)
-        assert client.stray_replies == []
+        assert not client.stray_replies
 
 
 def test_bytes_and_frames_can_be_sent_as_they_stand(pair):

@@ -1,4 +1,4 @@
-"""Files that the bench writes and reads: pictures, wire logs, JUnit, truth."""
+"""Files that the bench writes and reads: images, wire logs, JUnit, truth."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.images import decode_bmp
 from starhil.hil_tests.png import encode_png, write_png
-from starhil.hil_tests.raw_exchange import format_frame, matches, parse_frame, pattern
+from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
-from starhil.hil_tests.truth_file import TruthFile
+from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import read_candump
 
 
-def picture(height: int, width: int) -> np.ndarray:
+def random_image(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (height, width), dtype=np.uint8)
 
 
-def test_a_picture_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
-    image = picture(37, 64)
+def test_an_image_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
+    image = random_image(37, 64)
     write_png(tmp_path / "a.png", image.tobytes(), 64, 37)
     assert np.array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), image)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_a_picture_of_another_size_is_refused():
-    with pytest.raises(BenchError, match="4096 bytes, 10 given"):
+def test_an_image_of_another_size_is_refused():
+    with pytest.raises(BenchError, match="4096 bytes, not 10"):
         encode_png(bytes(10), 64, 64)
 
 
 @pytest.mark.parametrize("width", [64, 61])
 def test_a_bmp_file_is_read_as_opencv_wrote_it(width):
-    image = picture(40, width)
+    image = random_image(40, width)
     ok, data = cv2.imencode(".bmp", image)
     assert ok
     assert decode_bmp(data.tobytes()) == (image.tobytes(), width, 40)
@@ -104,7 +104,7 @@ def test_the_truth_lies_between_the_rows_of_the_file_while_it_grows(tmp_path):
         for n in range(3)
     ]
     path.write_text(head + rows[0] + rows[1])
-    truth = TruthFile(path)
+    truth = TruthLogReader(path)
     assert attitude_error(truth.at(100.5), from_radec_roll(10.5, 0.0, 0.0)).total_arcsec < 1e-3
     with pytest.raises(BenchError, match=r"102\.000 s; it covers 100\.000 to 101\.000"):
         truth.at(102.0)
@@ -112,9 +112,9 @@ def test_the_truth_lies_between_the_rows_of_the_file_while_it_grows(tmp_path):
     assert attitude_error(truth.at(102.0), from_radec_roll(12.0, 0.0, 0.0)).total_arcsec < 1e-3
     path.write_text("time,qx\n1,2\n")
     with pytest.raises(BenchError, match="no column time_of_exposure_s"):
-        TruthFile(path).at(1.0)
+        TruthLogReader(path).at(1.0)
     with pytest.raises(BenchError, match="cannot be read"):
-        TruthFile(tmp_path / "none.csv").at(1.0)
+        TruthLogReader(tmp_path / "none.csv").at(1.0)
 
 
 @pytest.mark.parametrize("text", ["07360104#0001020304050601", "02360401#", "123#R", "7FF#00"])

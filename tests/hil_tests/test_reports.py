@@ -1,4 +1,4 @@
-"""Reports of the commands: refused before the run, and written whatever becomes of the emulator."""
+"""Reports of the commands: refused before the run, and written even if the emulator fails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starhil.hil_tests import session_run
 from starhil.hil_tests.conformance import conformance_run
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.own_hub import OwnHub
+from starhil.hil_tests.private_can_bus import HubThread
 from starhil.hil_tests.results import write_report
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
@@ -46,7 +46,7 @@ def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_repo
     script = tmp_path / "s.toml"
     script.write_text("[[step]]\nwait_s = 0\n", encoding="ascii")
     junit = tmp_path / "out" / "j.xml"
-    with OwnHub() as hub:
+    with HubThread() as hub:
         process = EmulatorProcess([sys.executable, "-c", DIES.format(hub.channel)])
         monkeypatch.setattr(session_run, "_emulator", lambda *_arguments: process)
         run = session_run.SessionRunner.run
@@ -58,7 +58,7 @@ def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_repo
     assert outcome.exit_code == 1, outcome.output
     *_, end = json.loads(outcome.stdout)["results"]
     assert (end["step"], end["status"]) == (2, "failed")
-    assert "by itself with status 7: no more sky" in end["detail"]
+    assert "unexpectedly with status 7: no more sky" in end["detail"]
     assert ET.parse(junit).getroot().get("failures") == "1"
 
 

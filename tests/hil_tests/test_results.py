@@ -1,4 +1,4 @@
-"""What is left of a run: reports in their folders, and the last words of an emulator that did not last."""
+"""Results of a failed run: reports, and the last lines of stderr of the emulator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from starhil.protocol.icd import load_icd
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"
 LASTS = READY + "time.sleep(600)"
-LAST_WORDS = "by itself with status 7: Segmentation of the sky"
+LAST_ERRORS = "unexpectedly with status 7: Segmentation of the sky"
 
 
 def emulator(text: str) -> EmulatorProcess:
@@ -31,7 +31,7 @@ def bench(text: str) -> Bench:
 
 
 def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -> None:
-    """Wait for the end of one that ends by itself, then raise the error if there is one."""
+    """Wait until the emulator ends, then raise the error if there is one."""
     if process.command[-1] == DIES:
         process.process.wait(timeout=60)
     if error is not None:
@@ -39,8 +39,8 @@ def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -
 
 
 @pytest.mark.process
-def test_an_emulator_that_ended_by_itself_is_told_of_with_its_last_words():
-    with pytest.raises(EmulatorProcessError, match=LAST_WORDS), bench(DIES) as own:
+def test_an_emulator_that_ended_unexpectedly_is_reported_with_its_last_errors():
+    with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), bench(DIES) as own:
         wait_for_its_end(own.emulator)
     assert own.emulator.process.stdout.closed
     assert own.emulator.process.stderr.closed
@@ -48,7 +48,7 @@ def test_an_emulator_that_ended_by_itself_is_told_of_with_its_last_words():
 
 @pytest.mark.process
 def test_it_is_the_reason_for_what_came_of_its_end():
-    with pytest.raises(EmulatorProcessError, match=LAST_WORDS), bench(DIES) as own:
+    with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), bench(DIES) as own:
         wait_for_its_end(own.emulator, BenchError("no reply"))
 
 
@@ -65,7 +65,7 @@ def test_another_error_is_not_hidden_by_it(text):
 def test_an_end_that_a_restart_has_told_of_is_not_told_of_again():
     with bench(DIES) as own:
         wait_for_its_end(own.emulator)
-        with pytest.raises(EmulatorProcessError, match=LAST_WORDS):
+        with pytest.raises(EmulatorProcessError, match=LAST_ERRORS):
             own.restart("term")
 
 
@@ -77,11 +77,11 @@ def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_says_so(m
         return None, None
 
     monkeypatch.setattr(conformance_run, "_start", start)
-    told = []
-    outcomes = run_conformance(ConformanceRequest(serial="auto", start=True), told.append).outcomes
+    reported = []
+    outcomes = run_conformance(ConformanceRequest(serial="auto", start=True), reported.append).outcomes
     assert [(outcome.id, outcome.status) for outcome in outcomes] == [("emulator.end", "failed")]
-    assert LAST_WORDS in outcomes[0].seen
-    assert told == outcomes
+    assert LAST_ERRORS in outcomes[0].seen
+    assert reported == outcomes
 
 
 WRITERS = pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_folder_is_no_report(write, tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_made_is_told_in_one_line(write, tmp_path):
     (tmp_path / "file").write_text("", encoding="ascii")
     for path in (tmp_path / "file" / "report", tmp_path / "file" / "deeper" / "report"):
-        with pytest.raises(BenchError, match=r"report: its folder cannot be made: [A-Z].*"):
+        with pytest.raises(BenchError, match=r"report: its folder cannot be created: [A-Z].*"):
             write(path)
 
 

@@ -1,4 +1,4 @@
-"""The session runner on a device of canned answers: what passes, what fails, and what is written."""
+"""The session runner with a canned device: passes, failures, and files."""
 
 from __future__ import annotations
 
@@ -280,7 +280,7 @@ def test_samples_go_to_a_csv_file_with_all_digits(play, device, tmp_path):
     assert result.results[0].figures["cross_boresight_max_arcsec"] == pytest.approx(5.0, abs=0.1)
 
 
-def test_a_picture_is_written_and_a_blank_one_fails(play, device, tmp_path):
+def test_an_image_is_written_and_a_blank_one_fails(play, device, tmp_path):
     assert play("[[step]]\ndownload_image = 'a.png'\nsize = 'size_64'").passed
     assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
     device.pixels = bytes(64 * 64)

@@ -1,4 +1,4 @@
-"""The wire rules once more, written from the published description alone: an oracle for what the emulator must answer."""
+"""An oracle for the replies of the emulator, written from the published wire rules alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ STATE_CHANGING = frozenset(
     {"reset", "set_parameter", "set_unsolicited", "set_mode", "set_update_rate", "set_star_config", "clear_counters",
      "save_image", "default_parameters", "restore_parameters"}
 )  # fmt: skip
-"""Telecommands that, if they were accepted, would change how the device answers; the fuzzers leave them out."""
+"""Telecommands that, if they were accepted, would change how the device answers.
+
+The fuzzers leave them out.
+"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Expected:
     source: int = 0
 
     def fits(self, body: bytes) -> bool:
-        """Tell whether a reply body (data or the code) is right."""
+        """Return whether a reply body (data or the code) is right."""
         if self.size is not None:
             return len(body) == self.size
         return len(body) == 1 and body[0] in self.codes
@@ -57,7 +60,7 @@ def answer_to(identifier: int, data: bytes, source: int = 0) -> Expected:
 
 
 def is_dangerous(identifier: int, data: bytes) -> bool:
-    """Tell whether a request might be accepted and change how the device answers."""
+    """Return whether a request might be accepted and change how the device answers."""
     row = ICD.telecommands_by_id.get(identifier)
     return row is not None and row.name in STATE_CHANGING and answer_to(identifier, data).codes >= OK_OR_STATE
 
@@ -70,9 +73,9 @@ def frame_request(identifier: int, data: bytes = b"") -> bytes:
 def requests_in(stream: bytes) -> list[tuple[int, bytes]]:
     """Find the requests in a stream of bytes, whatever else is in it.
 
-    Outside a message everything but `1F 7F` is passed over. Inside, `1F 1F` is a byte 1F, `1F FF` the end, `1F 7F`
-    the start of another message, and `1F` before anything else ends the message without effect, save that an
-    identifier 1F may stand alone.
+    Outside a message everything but `1F 7F` is passed over. Inside, `1F 1F` is a byte 1F, `1F FF`
+    the end, `1F 7F` the start of another message, and `1F` before anything else ends the message
+    without effect, save that an identifier 1F may stand alone.
     """
     found = []
     position = 0

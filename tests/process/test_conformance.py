@@ -1,4 +1,7 @@
-"""The conformance command against the emulator as a process: pty, bus, CANopen; reports; choice of cases."""
+"""The conformance command against the emulator as a process: pty, bus, CANopen; reports.
+
+Choice of cases.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ pytestmark = pytest.mark.process
 
 
 SPEED = 0.5
-"""Run time in a second: slow motion gives each rule about time the same meaning and a busy machine twice the patience."""
+"""Simulation time per second: slow motion doubles the time-outs on a busy machine."""
 SLOW_MOTION = ["--speed", str(SPEED)]
 TIME_OUT_S = 400.0
 
@@ -35,8 +38,9 @@ def run_cases(words: tuple) -> tuple[list[dict], list[str]]:
 def conform(*words: str, reports: tuple = ()) -> list[dict]:
     """Run cases and return their outcomes; none may have failed.
 
-    Rules about time are not loosened, and a machine that stalls breaks them: cases that failed are run once more, by
-    themselves, and named in a warning.
+    The rules on timing are those of real hardware, so a stall of a busy test machine breaks them,
+    and longer time-outs would loosen them. Cases that failed are therefore run once more, alone,
+    and named in a warning.
     """
     outcomes, failed = run_cases((*words, *reports))
     if failed:
@@ -54,7 +58,7 @@ AREAS = ("framing", "frames", "segments", "stuffing", "errors", "timing", "data"
 def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
     chosen = [f"serial.{area}" for area in AREAS if area not in ("frames", "segments")]
     chosen += [f"can.{area}" for area in AREAS if area not in ("framing", "stuffing")]
-    chosen += ["canopen.nmt", "canopen.sdo"]
+    chosen += ["canopen.nmt", "canopen.sdo", "canopen.rpdo", "canopen.design"]
     junit, html = tmp_path / "c.xml", tmp_path / "c.html"
     links = ["--serial", "auto", "--can", "auto", "--canopen", "44"]
     outcomes = conform(*chosen, "--start", *links, *SLOW_MOTION, reports=("--junit", junit, "--html", html))

@@ -1,4 +1,4 @@
-"""Recordings of sessions on a bus of several processes, with a CANopen node that talks meanwhile, as Wireshark reads them."""
+"""Bus recordings of sessions next to a busy CANopen node, dissected by Wireshark."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ BOOT_UP = 0
 
 
 def read_by_blocks(node: canopen.RemoteNode, index: int) -> bytes:
-    """Upload an object; anew after a reset where the device took a process's pause for the end of the transfer."""
+    """Upload an object.
+
+    Again after a reset if the transfer timed out because a process was paused.
+    """
     states: queue.Queue[int] = queue.Queue()
     node.nmt.add_heartbeat_callback(states.put)
     for _ in range(TRIES):

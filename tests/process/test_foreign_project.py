@@ -1,4 +1,4 @@
-"""The built wheel, installed into a fresh environment, in a project with folders of the names that ours have."""
+"""The built wheel in a fresh environment, in a project with folders of the same names."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def project(wheel, tmp_path_factory) -> Path:
-    """A project of flight software, with an environment of its own in `.venv`."""
+    """A project of flight software, with a separate environment in `.venv`."""
     folder = tmp_path_factory.mktemp("flight_software")
     for name in OUR_ROOMS:
         (folder / name).mkdir()
@@ -70,7 +70,7 @@ def test_the_wheel_brings_two_packages_and_no_more(wheel):
     assert {top for top in tops if not top.endswith(".dist-info")} == {"starhil", "starid"}
 
 
-def test_plugin_and_fixtures_work_beside_folders_of_the_same_names(project):
+def test_plugin_and_fixtures_work_next_to_folders_of_the_same_names(project):
     out = _run([str(project / ".venv/bin/python"), "-m", "pytest", "-q", "tests"], project)
     assert "2 passed" in out
 

@@ -1,4 +1,4 @@
-"""A session or a conformance run that is ended by a signal leaves no process and no folder behind, and keeps its reports."""
+"""A signal that ends a session or a conformance run leaves no process or folder, and its reports."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from starhil.hil_tests.emulator_process import STARHIL, EmulatorProcess
-from starhil.hil_tests.scratch import scratch_folder
+from starhil.hil_tests.emulator_process import EmulatorProcess, installed_command
+from starhil.hil_tests.temporary_folder import temporary_folder
 
 pytestmark = pytest.mark.process
 
@@ -56,8 +56,11 @@ def wait_until(condition, what: str) -> None:
 
 
 def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
-    """Start a command, send it a signal once a line of its run is out; return its exit status when all is over."""
-    command = [sys.executable, "-c", STARHIL, *map(str, words)]
+    """Start a command, send it a signal once a line of its run is out.
+
+    Return its exit status when all is over.
+    """
+    command = [installed_command(), *map(str, words)]
     environment = {**os.environ, "TMPDIR": str(folder)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         lines = iter(process.stdout)
@@ -83,7 +86,7 @@ def test_a_signal_leaves_no_process_and_no_folder_behind(name, number, tmp_path)
     }[name]
     status = interrupt([*words, "--start", "--serial", "auto", "--junit", junit], number, scratch)
     if number is signal.SIGKILL:
-        with scratch_folder("starhil-", base=scratch):  # the next run clears away what this one could not
+        with temporary_folder("starhil-", base=scratch):  # the next run clears away what this one could not
             left = list(scratch.iterdir())
         assert len(left) == 1
         return

@@ -1,15 +1,14 @@
-"""The sessions that come along, each against an emulator process of its own, as a user would run them."""
+"""The shipped sessions, each run against a new emulator process."""
 
 from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from xml.etree import ElementTree as ET
 
 import pytest
 
-from starhil.hil_tests.emulator_process import STARHIL
+from starhil.hil_tests.emulator_process import installed_command
 from starhil.protocol.candump import read_candump
 from tests.protocol.dissection import dissect
 
@@ -19,7 +18,7 @@ TIME_OUT_S = 120
 
 
 def starhil(*words: str, time_out_s: float = TIME_OUT_S) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-c", STARHIL, *map(str, words)]
+    command = [installed_command(), *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, timeout=time_out_s, check=False)
 
 

@@ -1,4 +1,4 @@
-"""Emulator, OBC and can-utils as processes of their own on a kernel vcan0 (on machines without one: in a guest)."""
+"""Emulator, OBC and can-utils as separate processes on a kernel vcan0 (if need be, in a guest)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.raw_exchange import format_frame
+from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.candump import parse_candump, read_candump
 from tests.process.conftest import needs_vcan0
 from tests.process.test_sessions import starhil
@@ -52,7 +52,10 @@ def obc(unit):
 
 @pytest.fixture
 def dump():
-    """A candump process; call it to get what it has seen since, heartbeats of the CANopen node left out."""
+    """A candump process.
+
+    Call it to get what it has seen since, heartbeats of the CANopen node left out.
+    """
     process = subprocess.Popen(
         [shutil.which("candump"), "-L", "vcan0"], stdout=subprocess.PIPE, text=True, bufsize=1
     )
@@ -137,8 +140,8 @@ def test_commands_are_answered_while_cangen_floods_the_bus(obc):
     finally:
         flood.terminate()
         flood.wait()
-    assert obc.faults == []
-    assert obc.stray_replies == []
+    assert not obc.faults
+    assert not obc.stray_replies
 
 
 def test_the_kernel_sends_periodic_requests_and_each_is_answered(obc):

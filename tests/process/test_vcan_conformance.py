@@ -1,4 +1,4 @@
-"""Every conformance case of CAN and CANopen on a kernel vcan0 (on machines without one: in a guest)."""
+"""Every CAN and CANopen conformance case on a kernel vcan0 (if need be, in a guest)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
 
 SPEED = 0.5
-"""Run time in a second: the guest has one slow processor, and time-outs are rules that stay."""
+"""Simulation time per second: the guest has one slow processor, and time-outs are rules that stay."""
 
 
 def test_every_case_passes_on_the_kernel_bus():

@@ -1,4 +1,4 @@
-"""The README and the walk-through typed as they stand, into a shell on a machine with a vcan0 (elsewhere: in a guest)."""
+"""README and walk-through in a shell on a machine with a vcan0 (if need be, in a guest)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Typed:
         return self._lines.get(timeout=within_s)
 
     def skip_past(self, identifier: str) -> None:
-        """Let go of what candump has shown and will show until a frame, and of that frame."""
+        """Discard the output of candump up to and including a frame."""
         while self.next_line().split()[1] != identifier:
             pass
 
@@ -90,7 +90,10 @@ def emulator_and_dump(lines: list[str], environment: dict[str, str]) -> Iterator
 
 
 def check(found: list[Exchange], dump: Typed, environment: dict[str, str]) -> None:
-    """Type each cansend line; candump must show what the text shows, but for what depends on time and noise."""
+    """Type each cansend line.
+
+    Candump must show what the text shows, but for what depends on time and noise.
+    """
     for exchange in found:
         subprocess.run(["sh", "-c", exchange.typed], check=True, env=environment)
         for shown in (exchange.sent, *exchange.answers):

@@ -12,7 +12,7 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.truth.file import read_truth_file
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.script import load_script
-from starhil.hil_tests.truth_file import TruthFile
+from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.canopen.layout import load_layout
 from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
@@ -21,7 +21,7 @@ from starhil.protocol.user_file import UnsuitableFileError, read_user_file, read
 
 READERS = {
     "truth file": read_truth_file,
-    "truth of a session": lambda path: TruthFile(path).at(0.0),
+    "truth of a session": lambda path: TruthLogReader(path).at(0.0),
     "profile": lambda path: load_profile(str(path)),
     "scenario": lambda path: load_scenario(str(path)),
     "session script": lambda path: load_script(path, load_icd()),

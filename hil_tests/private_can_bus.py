@@ -1,4 +1,4 @@
-"""A CAN bus of the bench's own: vcan0 where the kernel has it, else a TCP hub at a free port for as long as it lives."""
+"""A CAN bus for one run: vcan0 if the kernel has it, else a TCP hub at a free port."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from starhil.protocol.hub import DEFAULT_BUS, CanHub
 from starhil.protocol.transports.can import kernel_can_is_up
 
 
-class OwnHub:
+class HubThread:
     """A TCP hub at a free port in a thread; a context manager. `channel` is what clients open."""
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class OwnHub:
 
     @property
     def port(self) -> int:
-        """The port that the hub listens at, 0 while it does not."""
+        """Port of the hub, 0 while it is stopped."""
         return 0 if self._hub is None else self._hub.port
 
     def stop(self) -> None:
@@ -51,16 +51,16 @@ class OwnHub:
         self.close()
 
 
-class OwnBus:
-    """A bus that nobody else is on, as far as the machine allows: vcan0, or a hub of its own; a context manager."""
+class PrivateCanBus:
+    """A context manager for a CAN bus: vcan0 if the kernel has it, else a private hub."""
 
     def __init__(self) -> None:
-        self._hub: OwnHub | None = None
+        self._hub: HubThread | None = None
 
     def __enter__(self) -> str:
         if kernel_can_is_up(DEFAULT_BUS):
             return DEFAULT_BUS
-        self._hub = OwnHub().start()
+        self._hub = HubThread().start()
         return self._hub.channel
 
     def __exit__(

@@ -1,4 +1,4 @@
-"""Sending bytes or CAN frames as they stand, and comparing what comes back with a pattern."""
+"""Send raw bytes or CAN frames, and compare the answer with a pattern."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Final
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.links import CanLink, SerialLink
+from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 
 _FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8})")
-_LOOK_S: Final = 0.02
+_POLL_S: Final = 0.02
 _BYTES: Final = re.compile(r"(?:[0-9A-F]{2}|\.\.)*")
 
 
 def parse_frame(text: str) -> CanFrame:
-    """Read a frame as `cansend` takes it: `07360104#0001020304050601`, `123#R`.
+    """Parse a frame in the format of `cansend`: `07360104#0001020304050601`, `123#R`.
 
     Raises
     ------
@@ -29,7 +29,7 @@ def parse_frame(text: str) -> CanFrame:
     compact = text.replace(" ", "")
     match = _FRAME.fullmatch(compact)
     if match is None or ".." in compact:
-        raise BenchError(f"not a CAN frame as cansend takes it: {text!r}")
+        raise BenchError(f"not a CAN frame in the format of cansend: {text!r}")
     identifier, data = match.groups()
     try:
         if data == "R":
@@ -40,13 +40,13 @@ def parse_frame(text: str) -> CanFrame:
 
 
 def format_frame(frame: CanFrame) -> str:
-    """Write a frame as `cansend` takes it."""
+    """Format a frame for `cansend`."""
     identifier = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
     return f"{identifier}#{'R' if frame.remote else frame.data.hex().upper()}"
 
 
 def pattern(text: str) -> str:
-    """Return the pattern of an answer without blanks, in capitals; `..` stands for any byte.
+    """Normalise the pattern of an answer: no blanks, capitals; `..` stands for any byte.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def pattern(text: str) -> str:
 
 
 def matches(expected: str, seen: str) -> bool:
-    """Compare a text of hexadecimal bytes or a frame with a pattern, in which `..` stands for any byte."""
+    """Return whether hexadecimal bytes or a frame match a pattern; `..` stands for any byte."""
     return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
 
 
@@ -71,20 +71,22 @@ def send_and_listen(
     wanted: tuple[str, ...] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
-    """Send bytes (serial) or frames (CAN); return what came back as one text of bytes, or as frames of the device.
+    """Send bytes (serial) or frames (CAN).
+
+    Return what came back as one text of bytes, or as frames of the device.
 
     Parameters
     ----------
     client
         The open link.
     data
-        What to send, in hexadecimal or as `cansend` takes it.
+        What to send, in hexadecimal or in the format of `cansend`.
     listen_s
-        How long to listen at least, seconds.
+        Shortest time to listen, s.
     wanted
         Patterns of the answer.
     timeout_s
-        How long to listen at most while less than that has come, seconds; None: as long as the client waits for a reply.
+        Longest time to wait for such an answer, s; None: the client's time-out.
     """
     return client.run(_send_and_listen(client, data, listen_s, wanted, timeout_s))
 
@@ -97,30 +99,30 @@ async def _send_and_listen(
     timeout_s: float | None,
 ) -> tuple[str, ...]:
     link = client.core.link
-    if not isinstance(link, (SerialLink, CanLink)):
-        raise BenchError(f"{link.description}: cannot send as it stands")
+    if not isinstance(link, (SerialHostLink, CanHostLink)):
+        raise BenchError(f"{link.description}: cannot send raw data")
     size = len("".join(wanted))
     end = time.monotonic() + (client.core.timeout_s if timeout_s is None else timeout_s)
     seen: list[bytes | CanFrame] = []
     before, link.on_raw = link.on_raw, seen.append
     try:
-        if isinstance(link, SerialLink):
+        if isinstance(link, SerialHostLink):
             for text in data:
                 link.send(bytes.fromhex(text))
         else:
             for text in data:
                 link.send(parse_frame(text))
         await asyncio.sleep(listen_s)
-        while len("".join(_texts(link, seen))) < size and time.monotonic() < end:
-            await asyncio.sleep(_LOOK_S)
+        while len("".join(_format_received(link, seen))) < size and time.monotonic() < end:
+            await asyncio.sleep(_POLL_S)
     finally:
         link.on_raw = before
-    return _texts(link, seen)
+    return _format_received(link, seen)
 
 
-def _texts(link: SerialLink | CanLink, seen: list[bytes | CanFrame]) -> tuple[str, ...]:
-    """What came: one text of all bytes, or one of each frame of the device."""
-    if isinstance(link, SerialLink):
+def _format_received(link: SerialHostLink | CanHostLink, seen: list[bytes | CanFrame]) -> tuple[str, ...]:
+    """Return one text of all bytes, or one per frame of the device."""
+    if isinstance(link, SerialHostLink):
         return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
     device = link.device_address
     frames = [item for item in seen if isinstance(item, CanFrame) and item.extended]

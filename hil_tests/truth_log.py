@@ -1,4 +1,4 @@
-"""The file of true attitudes that an emulator writes (`starhil run --truth-log`), read while it grows."""
+"""Reader of the truth log that an emulator writes (`starhil run --truth-log`), while it grows."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from starhil.protocol.user_file import read_user_text
 TIME_COLUMN: Final = "time_of_exposure_s"
 QUATERNION_COLUMNS: Final = ("true_qx", "true_qy", "true_qz", "true_qw")
 MAX_BYTES: Final = 256_000_000
-"""Largest file of true attitudes that is read, bytes."""
+"""Size limit of a truth log, bytes."""
 SLACK_S: Final = 0.0005
-"""A time that lies this little outside the file still counts: telemetry rounds."""
+"""Tolerance outside the times of the file, s: telemetry is rounded."""
 
 
-class TruthFile:
+class TruthLogReader:
     """True attitudes over device time.
 
     Parameters
     ----------
     path : Path
-        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four of the quaternion.
+        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four of
+        the quaternion.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,7 +36,7 @@ class TruthFile:
         self._attitudes: list[Quaternion] = []
 
     def at(self, time_s: float) -> Quaternion:
-        """Return the attitude at a device time, between two rows by the shortest turn.
+        """Return the attitude at a device time, interpolated by the shortest rotation.
 
         Raises
         ------

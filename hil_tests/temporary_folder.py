@@ -1,4 +1,4 @@
-"""A folder for one run, which the next run removes if this one could not."""
+"""A temporary folder for one run; the next run removes it if this one was killed."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Final
 
 LOCK_NAME: Final = "owner.lock"
-"""Held locked for as long as the owner of the folder lives: the kernel releases it, however that ends."""
+"""File locked while the owner of the folder lives; the kernel releases the lock."""
 
 
 @contextmanager
-def scratch_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
-    """Make a temporary folder and remove it at the end, with those whose owner was killed.
+def temporary_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
+    """Create a temporary folder and remove it at the end, with those whose owner was killed.
 
     Parameters
     ----------
@@ -40,10 +40,10 @@ def scratch_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove a folder whose lock nobody holds."""
+    """Remove a folder that nobody has locked."""
     try:
         lock = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CLOEXEC)
-    except OSError:  # not such a folder, just being made, or another user's
+    except OSError:  # another kind of folder, one being created, or another user's
         return
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""What an OBC client returns: acknowledges and readings, with their latency."""
+"""Transactions of an OBC client: acknowledgements and readings, with their latency."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Ack:
 
     name: str
     latency_s: float
-    """From the request being handed to the port to the last byte of the reply."""
+    """From handing the request to the port until the last byte of the reply, s."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Reading:
     name: str
     values: Mapping[str, Value]
     latency_s: float
-    """As that of an acknowledge; 0 for unsolicited telemetry."""
+    """Latency of the reply, s; 0 for unsolicited telemetry."""
     received_unix_s: float
-    """OBC's clock when it came, seconds since 1970-01-01 UTC."""
+    """Time of reception on the OBC's clock, seconds since 1970-01-01 UTC."""
     received_s: float
-    """The same on `time.monotonic`, which nobody sets: for intervals."""
+    """Time of reception on `time.monotonic`, s; for intervals."""
 
     def __getitem__(self, field: str) -> Value:
         """Return the value of a field."""
@@ -37,10 +37,10 @@ class Reading:
 
 @dataclass(frozen=True)
 class Transaction:
-    """What became of one request: for latency figures and reports."""
+    """Outcome of one request."""
 
     name: str
     outcome: str
     """`ok`, the name of an error code, or `no_reply`."""
     latency_s: float
-    """Infinite where no reply came."""
+    """Seconds; infinite without a reply."""

@@ -1,0 +1,78 @@
+"""Conformance of the link-error flags in `communication_status`, on any link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
+from starhil.hil_tests.conformance.link_probe import LinkProbe
+
+ProbeType = TypeVar("ProbeType", bound=LinkProbe)
+
+FLAG_NAMES: Final = (
+    "telecommand_overrun",
+    "uart_protocol_error",
+    "uart_incomplete",
+    "i2c_telemetry_error",
+    "i2c_telecommand_error",
+    "can_telecommand_error",
+)
+
+
+@dataclass(frozen=True)
+class FlagRow:
+    """Malformed traffic and the flags that it sets.
+
+    Attributes
+    ----------
+    id, title
+        Name of the case, and what is wrong with the traffic.
+    sent
+        Raw traffic, as `LinkProbe.send_text` takes it.
+    flags
+        Flags that must be set, and no others.
+    pause_s
+        Silence expected before the flags are read, s; None to read them at once.
+    """
+
+    id: str
+    title: str
+    sent: tuple[str, ...]
+    flags: frozenset[str]
+    pause_s: float | None = 0.0
+
+
+def check_flags(probe: LinkProbe, expected: frozenset[str]) -> None:
+    """Read `communication_status`; fail the case unless exactly these flags are set."""
+    status = probe.telemetry("communication_status")
+    seen = {flag for flag in FLAG_NAMES if status[flag]}
+    check(seen == expected, f"flags {_names(expected)}", _names(seen))
+
+
+def add_flag_cases(area: CaseArea[ProbeType], rows: Iterable[FlagRow]) -> None:
+    """Add one case per row."""
+    for row in rows:
+        _add_flag_case(area, row)
+
+
+def _add_flag_case(area: CaseArea[ProbeType], row: FlagRow) -> None:
+    @area.case(row.id, f"{row.title} sets its flag and counts as nothing")
+    def run(probe: ProbeType) -> None:
+        probe.command("clear_counters")
+        for text in row.sent:
+            probe.send_text(text)
+        if row.pause_s is not None:
+            probe.expect_silence("no request was made", max(row.pause_s, probe.times.quiet_s))
+        status = probe.telemetry("communication_status")
+        seen = {flag for flag in FLAG_NAMES if status[flag]}
+        check(seen == row.flags, f"flags {_names(row.flags)}", _names(seen))
+        counts = (status["telecommand_count"], status["telemetry_count"])
+        check_equal(counts, (0, 1), "counts of telecommands and telemetry")
+        probe.command("clear_counters")
+        check_flags(probe, frozenset())
+
+
+def _names(flags: Iterable[str]) -> str:
+    return ", ".join(sorted(flags)) or "none"
