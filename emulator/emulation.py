@@ -25,8 +25,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.frames import PipelineSetup, Warm
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
@@ -87,7 +87,7 @@ class Emulation:
     icd
         Interface definition; by default the product's own.
     worker
-        A picture worker that was started before; by default one is started here.
+        A worker that was started before; by default one is started here.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Emulation:
         self.feed: LiveFeed | None = None
         self._feed_wanted = ""
         """Where the feed was to listen, in the profile's words."""
-        self.warm: Warm | None = None
+        self.warm: PipelineReady | None = None
         self.ready_words: dict[str, str] = {}
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
         self._closers: list[Callable[[], object]] = []
@@ -382,11 +382,11 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         epoch=profile.catalog.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
-        build_beside=profile.run.clock != "stepped",
+        build_in_background=profile.run.clock != "stepped",
     )
 
 
-def camera_constants(warm: Warm) -> dict[str, Value]:
+def camera_constants(warm: PipelineReady) -> dict[str, Value]:
     """Parameters that say of the camera what its optics are: a calibrated unit."""
     camera = warm.camera
     k1, k2, p1, p2, _ = camera["distortion"]

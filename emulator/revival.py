@@ -1,4 +1,4 @@
-"""What happens when the picture pipeline has ended by itself: it is started again, a bounded number of times.
+"""What happens when the pipeline has ended by itself: it is started again, a bounded number of times.
 
 The pauses grow. A pipeline that has run for `STEADY_S` counts as sound, and a later loss begins with the first pause again.
 When no attempt is left, the device stays in its error mode with the error `pipeline_ended` until it is reset, which tries again.
@@ -14,8 +14,8 @@ from typing import Final
 from starhil.emulator.device.device import PIPELINE_ENDED, Device
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
-from starhil.emulator.pipeline.frames import Warm
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.messages import PipelineReady
 
 log = logging.getLogger("starhil.run")
 
@@ -35,7 +35,7 @@ class PipelineRevival:
     """
 
     def __init__(
-        self, imager: ProcessImager | ThreadImager, device: Device, ready: Callable[[Warm], None]
+        self, imager: ProcessImager | ThreadImager, device: Device, ready: Callable[[PipelineReady], None]
     ) -> None:
         self._imager = imager
         self._device = device
@@ -68,7 +68,7 @@ class PipelineRevival:
             pause_s = PAUSES_S[self._attempts]
             self._attempts += 1
             log.warning(
-                "picture pipeline: starting it again in %g s (attempt %d of %d)",
+                "pipeline: starting it again in %g s (attempt %d of %d)",
                 pause_s,
                 self._attempts,
                 len(PAUSES_S),
@@ -77,7 +77,7 @@ class PipelineRevival:
             await self._restart()
         if self._lost:
             log.error(
-                "picture pipeline: ended %d times, not started again; error %s: "
+                "pipeline: ended %d times, not started again; error %s: "
                 "reset the device to try again, or restart the emulator",
                 len(PAUSES_S) + 1,
                 PIPELINE_ENDED,
@@ -91,7 +91,7 @@ class PipelineRevival:
         except Exception as error:  # noqa: BLE001 (whatever it is, the next attempt may succeed)
             self._lost = True
             what = str(error) if isinstance(error, EmulatorError) else one_line(error)
-            log.warning("picture pipeline: not started: %s", what)
+            log.warning("pipeline: not started: %s", what)
             return
         if self._lost:  # it has ended again already
             return

@@ -20,8 +20,8 @@ from starhil.emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMAND
 from starhil.emulator.device.telemetry import TELEMETRY
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, one_line
-from starhil.emulator.pipeline.frames import FrameRequest
 from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.pipeline.messages import FrameRequest
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
@@ -43,7 +43,7 @@ STALE_PERIODS: Final = 3
 PROCESSING_ALLOWANCE_S: Final = 2.0
 
 PIPELINE_ENDED: Final = "pipeline_ended"
-"""Error of a device whose picture pipeline has ended and is not started again, a name of the enumeration `device_error`."""
+"""Error of a device whose pipeline has ended and is not started again, a name of the enumeration `device_error`."""
 
 
 def outcome(work: Callable[[], None]) -> EmulatorError | None:

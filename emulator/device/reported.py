@@ -10,7 +10,7 @@ import numpy as np
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import as_quaternion
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.pipeline.frames import ZERO, Quaternion, Triple
+from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple
 from starid.attitude import Attitude
 
 if TYPE_CHECKING:

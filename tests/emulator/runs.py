@@ -1,10 +1,10 @@
-"""A whole run for tests: a pipeline that makes no pictures, and a peer on the control channel."""
+"""A whole run for tests: a pipeline that renders no images, and a peer on the control channel."""
 
 import asyncio
 import json
 
-from starhil.emulator.pipeline.frames import Warm
 from starhil.emulator.pipeline.imager import DirectImager
+from starhil.emulator.pipeline.messages import PipelineReady
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
 
@@ -14,8 +14,8 @@ class FakeImager(DirectImager):
 
     on_failure = None
 
-    async def start(self) -> Warm:
-        return Warm(CAMERA, 5, 0.0)
+    async def start(self) -> PipelineReady:
+        return PipelineReady(CAMERA, 5, 0.0)
 
     async def close(self) -> None:
         return
