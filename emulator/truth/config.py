@@ -1,4 +1,4 @@
-"""Truth sources as a profile or the control channel write them, and how they become sources."""
+"""Configuration of truth sources in a profile, a scenario or on the control channel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from starid.attitude import Attitude
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
-"""Body rate in the sensor frame, degrees a second."""
+"""Body rate in the sensor frame, degrees per second."""
 
 Turn: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
 """Right ascension or roll, degrees."""
@@ -35,7 +35,7 @@ SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 class Strict(BaseModel):
-    """A part of a profile: unknown keys, numbers in quotes and not-finite numbers are refused."""
+    """Base of configuration models: rejects unknown keys, numbers in quotes and non-finite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -83,19 +83,19 @@ class FixedConfig(Strict):
 
 
 class RateConfig(Strict):
-    """A turn at a constant body rate from an attitude."""
+    """A rotation at a constant body rate, starting from an attitude."""
 
     kind: Literal["rate"]
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     rate_deg_s: Rate
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
-        """Make the source; the turn begins now."""
+        """Make the source; the rotation begins now."""
         return RateTruth(self.attitude.build(), np.radians(self.rate_deg_s), start_s=now_s)
 
 
 class HoldConfig(Strict):
-    """Rest for a time."""
+    """Hold the attitude for a time."""
 
     do: Literal["hold"]
     seconds: SegmentSeconds
@@ -106,7 +106,7 @@ class HoldConfig(Strict):
 
 
 class TurnConfig(Strict):
-    """Turn at a constant body rate for a time."""
+    """Rotate at a constant body rate for a time."""
 
     do: Literal["rate"]
     seconds: SegmentSeconds
@@ -118,7 +118,7 @@ class TurnConfig(Strict):
 
 
 class SlewToConfig(Strict):
-    """Turn about one axis to an attitude, starting and ending at rest."""
+    """Slew about one axis to an attitude, from rest to rest."""
 
     do: Literal["slew"]
     to: AttitudeConfig
@@ -140,7 +140,7 @@ SegmentConfig: TypeAlias = Annotated[HoldConfig | TurnConfig | SlewToConfig, Fie
 
 
 class SlewConfig(Strict):
-    """A profile of rests, turns and slews."""
+    """A sequence of holds, constant rates and slews."""
 
     kind: Literal["slew"]
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
@@ -154,12 +154,12 @@ class SlewConfig(Strict):
 
 
 class FileConfig(Strict):
-    """A table of times and attitudes; a relative path counts from the profile's folder."""
+    """A table of times and attitudes; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
     path: str
     start: Literal["run", "now"] = "run"
-    """What the file's time zero is: the start of the run, or the moment the source is taken into use."""
+    """Time zero of the file: the start of the run, or the time at which the source is set."""
     repeat: bool = False
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
@@ -169,20 +169,20 @@ class FileConfig(Strict):
 
 
 class LiveConfig(Strict):
-    """A feed of JSON lines, the message of `starhil.emulator.truth.live`."""
+    """A feed of JSON lines in the format of `starhil.emulator.truth.live`."""
 
     kind: Literal["live"]
     protocol: Literal["udp", "tcp"] = "udp"
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """0 takes a free port; the ready line tells which."""
+    """0 takes a free port, reported on the ready line."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
     timeline: Literal["anchor", "run"] = "anchor"
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """Attitude until the first message comes."""
+    """Attitude before the first message."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
-        """Make the source; its socket is opened by whoever runs it."""
+        """Make the source; the emulation opens its socket."""
         return LiveTruth(self.attitude.build(), stale_s=self.stale_s, timeline=self.timeline)
 
 
