@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from starhil.emulator.errors import EmulatorError
+from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanFrame, encode_request_frames
 from starhil.protocol.icd import load_icd
 from starhil.protocol.messages import Request
@@ -133,7 +133,7 @@ class HubProbe:
         while end not in self._buffer:
             data = self._socket.recv(4096)
             if not data:
-                raise EmulatorError("CAN hub: closed the connection; is the emulator still running?")
+                raise BenchError("CAN hub: closed the connection; is the emulator still running?")
             self._buffer += data
         self._buffer = self._buffer.partition(end)[2]
 
@@ -176,7 +176,7 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
 
     Raises
     ------
-    EmulatorError
+    BenchError
         It did not become ready.
     """
     begin = time.perf_counter()
@@ -184,10 +184,10 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603
     try:
         if process.stdout is None or not select.select([process.stdout], [], [], READY_WITHIN_S)[0]:
-            raise EmulatorError(f"starhil {arguments[0]}: not ready within {READY_WITHIN_S:g} s")
+            raise BenchError(f"starhil {arguments[0]}: not ready within {READY_WITHIN_S:g} s")
         line = process.stdout.readline()
         if not line.startswith("ready "):
-            raise EmulatorError(
+            raise BenchError(
                 f"starhil {arguments[0]}: did not start: {line.strip() or 'its reason stands above'}"
             )
         ready = dict(word.split("=", 1) for word in line.split()[1:])

@@ -1,30 +1,30 @@
-"""`starhil cache`: what is kept of earlier computations, and removing it."""
+"""`starhil cache`: show and clear the cache of computed files."""
 
 from __future__ import annotations
 
 import json
 import time
-from typing import Annotated
 
 import typer
 
-group = typer.Typer(help="Star catalogue, indices and databases that were computed before and are kept.")
+from starhil.emulator.cli.options import AsJson
 
-AS_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+group = typer.Typer(help="Show or clear the cache of star catalogues, indices and databases.")
 
 
 @group.callback(invoke_without_command=True)
 def command(context: typer.Context) -> None:
-    """Show the cache, as `info` does, unless a command follows."""
+    """Show or clear the cache of star catalogues, indices and databases; without a command: info."""
     if context.invoked_subcommand is None:
         info()
 
 
 @group.command("info")
-def info(as_json: AS_JSON = False) -> None:
-    """Show folder, size, limit and files; beyond the limit the least recently used file goes first.
+def info(as_json: AsJson = False) -> None:
+    """Show the folder, size, limit and files of the cache.
 
-    STARHIL_CACHE_DIR names another folder, STARHIL_CACHE_LIMIT_MB another limit.
+    Above the limit the least recently used files are removed. The environment variables
+    STARHIL_CACHE_DIR and STARHIL_CACHE_LIMIT_MB set another folder and limit.
     """
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
 
@@ -44,7 +44,7 @@ def info(as_json: AS_JSON = False) -> None:
 
 @group.command("clear")
 def clear() -> None:
-    """Remove all cached files; they are computed again when they are needed."""
+    """Remove all cached files; they are computed again when needed."""
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, remove
 
     files = cached_files()
