@@ -1,4 +1,4 @@
-"""`starhil bench identify`: identification programs on the same scenes, against the bound."""
+"""Compares star identification solvers on the same scenes, and with the least-squares bound."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "0.5, 100 false, V ≤ 4.75": SceneSettings(4.75, 0.5, false_stars=100),
     "0.5, 200 false in half the field": SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5),
 }
-"""Row of the table → scene: "σ px, false, missing" of stars to V 5.5 where nothing else is said."""
+"""Row of the table → scene; named "σ px, false, missing", with stars to V 5.5 unless noted."""
 
 STANDARD: Final = tuple(ROWS)[:9]
 """Rows of the published comparison."""
@@ -44,7 +44,7 @@ WRONG_ARCSEC: Final = 360.0
 """A valid attitude whose boresight is off by more than this is wrong."""
 
 PEER_LIMIT_V: Final = 5.5
-"""Faintest star in the peers' databases: that of the scenes."""
+"""Limiting magnitude of the peers' databases, as in the scenes."""
 
 _BLEND_PX: Final = 2.0
 _DEEPEST_V: Final = 6.0
@@ -53,7 +53,7 @@ _FLOOR_STEPS: Final = 3
 
 @dataclass
 class Tally:
-    """Figures of one solver in one row, frame by frame."""
+    """Results of one solver in one row, frame by frame."""
 
     row: str
     solver: str
@@ -69,7 +69,7 @@ class Tally:
     cpu_seconds: list[float] = field(default_factory=list)
 
     def add(self, scene: Scene, floor: Attitude | None, reply: Reply) -> None:
-        """Count one frame; `floor` is None where there is no true attitude."""
+        """Add the result of one frame; `floor` is None if there is no true attitude."""
         self.frames += 1
         self.seconds.append(reply.seconds)
         self.cpu_seconds.append(reply.cpu_seconds)
@@ -90,7 +90,7 @@ class Tally:
             self.squared.append(float(e @ np.linalg.solve(reply.covariance, e)) / 3.0)
 
     def report(self) -> dict[str, Any]:
-        """Figures as plain values; None where a row has none."""
+        """Return the figures as plain values; None if there are no data."""
         milliseconds, cpu = 1e3 * np.array(self.seconds), 1e3 * np.array(self.cpu_seconds)
         boresight, roll = _median(self.boresight), _median(self.roll)
         return {
@@ -123,24 +123,24 @@ def run(
     budget_s: float = 120.0,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Let all solvers answer the same scenes.
+    """Run all solvers on the same scenes.
 
     Parameters
     ----------
     frames : int
-        Scenes a row.
+        Scenes per row.
     seed : int
-        Of the scenes; each row begins anew with it.
+        Seed of the scenes; each row restarts with it.
     peers, own : sequence of str
-        Solvers; a peer that is not installed is named as skipped.
+        Solvers; a peer that is not installed is reported as skipped.
     rows : sequence of str
         Keys of `ROWS`.
     camera : Camera
-        Pinhole without distortion.
+        Pinhole camera without distortion.
     budget_s : float
-        A solver that has spent this long on a row answers no more of it (its `frames` says how many).
+        Time per row after which a solver skips the rest of the row; its `frames` is the number completed.
     progress : callable, optional
-        Told of each row.
+        Receives the name of each row.
 
     Returns
     -------
@@ -187,13 +187,13 @@ def _solvers(
 def _run_row(
     row: str, frames: int, seed: int, maker: SceneMaker, solvers: dict[str, Solver], budget_s: float
 ) -> list[Tally]:
-    """All solvers on the scenes of one row."""
+    """Run all solvers on the scenes of one row."""
     settings = ROWS[row]
     tallies = {name: Tally(row, name) for name in solvers}
     spent = dict.fromkeys(solvers, 0.0)
     warm = maker.scene(settings, np.random.default_rng([seed, 1]))
     for solver in solvers.values():
-        # a row's figures are its own, whatever rows came before
+        # so that the figures do not depend on earlier rows
         solver.reset()
         solver.solve(warm)
     rng = np.random.default_rng(seed)
@@ -210,9 +210,9 @@ def _run_row(
 
 
 def best_attitude(camera: Camera, stars: StarCatalog, scene: Scene) -> Attitude:
-    """Attitude by least squares in pixels from the true matches: the bound for any solver.
+    """Least-squares attitude in pixels from the true matches: the bound for any solver.
 
-    Gauss–Newton from the truth; with fewer than two true stars the truth itself comes back.
+    Gauss–Newton from the truth; with fewer than two true stars the truth is returned.
     """
     true = scene.star >= 0
     attitude = scene.attitude
@@ -224,7 +224,7 @@ def best_attitude(camera: Camera, stars: StarCatalog, scene: Scene) -> Attitude:
         xy, _ = camera.project(directions)
         x, y, z = directions.T
         zero = np.zeros_like(x)
-        # a turn v moves a direction by direction × v
+        # a rotation by v moves a direction by direction × v
         moves = np.stack(
             [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=1
         )
