@@ -13,8 +13,8 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.state_store import MemoryStore
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
 from starhil.emulator.pipeline.imager import Answer, Asked, DirectImager
+from starhil.emulator.pipeline.messages import FrameResult, ImageRequest, ImageResult, MatchedStar
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.truth.source import FixedTruth
