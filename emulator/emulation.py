@@ -21,8 +21,8 @@ from starhil.emulator.guard import close_all
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.frames import PipelineSetup, Warm
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
@@ -73,7 +73,7 @@ class Emulation:
         self.feed: LiveFeed | None = None
         self._configured_feed = ""
         """Address of the live feed as configured: `ready_fields` has the actual one."""
-        self.warm: Warm | None = None
+        self.warm: PipelineReady | None = None
         self.ready_fields: dict[str, str] = {}
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
         self._closers: list[Callable[[], object]] = []
@@ -340,11 +340,11 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         epoch=profile.catalog.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
-        build_beside=profile.run.clock != "stepped",
+        build_in_background=profile.run.clock != "stepped",
     )
 
 
-def camera_constants(warm: Warm) -> dict[str, Value]:
+def camera_constants(warm: PipelineReady) -> dict[str, Value]:
     """Return the camera parameters of a calibrated unit: focal length, centre and distortion, in pixels."""
     camera = warm.camera
     k1, k2, p1, p2, _ = camera["distortion"]

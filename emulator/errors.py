@@ -1,5 +1,5 @@
-"""The error that every user-visible failure of this package derives from."""
+"""The base class of the emulator's errors for users."""
 
 
 class EmulatorError(Exception):
-    """A profile, file or port that the emulator rejects; the message is one line with cause, location and remedy."""
+    """Invalid input or an unusable file or port; the message is one line with what, where and the remedy."""

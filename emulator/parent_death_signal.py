@@ -1,4 +1,4 @@
-"""A child process that ends with its parent, however that ends."""
+"""Ends a child process when its parent ends, whatever the cause."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ PR_SET_PDEATHSIG: Final = 1
 
 
 def end_with_parent(parent: int | None = None, number: int = signal.SIGKILL) -> None:
-    """Let the kernel send this process a signal when the thread that started it has ended.
+    """Make the kernel send this process a signal when the thread that started it ends.
 
     Parameters
     ----------
     parent
-        Process that must be the parent still: one that has ended before this call sends nothing any more, so the signal is
-        raised here.
+        Process ID of the expected parent. If it has ended before this call, the signal is raised here.
     number
-        The signal.
+        Signal number.
 
     Raises
     ------
     OSError
-        The kernel refuses.
+        `prctl` failed.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, int(number)) != 0:

@@ -1,7 +1,7 @@
-"""Device profiles: TOML files that say which camera, sensor, truth, links and parameters a run has.
+"""Device profiles: TOML files that configure camera, sensor, truth, links and parameters of a run.
 
-A profile may name another one that it builds on (`extends = "cubestar"` or a path beside it); its own keys win. Every key is
-checked; a wrong one is named with its file, its place and what to do.
+A profile may extend another (`extends = "cubestar"`, or a path relative to the file) and override its
+keys. Every key is validated; an error names the file, the key and the remedy.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from starhil.emulator.truth.config import FixedConfig, Strict, TruthConfig
 from starhil.emulator.validation_messages import explain
 
 DEFAULT_PROFILE: Final = "cubestar"
-MAX_DEPTH: Final = 8
+MAX_EXTENDS_DEPTH: Final = 8
 
 LATEST_UNIX_S: Final = 4_102_444_800.0
-"""2100-01-01: the telemetry's 32-bit seconds have six more years until they wrap."""
+"""2100-01-01; the 32-bit seconds of telemetry wrap six years later."""
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
-"""What one stage of a frame may take."""
+"""Duration of one stage of a frame, seconds."""
 
 FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
 PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -33,7 +33,7 @@ DistortionTerm = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class RunConfig(Strict):
-    """How a run goes."""
+    """Seed, clock, algorithm and saved state of a run."""
 
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
     """Seed of all noise and faults; the same seed, profile and commands give the same bytes on the stepped clock."""
@@ -50,16 +50,16 @@ class RunConfig(Strict):
 
 
 class CatalogConfig(Strict):
-    """Which stars there are."""
+    """The star catalogue."""
 
     path: str = ""
     """Another Hipparcos file; empty: the installed catalogue."""
     epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] = 2026.0
-    """Julian year to which the stars are moved."""
+    """Julian year of the star positions."""
 
 
 class CameraConfig(Strict):
-    """The optics and pixel array that make the picture."""
+    """The optics and pixel array."""
 
     width: Annotated[int, Field(ge=64, le=4096)] = 937
     """Columns of the pixel array."""
@@ -74,18 +74,18 @@ class CameraConfig(Strict):
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
     """Projection of the lens."""
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
-    """Brown–Conrady k1, k2, p1, p2, k3."""
+    """Brown–Conrady coefficients k1, k2, p1, p2, k3."""
 
     def values(self) -> dict[str, Any]:
-        """Keys as the camera of `starid` reads them."""
-        given = self.model_dump(exclude_none=True)
-        if "focal_px" not in given:
-            given.setdefault("fov_deg", 42.0)
-        return given
+        """Return the keys that `starid.camera.Camera.from_dict` reads."""
+        values = self.model_dump(exclude_none=True)
+        if "focal_px" not in values:
+            values.setdefault("fov_deg", 42.0)
+        return values
 
 
 class DeviceConfig(Strict):
-    """What the unit says of itself, and how long it boots."""
+    """The unit's identification, boot time and rate estimation."""
 
     node_type: Annotated[int, Field(ge=0, le=255)] = 0x53
     """Reported in `identification` (128)."""
@@ -96,13 +96,13 @@ class DeviceConfig(Strict):
     firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
     """Reported in `identification` (128)."""
     boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
-    """Least time in boot mode."""
+    """Minimum time in boot mode."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
-    """Valid frames from which the body rate is estimated, where the identifier gives none."""
+    """Number of valid frames for the body rate, if the star identifier does not estimate it."""
 
 
 class TimingConfig(Strict):
-    """How long the unit takes for a frame; reported in telemetry and kept before a result is published."""
+    """Processing times of the emulated unit: reported in telemetry, and elapsed before a result is published."""
 
     readout_s: FrameSeconds = 0.020
     """Read-out of the detector."""
@@ -120,13 +120,13 @@ class SerialConfig(Strict):
     """The serial link."""
 
     port: str = "auto"
-    """`auto` (a pty), a device, `listen://HOST:PORT`, or `off`."""
+    """`auto` (a pty), a device path, `listen://HOST:PORT`, or `off`."""
     dialect: Literal["a", "b", "c"] = "b"
     """Form of the replies: `a` as to a CubeComputer, `b` stand-alone node, `c` generation 2."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
-    """Send bytes no faster than the baud rate lets them."""
+    """Limit transmission to the baud rate."""
     symlink: str = ""
     """Path of a link to the pty, made at start and removed at the end."""
 
@@ -135,20 +135,20 @@ class CanConfig(Strict):
     """The CAN link."""
 
     channel: str = "auto"
-    """`auto` (vcan0, else the TCP hub), a channel of python-can, or `off`."""
+    """`auto` (vcan0 if available, else the TCP hub), a python-can channel, or `off`."""
     address: Annotated[int, Field(ge=1, le=254)] = 4
     """CAN address of the device."""
     host_address: Annotated[int, Field(ge=1, le=254)] = 1
     """CAN address of the OBC."""
     frame_gap_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Least time between two frames of one message."""
+    """Minimum time between two CAN frames of one message."""
 
 
 class CanopenConfig(Strict):
-    """The CANopen slave; it joins the CAN link's channel."""
+    """The CANopen slave, on the channel of the CAN link."""
 
     node: Annotated[int, Field(ge=0, le=127)] = 0
-    """Node identifier; 0: off."""
+    """Node ID; 0: off."""
 
 
 class LinksConfig(Strict):
@@ -163,7 +163,7 @@ class LinksConfig(Strict):
 
 
 class Profile(Strict):
-    """A whole profile."""
+    """A device profile."""
 
     name: str = DEFAULT_PROFILE
     """Name in messages and on the control channel."""
@@ -174,11 +174,11 @@ class Profile(Strict):
     camera: CameraConfig = CameraConfig()
     """Optics and pixel array."""
     sensor: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `starhil.emulator.sensor.model.SensorModel`, but for those that are parameters of the device."""
+    """Fields of `starhil.emulator.sensor.model.SensorModel`, except those that are device parameters."""
     sky: dict[str, Any] = Field(default_factory=dict)
     """Fields of `starhil.emulator.sky.objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
     identifier: dict[str, Any] = Field(default_factory=dict)
-    """Options of the algorithm."""
+    """Options of the star identification algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
     """Where the sensor really looks."""
     device: DeviceConfig = DeviceConfig()
@@ -188,20 +188,20 @@ class Profile(Strict):
     links: LinksConfig = LinksConfig()
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)
-    """What `starhil calibrate` notes about a camera: for people, not used."""
+    """Notes that `starhil calibrate` writes for people; not used."""
     parameters: dict[str, Any] = Field(default_factory=dict)
-    """Parameters of the device by the names of the interface definition: its defaults in this profile."""
+    """Defaults of device parameters, named as in the interface definition."""
 
     _source: Path | None = PrivateAttr(default=None)
 
     @property
     def source(self) -> str:
-        """How messages name the profile: by its file, if it came from one."""
+        """The profile's file, or its name if it has none, for messages."""
         return self.name if self._source is None else str(self._source)
 
     @property
     def folder(self) -> Path:
-        """Folder of the profile's file, from which its relative paths count."""
+        """Folder of the profile's file, to which its relative paths refer."""
         return Path() if self._source is None else self._source.parent
 
 
@@ -209,7 +209,7 @@ ALTERNATIVES: Final = (
     (frozenset({"fov_deg"}), frozenset({"focal_px", "centre_px"})),
     (frozenset({"ra_deg", "dec_deg", "roll_deg"}), frozenset({"quaternion_xyzw"})),
 )
-"""Sets of keys that say the same in two ways; a table has one of them."""
+"""Pairs of key sets that exclude each other in a table."""
 
 LINK_PARAMETERS: Final[dict[str, str]] = {
     "serial_dialect": "links.serial.dialect",
@@ -218,21 +218,21 @@ LINK_PARAMETERS: Final[dict[str, str]] = {
     "host_address": "links.can.host_address",
     "canopen_node": "links.canopen.node",
 }
-"""Parameters of the device whose defaults stand under another key of a profile."""
+"""Device parameters whose defaults are set under another key of a profile."""
 
 
 def configs_folder() -> Path:
-    """Folder `configs` of the installed product, or of the checkout."""
+    """Return the folder `configs` of the installation or checkout."""
     return Path(__file__).resolve().parent.parent / "configs"
 
 
-def find_profile(name_or_path: str, beside: Path | None = None) -> Path:
-    """Path of a profile given by name or path.
+def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
+    """Return the path of a profile given by name or path.
 
     Raises
     ------
     EmulatorError
-        There is none; the text lists the names that there are.
+        No such profile; the message lists the known names.
     """
     folder = configs_folder() / "profiles"
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
@@ -241,42 +241,42 @@ def find_profile(name_or_path: str, beside: Path | None = None) -> Path:
             return path
         known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
         raise EmulatorError(
-            f"profile {name_or_path!r}: not known; give a path to a .toml file or one of: {known}"
+            f"profile {name_or_path!r}: unknown; give a path to a .toml file or one of: {known}"
         )
     path = Path(name_or_path).expanduser()
-    if beside is not None and not path.is_absolute():
-        path = beside / path
+    if relative_to is not None and not path.is_absolute():
+        path = relative_to / path
     if not path.is_file():
         raise EmulatorError(f"profile {path}: no such file; give a path to a .toml file or a profile's name")
     return path
 
 
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
-    """Read a profile with all that it extends, and set `section.key=value` overrides over it.
+    """Read a profile and the profiles it extends, and apply `section.key=value` overrides.
 
     Raises
     ------
     EmulatorError
-        One line: file, key and remedy.
+        The profile is invalid; one line with file, key and remedy.
     """
     path = find_profile(name_or_path)
-    values = _read(path, 0)
+    values = _read_extended(path, 0)
     for override in overrides:
-        _override(values, override)
+        _apply_override(values, override)
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
         why = explain(error, Profile, also=("extends",))
-        raise EmulatorError(f"{_culprit(path, overrides, why)}: {why}") from None
+        raise EmulatorError(f"{_source_of_key(path, overrides, why)}: {why}") from None
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
             raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
-    profile._source = path  # noqa: SLF001 (not a key of the file)
+    profile._source = path  # noqa: SLF001 (private: not a key of the file)
     return profile
 
 
-def _culprit(path: Path, overrides: Sequence[str], why: str) -> str:
-    """Name what brought the key that `why` begins with: an override, or else the file."""
+def _source_of_key(path: Path, overrides: Sequence[str], why: str) -> str:
+    """Name the source of the key that `why` begins with: an override, or else the file."""
     wrong = why.partition(": ")[0]
     for override in reversed(overrides):
         key = override.partition("=")[0].strip()
@@ -285,25 +285,25 @@ def _culprit(path: Path, overrides: Sequence[str], why: str) -> str:
     return f"profile {path}"
 
 
-def _read(path: Path, depth: int) -> dict[str, Any]:
+def _read_extended(path: Path, depth: int) -> dict[str, Any]:
     values = read_toml(path, "profile")
     base = values.pop("extends", None)
     if base is None:
         return values
     if not isinstance(base, str):
         raise EmulatorError(f"profile {path}: extends: a name or a path in quotes is needed")
-    if depth >= MAX_DEPTH:
+    if depth >= MAX_EXTENDS_DEPTH:
         raise EmulatorError(
-            f"profile {path}: extends: more than {MAX_DEPTH} deep; does a profile extend itself?"
+            f"profile {path}: extends: more than {MAX_EXTENDS_DEPTH} deep; does a profile extend itself?"
         )
-    return merge(_read(find_profile(base, path.parent), depth + 1), values)
+    return merge(_read_extended(find_profile(base, path.parent), depth + 1), values)
 
 
 def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Lay `over` over `base`, table by table.
+    """Merge `over` into `base`, table by table.
 
-    A table of another `kind` replaces the whole table below it, and of two ways to say the same (a field of view or focal
-    lengths, angles or a quaternion) the one in `over` takes the other one's place.
+    A table of another `kind` replaces the whole table, and keys in `over` remove their alternatives from
+    `base` (field of view or focal lengths, angles or quaternion).
     """
     if "kind" in over and over["kind"] != base.get("kind"):
         return dict(over)
@@ -324,23 +324,23 @@ def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _override(values: dict[str, Any], override: str) -> None:
-    """Set one `section.key=value`; the value is TOML, or else text."""
+def _apply_override(values: dict[str, Any], override: str) -> None:
+    """Set one `section.key=value`; a value that is not TOML is text."""
     key, equals, text = override.partition("=")
-    parts = [part.strip() for part in key.split(".")]
-    if not equals or not all(parts):
+    names = [name.strip() for name in key.split(".")]
+    if not equals or not all(names):
         raise EmulatorError(f"--set {override}: write section.key=value, e.g. parameters.update_rate=5")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except (tomllib.TOMLDecodeError, RecursionError):
         value = text
     table = values
-    for part in parts[:-1]:
-        below = table.setdefault(part, {})
+    for name in names[:-1]:
+        below = table.setdefault(name, {})
         if not isinstance(below, dict):
-            raise EmulatorError(f"--set {override}: {part} is a value, not a section")
+            raise EmulatorError(f"--set {override}: {name} is a value, not a section")
         table = below
-    if parts[-1] == "kind" and table.get("kind") != value:
+    if names[-1] == "kind" and table.get("kind") != value:
         for other in set(table) - ({"attitude"} if value != "file" else set()):
             del table[other]
-    table[parts[-1]] = value
+    table[names[-1]] = value

@@ -1,4 +1,4 @@
-"""TOML files that a user names."""
+"""Reading of TOML files, with errors for users."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     path
         The file.
     what
-        How messages name it: `profile`, `scenario`.
+        Kind of file, for messages: `profile`, `scenario`.
 
     Raises
     ------
     EmulatorError
-        One line: the file, what is wrong with it, and the remedy.
+        The file cannot be read or is not TOML; one line with the remedy.
     """
     try:
         return tomllib.loads(read_text(path))

@@ -1,4 +1,4 @@
-"""What a validator refuses, in one line: where, what, and what to do."""
+"""Validation errors in one line: the key, the problem and the remedy."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-NEAR: Final = 0.55
-"""Likeness from which on a known key is offered in place of an unknown one."""
+MIN_SIMILARITY: Final = 0.55
+"""Similarity from which a known key is suggested for an unknown one (`difflib`)."""
 
 
 def explain(
     error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
 ) -> str:
-    """Say in one line where the first fault of a validation is, what it is and what to do.
+    """Describe the first validation error in one line: the key, the problem and the remedy.
 
     Parameters
     ----------
     error, model
-        What was refused, and by which model.
+        The error, and the model that rejected the input.
     under
-        Keys of the model under which what was refused stands.
+        Path of keys within the model to the validated input.
     also
-        Keys that may stand at the top beside those of the model.
+        Further keys allowed at the top level.
     """
-    first = _telling_fault(error)
+    first = _most_helpful_error(error)
     loc = (*under, *first["loc"])
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])
-        unknown = str(loc[-1])  # what a user wrote, even where an alternative is called that
+        unknown = str(loc[-1])  # _along would drop it if it equals the tag of an alternative
         known = sorted(
             {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
         )
-        near = difflib.get_close_matches(unknown, known, n=1, cutoff=NEAR)
+        near = difflib.get_close_matches(unknown, known, n=1, cutoff=MIN_SIMILARITY)
         remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
         return f"{'.'.join([*path, unknown])}: unknown key; {remedy}"
     where = ".".join(path) or "as a whole"
@@ -53,26 +53,26 @@ def explain(
     return f"{where}: {plain(first['msg'])}{shown}"
 
 
-def _telling_fault(error: ValidationError) -> Any:
-    """Return the first fault; where a key is missing beside an unknown one, the unknown one, which is the likelier slip."""
-    faults = error.errors(include_url=False)
-    first = faults[0]
+def _most_helpful_error(error: ValidationError) -> Any:
+    """Return the first error, but prefer an unknown key to a missing one in the same table: it may be a typo."""
+    errors = error.errors(include_url=False)
+    first = errors[0]
     if first["type"] == "missing":
-        for fault in faults:
-            if fault["type"] == "extra_forbidden" and fault["loc"][:-1] == first["loc"][:-1]:
-                return fault
+        for other in errors:
+            if other["type"] == "extra_forbidden" and other["loc"][:-1] == first["loc"][:-1]:
+                return other
     return first
 
 
 def plain(message: str) -> str:
-    """A validator's message as our own ones read: `must be …`, without a capital."""
+    """Rephrase a validator's message in the project's style: `must be …`, without a capital."""
     text = message.partition(", unable to parse")[0].partition(" or instance of ")[0]
-    for theirs, ours in _WORDS:
-        text = text.replace(theirs, ours)
+    for original, replacement in _REPLACEMENTS:
+        text = text.replace(original, replacement)
     return f"{text[:1].lower()}{text[1:]}"
 
 
-_WORDS: Final = (
+_REPLACEMENTS: Final = (
     ("Value error, ", ""),
     ("Input should be", "must be"),
     ("valid dictionary", "table"),
@@ -82,23 +82,23 @@ _WORDS: Final = (
 
 
 def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str], list[type[BaseModel]]]:
-    """Follow a field path of pydantic; return its keys without the tags of alternatives, and the models at its end."""
+    """Follow a pydantic location; return its keys without the tags of unions, and the models at its end."""
     models: list[type[BaseModel]] = [model]
     keys: list[str] = []
-    for part in loc:
-        chosen = [each for each in models if part in _tags_of(each)] if len(models) > 1 else []
-        if chosen:
-            models = chosen
+    for step in loc:
+        tagged = [each for each in models if step in _tags_of(each)] if len(models) > 1 else []
+        if tagged:
+            models = tagged
             continue
-        keys.append(str(part))
-        if isinstance(part, str):
-            fields = [each.model_fields[part] for each in models if part in each.model_fields]
+        keys.append(str(step))
+        if isinstance(step, str):
+            fields = [each.model_fields[step] for each in models if step in each.model_fields]
             models = [below for field in fields for below in _models_in(field.annotation)]
     return keys, models
 
 
 def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
-    """Return the values by which a model is told from its alternatives: those of its fields that can have but one."""
+    """Return the discriminator values of a model: those of its fields with a single allowed value."""
     literals = (
         get_args(field.annotation)
         for field in model.model_fields.values()
@@ -108,7 +108,7 @@ def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models that an annotation names, however deep."""
+    """Return all models in an annotation, at any depth."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for inner in get_args(annotation) for model in _models_in(inner)]

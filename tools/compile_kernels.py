@@ -1,18 +1,18 @@
-"""Compile the kernels of the pipeline, on two processors, before several test processes want them at the same time."""
+"""Compile the pipeline's kernels once, before several test processes need them at the same time."""
 
 from __future__ import annotations
 
 import sys
 
 from starhil.emulator.emulation import pipeline_setup
-from starhil.emulator.pipeline.frames import Failure
-from starhil.emulator.pipeline.pipeline import make_picture
+from starhil.emulator.pipeline.messages import Failure
+from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import Profile
 
 
 def main() -> int:
-    """Make the pipeline of the default profile and solve a frame with it."""
-    made = make_picture(pipeline_setup(Profile()))
+    """Start the pipeline of the default profile, which compiles its kernels."""
+    made = make_pipeline(pipeline_setup(Profile()))
     if isinstance(made, Failure):
         print(f"compile_kernels: {made.text}", file=sys.stderr)
         return 1

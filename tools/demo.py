@@ -1,6 +1,6 @@
-"""Run the product end to end: the emulator and an OBC as two processes, over a pty and then over CAN.
+"""Run starhil end to end: the emulator and an OBC as two processes, over a pty and then over CAN.
 
-Prints a table of truth against measured attitude and writes pictures; the exit status is 0 only if every check holds.
+Prints a table of attitude errors and writes images; the exit status is 0 only if every check passes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from starid.attitude import Attitude
 CROSS_LIMIT_ARCSEC = 60.0
 ROLL_LIMIT_ARCSEC = 300.0
 READY_WITHIN_S = 300.0
-"""The first start on a machine compiles the kernels and builds the index of the catalogue."""
+"""Timeout for the emulator; its first start on a machine compiles kernels and builds the star index."""
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One session of the demo: the script, the link it uses, and what its samples showed."""
+    """One session of the demo: the script, and the link and channel it uses."""
 
     script: str
     link: str
@@ -45,7 +45,7 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Measured against true attitude over the samples of one leg; arrays have one entry a frame."""
+    """Errors of the measured attitude over one leg; arrays have one entry per frame."""
 
     time_s: np.ndarray[Any, np.dtype[np.float64]]
     cross_arcsec: np.ndarray[Any, np.dtype[np.float64]]
@@ -57,13 +57,13 @@ class Comparison:
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file by column name."""
+    """Read the rows of a CSV file by column name."""
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 
 def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Comparison:
-    """Join the samples that the OBC took with the emulator's own record of the truth, frame by frame."""
+    """Compare the samples of the OBC with the emulator's truth log, frame by frame."""
     by_frame = {int(row["frame"]): row for row in truth}
     rows: dict[int, tuple[float, ...]] = {}
     invalid = 0
@@ -94,7 +94,7 @@ def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Compa
 
 
 def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
-    """Run the OBC's session as a process of its own; True if every step went as expected."""
+    """Run the OBC's session as a separate process; return whether every step passed."""
     folder = out / leg.folder_name
     command = [
         str(Path(sys.executable).with_name("starhil")), "session", leg.script, f"--{leg.link}", leg.channel,
@@ -104,7 +104,7 @@ def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
 
 
 def plot(comparisons: dict[str, Comparison], path: Path) -> None:
-    """Draw the attitude error over the time of each leg."""
+    """Plot the attitude error over time for each leg."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -127,7 +127,7 @@ def plot(comparisons: dict[str, Comparison], path: Path) -> None:
 
 
 def within_limits(found: Comparison) -> bool:
-    """Whether every sample of a leg was valid and near enough to the truth."""
+    """Whether every sample of a leg was valid and within the error limits."""
     return (
         len(found.time_s) > 0
         and found.invalid == 0
@@ -137,7 +137,7 @@ def within_limits(found: Comparison) -> bool:
 
 
 def report(comparisons: dict[str, Comparison], console: Console) -> bool:
-    """Print truth against measured attitude; True if every figure is within its limit."""
+    """Print the attitude errors; return whether all are within their limits."""
     table = Table("figure", *comparisons, title="Measured attitude against the truth, as the OBC read it")
     figures: dict[str, Callable[[Comparison], str]] = {
         "frames": lambda found: str(len(found.time_s)),
@@ -161,10 +161,10 @@ def report(comparisons: dict[str, Comparison], console: Console) -> bool:
 
 
 def main() -> int:
-    """Run the demo; 0 if every check holds."""
+    """Run the demo; return 0 if every check passes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--out", type=Path, default=Path("out/demo"), help="folder for logs, tables and pictures"
+        "--out", type=Path, default=Path("out/demo"), help="folder for logs, tables and images"
     )
     out: Path = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
@@ -187,14 +187,14 @@ def main() -> int:
         console.print(f"demo: {error}", style="red")
         return 1
     if not all(passed):
-        console.print("demo: a session failed; its steps stand above", style="red")
+        console.print("demo: a session failed; see its steps above", style="red")
         return 1
     truth = read_csv(truth_log)
     comparisons = {leg.link: compare(read_csv(out / leg.folder_name / "attitude.csv"), truth) for leg in legs}
     good = report(comparisons, console)
     plot(comparisons, out / "error.png")
     console.print(
-        f"Pictures: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_1024.png. Logs beside them."
+        f"Images: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_1024.png; logs in the same folders."
     )
     return 0 if good else 1
 

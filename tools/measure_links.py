@@ -1,9 +1,9 @@
-"""Measure the links between processes: frames a second and round trips over the CAN hub, round trips over a pseudo-terminal.
+"""Measure throughput and round trips of the CAN hub, and round trips of a pseudo-terminal, between processes.
 
     python tools/measure_links.py [--frames N] [--trips N] [--json]
 
-Hub, far end and near end are processes of their own, as in use. The peer does nothing but answer, so that the figures are
-those of the links alone.
+Hub and both ends are separate processes, as in normal use. The peer only echoes, so that the figures are those of
+the links alone.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ async def _pty_echo(pipe: Connection) -> None:
 
 
 class Helper:
-    """A process that serves one end, and the pipe to it."""
+    """A process that serves one end of a link, and the pipe to it."""
 
     def __init__(self, main: Callable[[Connection], Any], first: object = None) -> None:
         self.pipe, far = mp.Pipe()
@@ -84,16 +84,16 @@ class Helper:
         self.process.start()
         if first is not None:
             self.pipe.send(first)
-        self.said = self.pipe.recv()
+        self.first_message = self.pipe.recv()
 
     def end(self) -> None:
-        """Let the process end."""
+        """End the process."""
         self.pipe.send("end")
         self.process.join(10)
 
 
 def percentile(values: list[float], share: float) -> float:
-    """Return the value below which the share of values lies."""
+    """Return the value below which a given fraction of the values lies."""
     return sorted(values)[min(int(share * len(values)), len(values) - 1)]
 
 
@@ -129,7 +129,7 @@ def hub_round_trip(spec: str, trips: int) -> dict[str, float]:
 
 
 def hub_flood(spec: str, frames: int) -> dict[str, float]:
-    """Frames a second from one sender to one reading transport, the sender as fast as it can."""
+    """Measure frames per second from one sender, as fast as it can, to one receiving transport."""
     reader = Helper(_can_count, (spec, frames))
     host, _, port = spec.removeprefix("socketcand:").partition("/")[0].rpartition(":")
     with socket.create_connection((host, int(port))) as raw:
@@ -161,8 +161,8 @@ def main() -> None:
     arguments = parser.parse_args()
     hub = Helper(_hub)
     results = {
-        "hub_round_trip": hub_round_trip(hub.said, arguments.trips),
-        "hub_flood": hub_flood(hub.said, arguments.frames),
+        "hub_round_trip": hub_round_trip(hub.first_message, arguments.trips),
+        "hub_flood": hub_flood(hub.first_message, arguments.frames),
         "pty_round_trip": pty_round_trip(arguments.trips),
     }
     hub.pipe.send("end")

@@ -1,4 +1,4 @@
-"""How well photographs of any camera are solved: seeded ones with one defect each, as a table of markdown.
+"""Measure how well photographs are solved: simulated ones with one defect each, as a Markdown table.
 
 Run from the repository's root: ``python tools/measure_photographs.py --frames 10 --seed 1``.
 """
@@ -42,10 +42,10 @@ CONDITIONS: Final[dict[str, dict[str, Any]]] = {
 
 
 def main() -> int:
-    """Print the table; exit status 1 if an answer was wrong."""
+    """Print the table; return 1 if any solution was wrong."""
     sys.path.insert(0, str(ROOT))
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=10, help="photographs of each kind")
+    parser.add_argument("--frames", type=int, default=10, help="photographs per condition")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     print(
@@ -86,9 +86,9 @@ def _solve(seed: int, defects: dict[str, Any]) -> tuple[float | None, float]:
     if negative:
         image = np.invert(image)
     off = np.random.default_rng(seed).uniform(-0.9, 0.9) * TOLERANCE
-    told = Camera.from_fov(camera.fov_deg * (1.0 + off), camera.width, camera.height)
+    rough = Camera.from_fov(camera.fov_deg * (1.0 + off), camera.width, camera.height)
     begin = time.process_time()
-    found = solve_image(image, told, sky, fov_tolerance=TOLERANCE)
+    found = solve_image(image, rough, sky, fov_tolerance=TOLERANCE)
     took = time.process_time() - begin
     if not found.solution.valid:
         return None, took

@@ -1,20 +1,20 @@
-"""Run the emulator for a while under load and faults, and fail if it grows: in memory, descriptors or latency.
+"""Run the emulator for a while under load and faults, and fail if memory, descriptors or latency grow.
 
-The emulator solves ten frames a second and serves a pty and a CAN hub; a session runs over both links again and again, and
-between sessions the control channel puts faults into sky, device and wires, requests meet them, and they are taken out. After
-each round, with the faults out, resident memory and open descriptors of all processes (emulator, picture worker, hub) and the
-99th percentile of the latency of each link are taken.
+The emulator solves ten frames per second and serves a pty and a CAN hub. In each round a session runs over both
+links; then the control channel injects faults into sky, device and wires, requests are sent, and the faults are
+cleared. After each round, resident memory and open descriptors of all processes (emulator, pipeline worker, hub)
+and the 99th percentile of the latency of each link are measured.
 
-The first quarter of the time is the warm-up: caches, the log of the last frames and the allocator's arenas fill up. The rest is
-compared with itself, its first third against its last, by medians, so that one bad round on a busy machine decides nothing:
+The first quarter of the time is the warm-up, in which caches, frame logs and the allocator's arenas fill. Of the
+rest, the first and the last third are compared by their medians, so that one bad round on a busy machine does not
+matter:
 
-memory        may grow by 8 MB: the allocator wanders by a few. In 15 minutes some 4500 frames and 60 sessions lie between the
-              middles of the two thirds, so that 2 kB kept a frame, or 140 kB kept a session, fail.
-descriptors   may not grow at all: every round ends in the same state, with nobody connected.
-latency       p99 may grow by half of what it was and 10 ms: lists that are searched, or queues that lengthen, grow without
-              end, while other programs on the machine come and go.
+memory        may grow by 8 MB, since the allocator fluctuates. In 15 minutes about 4500 frames and 60 sessions lie
+              between the two thirds, so a leak of 2 kB per frame or 140 kB per session fails.
+descriptors   may not grow: every round ends in the same state, with nobody connected.
+latency       p99 may grow by half plus 10 ms; growing lists or queues would exceed this in time.
 
-Prints a line a round and the figures at start and end; exit status 1 on growth or a session that fails.
+Prints one line per round and the figures at start and end; exit status 1 on growth or a failed session.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ WARM_UP_SHARE = 0.25
 MEMORY_GROWTH_MB = 8.0
 LATENCY_FACTOR, LATENCY_GROWTH_MS = 1.5, 10.0
 LEAST_ROUNDS = 8
-"""Rounds without which no third of the rest has two."""
+"""Minimum number of rounds, so that each third has two."""
 
 BAUD = 921_600
 REQUESTS = 200
-"""Requests a link and round whose latency is measured."""
+"""Number of requests per link and round whose latency is measured."""
 FAULTY_REQUESTS = 20
 FAULTY_TIMEOUT_S = 0.1
 SETTLE_S = 10.0
-"""Longest wait until what the last client left is closed."""
+"""Timeout for the emulator to close the connections of the last client."""
 ROWS = ("identification", "quaternion", "precise_attitude", "star_tracker")
 SESSION = Path(__file__).with_name("soak_session.toml")
 
@@ -68,7 +68,7 @@ FAULTS: tuple[dict[str, Any], ...] = (
 
 @dataclass(frozen=True)
 class Sample:
-    """What is measured after a round: elapsed time (s), memory (MB), descriptors, p99 latencies of the links (ms)."""
+    """Measurements after a round: elapsed time (s), memory (MB), descriptors, p99 latency of each link (ms)."""
 
     time_s: float
     memory_mb: float
@@ -79,7 +79,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure at the start and the end of a soak, and the most that it may be at the end."""
+    """A figure at the start and the end of a soak, and its limit at the end."""
 
     name: str
     start: float
@@ -88,12 +88,12 @@ class Figure:
 
     @property
     def grew(self) -> bool:
-        """Whether the figure is beyond its limit."""
+        """Whether the figure exceeds its limit."""
         return not self.end <= self.limit
 
 
 def compare(samples: Sequence[Sample]) -> list[Figure]:
-    """Figures of the first and the last third after the warm-up.
+    """Return the figures of the first and the last third after the warm-up.
 
     Raises
     ------

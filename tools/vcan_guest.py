@@ -3,16 +3,14 @@
 
     tools/vcan_guest.py [--share FOLDER]... [--time-out SECONDS] [--memory SIZE] -- COMMAND [ARGUMENT...]
 
-For machines whose own kernel has no CAN. The guest sees the host's whole file system under the same paths, so
-the virtual environment of this clone works there unchanged. What it writes stays in its memory and is thrown
-away with it, except below the folders named by --share. The command gets the caller's environment, folder and
-arguments, and no standard input; its two output streams come out as they are written, and its exit status is
-handed on.
+For machines whose kernel has no CAN. The guest sees the host's file system under the same paths, so the virtual
+environment of this clone works unchanged. Files written by the guest are discarded, except below the folders named
+by --share. The command gets the caller's environment, working folder and arguments, but no standard input. Its
+output is passed on as it is written, and its exit status is returned.
 
-Exit status of the script's own: 2 for a wrong call, 69 when a needed program is missing, 124 after a
-time-out, 125 when the guest did not come up or died (its console is printed then). Root is not needed. Needs
-the Debian packages user-mode-linux, can-utils, kmod and iproute2; see tools/install_test_packages. Only the
-standard library is used, and no file is left behind.
+Other exit statuses: 2 for a wrong call, 69 if a program is missing, 124 after a timeout, 125 if the guest did not
+start or died (its console is printed then). Root is not needed. Requires the Debian packages user-mode-linux,
+can-utils, kmod and iproute2; see tools/install_test_packages. Uses only the standard library and leaves no files.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ NEEDED: Final = {
     "insmod": "kmod",
     "candump": "can-utils",
 }
-"""Program → the Debian package that brings it."""
+"""Program → Debian package that provides it."""
 
 MODULES: Final = (
     "net/can/can",
@@ -135,14 +133,14 @@ def source_times(folder: Path) -> dict[str, int]:
     """Return the times of change (ns) of the Python files below a folder, hidden folders left out.
 
     The host file system shows a guest whole seconds only. Caches of compiled code compare the full time, so that the
-    guest has to set it anew, or it would compile everything once more.
+    guest must set it again; otherwise everything would be compiled again.
     """
     times = {}
-    for place, names, files in os.walk(folder):
+    for directory, names, files in os.walk(folder):
         names[:] = [name for name in names if not name.startswith(".")]
         for name in files:
             if name.endswith(".py"):
-                path = Path(place, name)
+                path = Path(directory, name)
                 times[str(path)] = path.stat().st_mtime_ns
     return times
 

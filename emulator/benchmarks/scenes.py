@@ -1,9 +1,9 @@
-"""Benchmark scenes: what a sensor's detector would hand over, without the detour by pixels.
+"""Benchmark scenes: simulated detections, without rendering images.
 
-A scene is a random attitude, the catalogue stars in the field with noisy positions and magnitudes, false
-stars and missing ones. The recipe is that of the published comparison of identification programs: magnitude
-noise 0.1, false stars at uniform positions with magnitudes drawn from the 20 brightest in the field, missing
-ones drawn from the same, doubles within 2 px seen as one.
+A scene is a random attitude, the catalogue stars in the field with noisy positions and magnitudes, false stars and
+missing ones. As in the published comparison of solvers, magnitude noise is 0.1, false stars have uniform positions
+and magnitudes drawn from the 20 brightest stars in the field, missing stars are drawn from the same, and doubles
+within 2 px are merged.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from starid.catalog import StarCatalog
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """Recipe of a scene.
+    """Parameters of a scene.
 
     Attributes
     ----------
     limiting_magnitude : float
-        Faintest V that the sensor sees.
+        V of the faintest visible stars.
     sigma_px : float
-        Noise of a position per axis, pixels.
+        Position noise per axis, pixels.
     false_stars, missing_stars : int
-        How many are added, and taken away.
+        Number of stars added and removed.
     magnitude_noise : float
         One sigma, magnitudes.
     brightest : int
-        Rank down to which magnitudes of false stars and victims are drawn.
+        Number of brightest stars from which false magnitudes and missing stars are drawn.
     random_points : tuple (least, most) or None
-        Instead of stars, that many points at uniform positions with magnitudes of the field's stars.
+        Instead of stars, this many points at uniform positions with magnitudes of the field's stars.
     covered : float
-        Share of the field behind a straight edge of random direction, in which no star is seen.
+        Fraction of the field without stars, behind a straight edge of random direction.
     cluttered : float
         Share of the field behind such an edge to which the false stars keep.
     kept : int or None
@@ -70,7 +70,7 @@ class Scene:
     flux : ndarray (n,)
         Brightness, 1 at magnitude 0.
     star : ndarray (n,) int64
-        Row of the star in the catalogue that the scene was made from, −1 for false ones.
+        Catalogue row of the star, −1 for false stars.
     """
 
     attitude: Attitude
@@ -95,7 +95,7 @@ class SceneMaker:
         self.stars = stars
 
     def scene(self, settings: SceneSettings, rng: np.random.Generator) -> Scene:
-        """One scene; the generator is the only source of chance."""
+        """Make one scene; the generator is the only source of randomness."""
         attitude = random_attitude(rng)
         visible = np.flatnonzero(self.stars.v <= settings.limiting_magnitude)
         near = visible[
@@ -130,13 +130,13 @@ class SceneMaker:
         """Uniform positions in a share of the field behind a straight edge of random direction."""
         if share >= 1.0:
             return self._uniform(count, rng)
-        places = self._uniform(int(2.0 * count / share) + 64, rng)
-        return places[~self._uncovered(places, share, rng)][:count]
+        xy = self._uniform(int(2.0 * count / share) + 64, rng)
+        return xy[~self._uncovered(xy, share, rng)][:count]
 
     def _uncovered(
         self, xy: NDArray[np.float64], share: float, rng: np.random.Generator
     ) -> NDArray[np.bool_]:
-        """Mask of the positions on the open side of an edge that covers a share of the field."""
+        """Return a mask of the positions not covered by an edge over a fraction of the field."""
         angle = rng.random() * 2.0 * math.pi
         normal = np.array([math.cos(angle), math.sin(angle)])
         border = np.quantile(self._uniform(4096, rng) @ normal, share)

@@ -1,4 +1,4 @@
-"""Frames for people: stretched, in colour, with circles and names at stars."""
+"""Images for people: stretched, in colour, with stars circled and named."""
 
 from __future__ import annotations
 
@@ -122,9 +122,9 @@ STAR_NAMES: Final[dict[int, str]] = {
 
 
 def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
-    """Bring an image (h, w) to 8 bits so that faint stars are seen: uneven sky taken off, dark, gamma 2.2.
+    """Stretch an image (h, w) to 8 bits so that faint stars show: background subtracted, gamma 2.2.
 
-    Where the image is brighter than its sky on the whole (a limb, glare) that stays visible as grey.
+    Areas that are brighter than the typical background (a limb, glare) stay visible as grey.
     """
     background = estimate_background(image)
     height, width = image.shape
@@ -138,7 +138,7 @@ def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArra
 
 
 def star_label(hip: int, magnitude: float, numbers_to: float) -> str:
-    """Label of a star: its name, else its Hipparcos number down to a magnitude, else nothing."""
+    """Return a star's name, else its Hipparcos number if bright enough, else an empty text."""
     if hip in STAR_NAMES:
         return STAR_NAMES[hip]
     return f"HIP {hip}" if magnitude <= numbers_to else ""
@@ -152,20 +152,20 @@ def annotate(
     radius_px: float = 8.0,
     missed_xy_px: npt.NDArray[np.float64] | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """Draw circles and names on a frame.
+    """Draw circles and names on an image.
 
     Parameters
     ----------
     image : ndarray (h, w)
         Counts; stretched for display.
     xy_px : ndarray (n, 2)
-        Where the circles go, pixels.
+        Centres of the circles, pixels.
     labels : sequence of n str
-        What is written beside them; empty for nothing.
+        Labels of the circles; empty for none.
     radius_px : float
         Radius of the circles.
     missed_xy_px : ndarray (m, 2), optional
-        Places to mark in another colour, such as detections without an identity.
+        Positions to mark in another colour, such as unidentified detections.
 
     Returns
     -------
@@ -183,8 +183,8 @@ def annotate(
         if not label:
             continue
         (text_width, text_height), _ = cv2.getTextSize(label, _FONT, size, 1)
-        places = _places(x, y, radius_px, text_width, text_height)
-        for forced, (left, base) in [*((False, place) for place in places), (True, places[0])]:
+        positions = _label_positions(x, y, radius_px, text_width, text_height)
+        for forced, (left, base) in [*((False, position) for position in positions), (True, positions[0])]:
             box = (left, base - text_height, left + text_width, base + 2)
             inside = box[0] >= 0 and box[1] >= 0 and box[2] < width and box[3] < height
             if inside and (forced or not any(_overlap(box, other) for other in taken)):
@@ -200,14 +200,14 @@ def annotate(
 def _circle(
     canvas: npt.NDArray[np.uint8], x: float, y: float, radius: float, colour: tuple[int, int, int]
 ) -> None:
-    """Draw a smooth circle at a sub-pixel place."""
+    """Draw a smooth circle at a sub-pixel position."""
     scale = 1 << _SUB_PIXEL_BITS
     centre = (round(x * scale), round(y * scale))
     cv2.circle(canvas, centre, round(radius * scale), colour, 1, cv2.LINE_AA, _SUB_PIXEL_BITS)
 
 
-def _places(x: float, y: float, radius: float, width: int, height: int) -> list[tuple[int, int]]:
-    """Left ends and baselines to try for a label: right, left, below, above."""
+def _label_positions(x: float, y: float, radius: float, width: int, height: int) -> list[tuple[int, int]]:
+    """Return candidate positions (left end, baseline) of a label around a circle, best first."""
     gap = radius + 3.0
     middle = round(y + height / 2.0)
     return [

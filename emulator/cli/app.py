@@ -1,4 +1,4 @@
-"""The `starhil` command: assembles the sub-commands and turns errors into one line and an exit status."""
+"""The `starhil` command: its sub-commands, and errors as one line with an exit status."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 
 EXIT_BAD_INPUT: Final = 2
-"""Exit status for input that is refused; 1 says that all worked and that the result is not good."""
+"""Exit status for invalid input; 1 means that the command worked but its result is negative."""
 
 EXIT_INTERRUPTED: Final = 130
-"""Exit status after Ctrl-C, as of shells."""
+"""Exit status after Ctrl-C, as in shells."""
 
 USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
-"""What a refused option or argument raises; which library it is of depends on the version of typer."""
+"""Base class of errors about options; which library defines it depends on typer's version."""
 
 COMMANDS: Final[dict[str, str]] = {
     "icd": "icd",
@@ -44,9 +44,9 @@ COMMANDS: Final[dict[str, str]] = {
     "reproduce": "reproduce",
     "cache": "cache",
 }
-"""Sub-command → module under `starhil.emulator.cli`: its `command` function, or its `group` of sub-commands.
+"""Sub-command → module in `starhil.emulator.cli` with a function `command` or a `group` of sub-commands.
 
-These modules import at the top only what is quick; numerics come in inside the function.
+For a fast start, these modules import slow packages inside their functions.
 """
 
 
@@ -57,7 +57,7 @@ def _print_version(value: bool) -> None:
 
 
 class FiniteCommand(TyperCommand):
-    """A command none of whose options is infinite or no number at all: nan lies within every bound."""
+    """A command that rejects infinite and NaN options; typer's bounds let NaN pass."""
 
     def invoke(self, ctx: Any) -> Any:
         """Call the command with its options.
@@ -102,49 +102,47 @@ def _options(
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Options of the command itself."""
+    """Options before the sub-command."""
 
 
 def describe_os_error(error: OSError) -> str:
-    """One line, `path: reason`, for what the operating system refused and no command has put into its own words."""
+    """Return one line, `path: reason`, for an error that no command has handled."""
     reason = error.strerror or str(error) or type(error).__name__
     paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
     return " ".join(": ".join([" -> ".join(paths), reason] if paths else [reason]).split())
 
 
-def describe_refusal(error: Any) -> str:
-    """One line, `command: what is wrong; see its --help`, for an option or argument that was refused."""
+def describe_usage_error(error: Any) -> str:
+    """Return one line, `command: problem (see … --help)`, for an invalid option or argument."""
     path = "" if error.ctx is None else str(error.ctx.command_path)
     command = path.removeprefix("starhil").strip()
     what, value, why = str(error.format_message()).partition("': ")
-    said = " ".join(f"{plain(what)}{value}{plain(why)}".split()).rstrip(".")
-    help_of = f"starhil {command}".strip()
-    return f"{f'{command}: ' if command else ''}{said} (see {help_of} --help)"
+    message = " ".join(f"{plain(what)}{value}{plain(why)}".split()).rstrip(".")
+    full_command = f"starhil {command}".strip()
+    return f"{f'{command}: ' if command else ''}{message} (see {full_command} --help)"
 
 
 def main() -> None:
-    """Run the command line; refused input ends in one line on stderr and exit status 2."""
+    """Run the command line; invalid input ends with one line on stderr and exit status 2."""
     show_every_character()
     try:
         status = build_app()(prog_name="starhil", standalone_mode=False)
     except (StaridError, ProtocolError, EmulatorError, BenchError) as error:
-        refuse(str(error))
+        exit_for_bad_input(str(error))
     except OSError as error:
-        refuse(describe_os_error(error))
+        exit_for_bad_input(describe_os_error(error))
     except MemoryError as error:
-        refuse(f"not enough memory: {error}" if str(error) else "not enough memory")
+        exit_for_bad_input(f"not enough memory: {error}" if str(error) else "not enough memory")
     except (KeyboardInterrupt, typer.Abort):
         raise SystemExit(EXIT_INTERRUPTED) from None
     except USAGE_ERROR as error:
-        if (
-            type(error).__name__ == "NoArgsIsHelpError"
-        ):  # its message is the help, which is on the screen already
+        if type(error).__name__ == "NoArgsIsHelpError":  # the help has been printed already
             raise SystemExit(EXIT_BAD_INPUT) from None
-        refuse(describe_refusal(error))
+        exit_for_bad_input(describe_usage_error(error))
     raise SystemExit(status if isinstance(status, int) else 0)
 
 
-def refuse(why: str) -> NoReturn:
-    """End for bad input: one line on stderr."""
+def exit_for_bad_input(why: str) -> NoReturn:
+    """Print one line on stderr and exit."""
     print(f"starhil: {' '.join(why.split())}", file=sys.stderr)
     raise SystemExit(EXIT_BAD_INPUT) from None

@@ -1,4 +1,4 @@
-"""`starhil bench bus`: links under full load and the regularity of periodic messages."""
+"""`starhil bench bus`: links under full load, and jitter of periodic messages."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ HEARTBEAT_MS = 50
 EVENT_TIMER_MS = 50
 SYNC_S = 0.05
 WARM_UP_S = 60.0
-"""Longest time until the emulator tracks."""
+"""Timeout for the emulator to reach tracking."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What is measured: the links of one device, each None where it has none."""
+    """The links of the device under test; None for a link that it lacks."""
 
     can: str | None
     serial: str | None
@@ -49,10 +49,10 @@ class BusFigures:
     serial: SerialLoad | None = None
     jitter: list[Jitter] = field(default_factory=list)
     frames_per_s: dict[str, float] = field(default_factory=dict)
-    """Frames that the device solved a second while each link was loaded."""
+    """Frames per second that the device solved while each link was loaded."""
 
     def good(self, p99_limit_ms: float) -> bool:
-        """Whether nothing was lost or wrong, and 99 % of the replies on CAN came within the limit."""
+        """Whether nothing was lost or wrong and 99 % of the CAN replies arrived within the limit."""
         can_good = self.can is None or (self.can.good and self.can.latency.p99_ms <= p99_limit_ms)
         return can_good and (self.serial is None or self.serial.good)
 
@@ -62,10 +62,10 @@ class BusFigures:
 
 
 @contextmanager
-def own_device(baud: int, realtime: bool, report: Callable[[str], None]) -> Iterator[Target]:
-    """Start a hub and an emulator that solves frames at 10 Hz, each a process of its own.
+def started_device(baud: int, realtime: bool, report: Callable[[str], None]) -> Iterator[Target]:
+    """Start a hub and an emulator that solves frames at 10 Hz, each in its own process.
 
-    With `realtime` both, but not the emulator's worker, and this process too, go before all ordinary ones.
+    With `realtime`, both and this process get real-time priority; the pipeline worker does not.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
@@ -98,31 +98,35 @@ def measure(
     figures = BusFigures()
     if target.can is not None:
         report(f"CAN: {rate:g} frames/s for {seconds:g} s")
-        with solved(target, "can", figures):
+        with count_solved_frames(target, "can", figures):
             load = load_can(target.can, seconds, rate, device=target.device, realtime=realtime)
             figures.can = asyncio.run(load)
     if target.serial is not None:
         report(f"serial: {target.baud} Bd both ways for {seconds:g} s")
-        with solved(target, "serial", figures):
+        with count_solved_frames(target, "serial", figures):
             figures.serial = asyncio.run(load_serial(target.serial, seconds, target.baud, target.dialect))
-    short = max(min(seconds / 3.0, 20.0), 2.0)
     if target.can is not None:
-        report(f"jitter: {short:g} s each")
-        kinds = [unsolicited_jitter(target.can, short, UNSOLICITED_HZ, device=target.device)]
-        if target.canopen is not None:
-            node = target.canopen
-            kinds += [
-                heartbeat_jitter(target.can, short, HEARTBEAT_MS, node=node),
-                event_timer_jitter(target.can, short, EVENT_TIMER_MS, node=node),
-                sync_to_pdo(target.can, short, SYNC_S, node=node),
-            ]
-        figures.jitter += [asyncio.run(kind) for kind in kinds]
+        jitter_s = max(min(seconds / 3.0, 20.0), 2.0)
+        report(f"jitter: {jitter_s:g} s each")
+        figures.jitter += measure_jitter(target.can, jitter_s, device=target.device, node=target.canopen)
     return figures
 
 
+def measure_jitter(can: str, seconds: float, *, device: int, node: int | None) -> list[Jitter]:
+    """Measure the jitter of periodic telemetry and, with a CANopen node, of its periodic messages."""
+    measurements = [unsolicited_jitter(can, seconds, UNSOLICITED_HZ, device=device)]
+    if node is not None:
+        measurements += [
+            heartbeat_jitter(can, seconds, HEARTBEAT_MS, node=node),
+            event_timer_jitter(can, seconds, EVENT_TIMER_MS, node=node),
+            sync_to_pdo(can, seconds, SYNC_S, node=node),
+        ]
+    return [asyncio.run(measurement) for measurement in measurements]
+
+
 @contextmanager
-def solved(target: Target, link: str, figures: BusFigures) -> Iterator[None]:
-    """Note how many frames a second the device solves meanwhile, as it says itself on CAN."""
+def count_solved_frames(target: Target, link: str, figures: BusFigures) -> Iterator[None]:
+    """Record the frames per second that the device reports as solved during the block, read over CAN."""
     if target.can is None:
         yield
         return
@@ -136,22 +140,18 @@ def solved(target: Target, link: str, figures: BusFigures) -> Iterator[None]:
 
 
 def print_figures(figures: BusFigures, good: bool) -> None:
-    """Print the figures for people."""
+    """Print the figures as text."""
     if figures.can is not None:
         load = figures.can
         print(
-            f"CAN     {load.offered_per_s:g} frames/s of other nodes for {load.seconds:g} s: {load.sent} sent, {load.lost} lost, "
-            f"{load.disordered} out of order"
+            f"CAN     {load.offered_per_s:g} frames/s from other nodes for {load.seconds:g} s: {load.sent} sent, "
+            f"{load.lost} lost, {load.disordered} out of order"
         )
         print(
-            f"        {load.requests} requests: {load.unanswered} unanswered, {load.wrong} wrong; latency p50 "
-            f"{load.latency.p50_ms:.2f} ms, p99 {load.latency.p99_ms:.2f} ms, max {load.latency.max_ms:.2f} ms"
+            f"        {load.requests} requests: {load.unanswered} unanswered, {load.wrong} wrong; "
+            f"latency {_percentiles(load.latency)}"
         )
-        machine = load.machine
-        print(
-            f"        a process that only answers: p50 {machine.p50_ms:.2f} ms, p99 {machine.p99_ms:.2f} ms, "
-            f"max {machine.max_ms:.2f} ms"
-        )
+        print(f"        for comparison, an echo process: {_percentiles(load.machine)}")
     if figures.serial is not None:
         line = figures.serial
         print(
@@ -159,11 +159,14 @@ def print_figures(figures: BusFigures, good: bool) -> None:
             f"{line.exchanges} exchanges, {line.wrong} wrong"
         )
     for link, frames in figures.frames_per_s.items():
-        print(f"frames  {frames:g} solved a second meanwhile ({link})")
+        print(f"frames  {frames:g} per second solved under load ({link})")
     for jitter in figures.jitter:
-        spread = jitter.deviation
         print(
-            f"jitter  {jitter.what}: mean {jitter.period_ms:.2f} ms over {jitter.messages}; p50 {spread.p50_ms:.2f} ms, "
-            f"p99 {spread.p99_ms:.2f} ms, max {spread.max_ms:.2f} ms"
+            f"jitter  {jitter.what}: mean {jitter.period_ms:.2f} ms over {jitter.messages}; "
+            f"{_percentiles(jitter.deviation)}"
         )
     print("good" if good else "NOT good: something was lost, wrong or late")
+
+
+def _percentiles(figures: Any) -> str:
+    return f"p50 {figures.p50_ms:.2f} ms, p99 {figures.p99_ms:.2f} ms, max {figures.max_ms:.2f} ms"

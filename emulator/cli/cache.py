@@ -1,30 +1,32 @@
-"""`starhil cache`: show and clear the results of earlier computations."""
+"""`starhil cache`: show and clear the cache of computed files."""
 
 from __future__ import annotations
 
 import json
 import time
-from typing import Annotated
 
 import typer
 
-group = typer.Typer(help="Cached star catalogues, indices, databases and machine code of kernels.")
+from starhil.emulator.cli.options import AsJson
 
-AS_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+group = typer.Typer(
+    help="Show or clear the cache of star catalogues, indices, databases and machine code of kernels."
+)
 
 
 @group.callback(invoke_without_command=True)
 def command(context: typer.Context) -> None:
-    """Show the cache, as `info` does, unless a command follows."""
+    """Show or clear the cache of star catalogues, indices and databases; without a command: info."""
     if context.invoked_subcommand is None:
         info()
 
 
 @group.command("info")
-def info(as_json: AS_JSON = False) -> None:
-    """Show folder, size, limit and files; beyond the limit the least recently used is removed first.
+def info(as_json: AsJson = False) -> None:
+    """Show the folder, size, limit and files of the cache.
 
-    STARHIL_CACHE_DIR sets the folder, STARHIL_CACHE_LIMIT_MB the limit.
+    Above the limit the least recently used files are removed. The environment variables
+    STARHIL_CACHE_DIR and STARHIL_CACHE_LIMIT_MB set another folder and limit.
     """
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
 

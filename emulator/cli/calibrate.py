@@ -1,4 +1,4 @@
-"""`starhil calibrate`: a camera profile from a few images of the sky."""
+"""`starhil calibrate`: estimate a camera's parameters from images of the sky."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 from starhil.emulator.errors import EmulatorError
 
@@ -19,32 +20,33 @@ _UNITS = {"fx": "px", "fy": "px", "cx": "px", "cy": "px"}
 
 def command(
     images: Annotated[
-        list[Path], typer.Argument(help="PNG, TIFF or JPEG frames from one camera, all of one size.")
+        list[Path], typer.Argument(help="PNG, TIFF or JPEG images from one camera, all of the same size.")
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help=output_help("Camera profile (TOML) to write."))
     ],
     fov: Annotated[float, typer.Option(help="Rough horizontal field of view, edge to edge, degrees.")],
     fov_tolerance: Annotated[
-        float, typer.Option(min=0.0, max=0.3, help="Relative uncertainty of that field.")
+        float, typer.Option(min=0.0, max=0.3, help="Relative uncertainty of --fov.")
     ] = 0.1,
     model: Annotated[str, typer.Option(help="pinhole or equidistant.")] = "pinhole",
     estimate: Annotated[
         list[str] | None,
         typer.Option(
-            help="Parameter to estimate: focal, aspect, centre, k1, k2, p1, p2, k3; repeatable. "
-            "Default: what the frames justify."
+            help="Parameter to estimate: focal, aspect, centre, k1, k2, p1, p2, k3; may be repeated. "
+            "Default: those that the images constrain."
         ),
     ] = None,
     epoch: Annotated[float | None, typer.Option(help="Julian year of the images; default 2026.")] = None,
     allow_colour: Annotated[
-        bool, typer.Option("--allow-colour/--refuse-colour", help="Turn colour images into grey.")
+        bool,
+        typer.Option("--allow-colour/--refuse-colour", help="Convert colour images to grey, or reject them."),
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Estimate focal length, centre and distortion from stars in several images, and save the camera.
+    """Estimate focal length, centre and distortion from the stars in several images, and write a camera profile.
 
-    Exit status 1 if an image could not be identified; the profile then rests on the others.
+    Exit status 1 if an image could not be identified; the profile is then based on the others.
     """
     from starid.camera import Camera
     from starid.camera_file import save_camera
@@ -66,7 +68,7 @@ def command(
 
 
 def _stars(images: list[Path], *, allow_colour: bool) -> tuple[list[Stars], tuple[int, int]]:
-    """Detections of each image, and the size (height, width) that all of them must have."""
+    """Return the detections of each image, and the common size (height, width)."""
     from starid.imaging.detection import detect
     from starid.imaging.image_io import read_image
     from starid.photograph.self_calibration import Stars
@@ -88,7 +90,7 @@ def _stars(images: list[Path], *, allow_colour: bool) -> tuple[list[Stars], tupl
 
 
 def _report(images: list[Path], result: SelfCalibration) -> dict[str, Any]:
-    """Figures of the calibration as plain values."""
+    """Return the results of the calibration as plain values."""
     calibration = result.calibration
     frames = zip(
         result.frame_index, calibration.attitudes, calibration.used, calibration.residual_px, strict=True

@@ -1,4 +1,4 @@
-"""`starhil campaign`: how accurate and how fast, over many seeded frames."""
+"""`starhil campaign`: accuracy and speed over many seeded frames."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from typing import Annotated, Any
 
 import typer
 
-group = typer.Typer(help="Accuracy over many seeded frames of random attitude.", no_args_is_help=True)
+from starhil.emulator.cli.options import AsJson
+
+group = typer.Typer(help="Measure accuracy over many seeded frames of random attitude.", no_args_is_help=True)
 
 
 @group.callback()
 def _campaigns() -> None:
-    """Accuracy over many seeded frames of random attitude."""
+    """Measure accuracy over many seeded frames of random attitude."""
 
 
 @group.command("lost-in-space")
@@ -26,19 +28,24 @@ def lost_in_space(
     rate: Annotated[
         float, typer.Option(min=0, help="Body rate during the exposure, deg/s, about a random axis.")
     ] = 0.0,
-    blocked: Annotated[float, typer.Option(help="Share of the field hidden by a dark body, 0 to 0.9.")] = 0.0,
-    algorithm: Annotated[str, typer.Option(help="Identifier: geometric, lsi or rsi.")] = "geometric",
+    blocked: Annotated[
+        float, typer.Option(help="Fraction of the field hidden by a dark body, 0 to 0.9.")
+    ] = 0.0,
+    algorithm: Annotated[
+        str, typer.Option(help="Star identification algorithm: geometric, lsi or rsi.")
+    ] = "geometric",
     require_valid: Annotated[
-        float, typer.Option(help="Exit 1 when fewer per cent of the frames are valid.")
+        float, typer.Option(help="Exit with status 1 if the percentage of valid frames is lower.")
     ] = 99.5,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes, also of a local Dask cluster.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes, also for --dask local.")] = 1,
     dask: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, or `local` for one of our own.")
+        str | None, typer.Option(help="Address of a Dask scheduler, or `local` to start one.")
     ] = None,
     sky: Annotated[
         str,
         typer.Option(
-            help="clear, or hard: 100 false stars among some 50 true ones, planets, hot pixels, the Moon or glare, to 2 deg/s."
+            help="clear, or hard: 100 false stars to about 50 true ones, planets, hot pixels, the Moon or glare, "
+            "and rates up to 2 deg/s."
         ),
     ] = "clear",
     output: Annotated[
@@ -46,14 +53,15 @@ def lost_in_space(
         typer.Option(
             "-o",
             "--output",
-            help="Folder that keeps finished chunks; made if it is missing. A second run goes on there.",
+            help="Folder for finished chunks, created if missing. A second run resumes from it.",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Render, detect and identify full images at uniformly random attitude and roll.
+    """Render, detect and identify full images at uniformly random attitudes.
 
-    A frame is wrong when its answer is valid and more than 0.1° off. Exit status 1 when any is wrong, or too few are valid.
+    A frame is wrong if its attitude is flagged valid but off by more than 0.1°. Exit status 1
+    if any frame is wrong or too few are valid.
     """
     import numpy as np
 
@@ -74,7 +82,7 @@ def lost_in_space(
 
 @contextmanager
 def _backend(dask: str | None, jobs: int) -> Iterator[None]:
-    """Work in the joblib backend that `--dask` asks for; without it in the caller's processes."""
+    """Use the joblib backend that `--dask` selects; without it, joblib's local processes."""
     if dask is None:
         yield
         return
@@ -107,7 +115,7 @@ def _backend(dask: str | None, jobs: int) -> Iterator[None]:
 
 
 def _with_progress(chunks: Any, total: int) -> Any:
-    """Show a progress bar on stderr while the chunks come in."""
+    """Show a progress bar on stderr while iterating over the chunks."""
     from rich.console import Console
     from rich.progress import track
 

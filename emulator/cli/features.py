@@ -1,4 +1,4 @@
-"""`starhil features`: the feature vector of one frame of the catalogue."""
+"""`starhil features`: the feature vector of one catalogue frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from starhil.emulator.cli.frame_options import frame_catalog, frame_parameters
+from starhil.emulator.cli.options import AsJson
 from starhil.emulator.errors import EmulatorError
 
 _KEYS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
@@ -26,14 +27,12 @@ def command(
     kappa: Annotated[float, typer.Option(help="Brightness limit κ, magnitudes.")] = 11.5,
     direction: Annotated[
         str,
-        typer.Option(
-            help="Side of the limit that is kept: faintest (a ≥ κ, the thesis) or brightest (a ≤ κ)."
-        ),
+        typer.Option(help="Stars kept: faintest (a ≥ κ, as in the thesis) or brightest (a ≤ κ)."),
     ] = "faintest",
     geometry: Annotated[
         str,
         typer.Option(
-            help="planar (degrees of the flat RA–Dec plane) or spherical (pixels of a 937-pixel camera)."
+            help="planar (degrees in the flat RA–Dec plane) or spherical (pixels of a 937-pixel camera)."
         ),
     ] = "planar",
     fov: Annotated[
@@ -42,15 +41,15 @@ def command(
     ] = None,
     band: Annotated[str, typer.Option(help="Magnitude used as brightness: hp or v.")] = "hp",
     full_field: Annotated[
-        bool, typer.Option("--full-field", help="Take the square frame instead of its inscribed circle.")
+        bool, typer.Option("--full-field", help="Use the square frame instead of its inscribed circle.")
     ] = False,
     epoch: Annotated[
         float | None,
         typer.Option(help="Epoch of the positions, Julian year; default 1991.25 planar, 2026 spherical."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of one frame of the catalogue."""
+    """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of a catalogue frame."""
     from starid.thesis.database import sky_of
 
     parameters = frame_parameters(

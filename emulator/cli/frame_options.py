@@ -1,9 +1,10 @@
-"""What `features` and `database` share: from options to the parameters of frames, and the catalogue they belong to."""
+"""Frame parameters and catalogue from the options of `features` and `database`."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, cast
 
+from starhil.emulator.cli.options import one_of
 from starhil.emulator.errors import EmulatorError
 
 if TYPE_CHECKING:
@@ -12,20 +13,13 @@ if TYPE_CHECKING:
     from starid.thesis.frame_sky import Direction
 
 PLANAR_EPOCH: Final = 1991.25
-"""The catalogue's own epoch: the published numbers know no proper motion."""
+"""The catalogue's native epoch: the published results ignore proper motion."""
 
 SPHERICAL_EPOCH: Final = 2026.0
 
 _WIDEST_FRAME_DEG: Final = 120.0
 _PLANAR_FOV_DEG: Final = 40.0
 _SPHERICAL_FOV_DEG: Final = 42.0
-
-
-def choice(name: str, value: str, allowed: tuple[str, ...]) -> str:
-    """Return `value`, or refuse it and name what is allowed."""
-    if value not in allowed:
-        raise EmulatorError(f"--{name} {value}: one of {', '.join(allowed)} is needed")
-    return value
 
 
 def frame_parameters(
@@ -38,22 +32,22 @@ def frame_parameters(
     full_field: bool,
     overlap_percent: float = 99.0,
 ) -> DatabaseParameters:
-    """Parameters of frames from command-line options; `overlap_percent` is in percent."""
+    """Make frame parameters from command-line options."""
     from starid.camera import Camera
     from starid.thesis.database import DatabaseParameters
 
-    side = cast("Direction", choice("direction", direction, ("faintest", "brightest")))
-    magnitude = cast("Band", choice("band", band, ("hp", "v")))
+    side = cast("Direction", one_of("--direction", direction, ("faintest", "brightest")))
+    magnitude = cast("Band", one_of("--band", band, ("hp", "v")))
     if not 1.0 < overlap_percent < 100.0:
         raise EmulatorError(
-            f"--overlap {overlap_percent}: percent are needed, above 1 and below 100, such as 99.5"
+            f"--overlap {overlap_percent}: must be a percentage between 1 and 100, such as 99.5"
         )
     if fov is not None and not 0.0 < fov <= _WIDEST_FRAME_DEG:
         raise EmulatorError(
-            f"--fov {fov:g}: degrees are needed, above 0 and at most {_WIDEST_FRAME_DEG:g}, such as 40"
+            f"--fov {fov:g}: must be above 0 and at most {_WIDEST_FRAME_DEG:g} degrees, such as 40"
         )
     overlap = overlap_percent / 100.0
-    if choice("geometry", geometry, ("planar", "spherical")) == "planar":
+    if one_of("--geometry", geometry, ("planar", "spherical")) == "planar":
         width = _PLANAR_FOV_DEG if fov is None else fov
         return DatabaseParameters("planar", overlap, width, kappa, side, magnitude, full_field)
     camera = Camera.from_fov(_SPHERICAL_FOV_DEG if fov is None else fov)
@@ -63,8 +57,8 @@ def frame_parameters(
 
 
 def frame_catalog(geometry: str, epoch: float | None) -> StarCatalog:
-    """Catalogue at the epoch asked for, or at the geometry's own."""
+    """Load the catalogue at an epoch, by default that of the geometry."""
     from starid.catalog import load_catalog
 
-    own = PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH
-    return load_catalog(epoch=own if epoch is None else epoch)
+    default = PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH
+    return load_catalog(epoch=default if epoch is None else epoch)

@@ -1,4 +1,4 @@
-"""`starhil hub`: a CAN bus over TCP that several processes share."""
+"""`starhil hub`: a CAN bus over TCP."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from starhil.emulator.cli.output import output_help, prepare_output
 
 
 def command(
-    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")] = 29536,
     log: Annotated[
-        Path | None, typer.Option(help=output_help("Write all frames to this file as a candump log."))
+        Path | None, typer.Option(help=output_help("Log all CAN frames to this file in candump format."))
     ] = None,
 ) -> None:
-    """Serve a CAN bus over TCP (socketcand text protocol) where the kernel has no CAN.
+    """Serve a CAN bus over TCP (socketcand protocol) for machines without SocketCAN.
 
-    python-can joins with interface socketcand, host, port and channel vcan0; starhil with --can socketcand:HOST:PORT/vcan0.
-    Ends with SIGINT or SIGTERM.
+    Connect python-can with interface socketcand, host, port and channel vcan0, and starhil
+    with --can socketcand:HOST:PORT/vcan0. SIGINT or SIGTERM ends the hub.
     """
     import asyncio
     import signal

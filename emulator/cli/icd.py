@@ -1,4 +1,4 @@
-"""`starhil icd`: the interface definition for people and for other tools."""
+"""`starhil icd`: list and export the interface definition."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import output_help, prepare_output, print_text
 
-group = typer.Typer(help="The interface definition: list it, export it.", no_args_is_help=True)
+group = typer.Typer(help="List or export the interface definition.", no_args_is_help=True)
 
 
 class Format(StrEnum):
@@ -31,13 +32,14 @@ def export(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help=output_help("File to write; stdout without it.")),
+        typer.Option("--output", "-o", help=output_help("File to write; default: stdout.")),
     ] = None,
     icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
 ) -> None:
-    """Write the interface definition in another format.
+    """Export the interface definition in another format.
 
-    markdown and html are for people; dbc, eds, xtce and cosmos for CAN tools, CANopen masters and ground software.
+    markdown and html are for readers, dbc for CAN tools, eds for CANopen masters, xtce and
+    cosmos for ground software.
     """
     from starhil.protocol.export import export as render
     from starhil.protocol.icd import load_icd
@@ -50,13 +52,13 @@ def export(
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically."""
     from starhil.emulator.errors import EmulatorError
     from starid.files import write_atomically
 
     prepare_output(path, "-o")
     try:
-        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+        write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     except OSError as error:
         raise EmulatorError(
             f"{path}: cannot be written ({error.strerror}); choose another file with -o"
@@ -66,9 +68,9 @@ def _write(path: Path, text: str) -> None:
 @group.command("list")
 def list_rows(
     icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """List telecommands, telemetry and parameters, one a line."""
+    """List telecommands, telemetry and parameters, one per line."""
     import json
 
     from starhil.protocol.icd import load_icd

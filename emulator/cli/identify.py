@@ -1,4 +1,4 @@
-"""`starhil identify`: which stars are on an image, and where it looks."""
+"""`starhil identify`: the stars and the attitude of an image."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 
 if TYPE_CHECKING:
@@ -24,24 +25,22 @@ _MODELS: dict[str, Model] = {"pinhole": "pinhole", "equidistant": "equidistant"}
 
 def command(
     image: Annotated[
-        Path, typer.Argument(help="PNG, TIFF or JPEG, 8 or 16 bits; grey, or with --fov colour.")
+        Path, typer.Argument(help="PNG, TIFF or JPEG, 8 or 16 bits; grey, or colour with --fov.")
     ],
     profile: Annotated[
-        str | None, typer.Option(help="Take the camera from this profile (name or TOML file).")
+        str | None, typer.Option(help="Device or camera profile with the camera: a name or a TOML file.")
     ] = None,
     fov: Annotated[
         str | None,
         typer.Option(
             metavar="DEGREES|auto",
-            help="Any other camera: rough width of what the image shows, edge to edge, degrees; or auto, to "
+            help="For any other camera: rough horizontal field of view, edge to edge, degrees; or auto to "
             "try 5 to 46 degrees.",
         ),
     ] = None,
     fov_tolerance: Annotated[
         float | None,
-        typer.Option(
-            min=0.0, max=0.3, help="Relative uncertainty of --fov in degrees; default 0.1. Not with auto."
-        ),
+        typer.Option(min=0.0, max=0.3, help="Relative uncertainty of --fov; default 0.1. Not with auto."),
     ] = None,
     model: Annotated[str, typer.Option(help="With --fov: pinhole or equidistant.")] = "pinhole",
     epoch: Annotated[float | None, typer.Option(help="Julian year of the image; default 2026.")] = None,
@@ -49,22 +48,22 @@ def command(
         bool | None,
         typer.Option(
             "--allow-colour/--refuse-colour",
-            help="Turn a colour image into grey, or refuse it; default: refuse it but with --fov.",
+            help="Convert a colour image to grey, or reject it; default: reject, but convert with --fov.",
         ),
     ] = None,
     annotate: Annotated[
         Path | None,
         typer.Option(
-            "--annotate", "-o", help=output_help("Write the image with its identified stars marked.")
+            "--annotate", "-o", help=output_help("Write the image with the identified stars marked.")
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Identify the stars on an image, lost in space; exit status 1 if they cannot be.
+    """Identify the stars in an image, lost in space.
 
-    Without --profile or --fov the camera is the emulator's own, 937×937 pixels
-    and 42° wide. With --fov the image may come from any camera, be mirrored or
-    a negative; field and distortion are measured on it.
+    Without --profile or --fov the image must be from the emulator's default camera, 937×937
+    pixels and 42° wide. With --fov it may be from any camera, mirrored or a negative; field of
+    view and distortion are estimated. Exit status 1 if the stars cannot be identified.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
     from starid.imaging.image_io import image_suffix, read_image, write_image
@@ -74,7 +73,7 @@ def command(
         prepare_output(annotate, "-o")
     pixels = read_image(image, allow_colour=fov is not None if allow_colour is None else allow_colour)
     catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)
-    result = _solved(pixels, catalog, profile, fov, fov_tolerance, model)
+    result = _solve(pixels, catalog, profile, fov, fov_tolerance, model)
     report = _report(image, result, _advice(result, fov, model))
     if annotate is not None:
         write_image(annotate, _marked(pixels, result))
@@ -86,7 +85,7 @@ def command(
         raise typer.Exit(1)
 
 
-def _solved(
+def _solve(
     pixels: Any,
     catalog: StarCatalog,
     profile: str | None,
@@ -94,7 +93,7 @@ def _solved(
     fov_tolerance: float | None,
     model: str,
 ) -> ImageSolution:
-    """What is found on the image with the camera that the options name."""
+    """Solve an image with the camera that the options select."""
     from starhil.emulator.errors import EmulatorError
     from starid.camera import Camera
     from starid.files import read_number
@@ -104,13 +103,13 @@ def _solved(
     if fov is None:
         return solve_image(pixels, _camera(profile), catalog)
     if profile is not None:
-        raise EmulatorError("identify: --profile and --fov both name a camera: give one of them")
+        raise EmulatorError("identify: --profile and --fov exclude each other; give one of them")
     if model not in _MODELS:
         raise EmulatorError(f"identify --model: {model!r} given, {' or '.join(_MODELS)} needed")
     if fov == _ANY_FIELD:
         if fov_tolerance is not None:
             raise EmulatorError(
-                "identify: --fov auto has its own tolerance: leave --fov-tolerance out, or give degrees"
+                "identify: --fov-tolerance has no effect with --fov auto; leave it out, or give --fov in degrees"
             )
         return solve_any_field(pixels, catalog, model=_MODELS[model])
     try:
@@ -124,7 +123,7 @@ def _solved(
 
 
 def _camera(profile: str | None) -> Camera:
-    """The camera of a profile, or the emulator's own."""
+    """Return the camera of a profile, or the emulator's default."""
     from starid.camera import Camera
     from starid.camera_file import load_camera
 
@@ -138,26 +137,28 @@ def _camera(profile: str | None) -> Camera:
 
 
 def _advice(result: ImageSolution, fov: str | None, model: str) -> str:
-    """What to try where the image was not identified; empty where it was."""
+    """Return what to try for an image that was not identified; empty if it was."""
     solution, found = result.solution, result.detections
     if solution.valid:
         return ""
     if solution.reason == "too_few_stars":
-        seen = found.reason or f"{len(found)} stars stand out"
-        return f"{seen}; expose longer, or give a part of the image that shows sky"
+        seen = found.reason or f"only {len(found)} stars detected"
+        return f"{seen}; expose longer, or crop the image to the sky"
     if fov is None:
-        return "give the profile of the camera that took it, or with --fov the rough width of the image in degrees"
+        return "give the camera's profile with --profile, or its rough field of view in degrees with --fov"
     if fov == _ANY_FIELD:
-        return "give the width of the image in degrees with --fov, if it is not within 5 to 46 degrees, or --model equidistant"
+        return (
+            "give the field of view with --fov if it is outside 5 to 46 degrees, or try --model equidistant"
+        )
     other = next(name for name in _MODELS if name != model)
     return (
-        f"check that the whole image is {fov}° wide within the tolerance, or try --fov {_ANY_FIELD}, --model {other}, "
-        "or a part of the image without foreground"
+        f"check that the image is {fov}° wide within the tolerance, or try --fov {_ANY_FIELD}, --model {other}, "
+        "or the image cropped to the sky"
     )
 
 
 def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
-    """The answer as plain values; angles and quaternion are None where it is not valid."""
+    """Return the result as plain values; angles and quaternion are None if it is not valid."""
     solution, found = result.solution, result.detections
     report: dict[str, Any] = {
         "image": str(image),
@@ -214,7 +215,7 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
 
 
 def _marked(pixels: Any, result: ImageSolution) -> Any:
-    """The image with circles at identified stars, and other ones at detections without an identity."""
+    """Return the image with identified stars and unidentified detections circled."""
     import numpy as np
 
     from starhil.emulator.cli.annotate import annotate, star_label
@@ -232,7 +233,7 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
 
 
 def _show(report: dict[str, Any], annotated: Path | None) -> None:
-    """The answer for people."""
+    """Print the result as text."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
@@ -257,11 +258,11 @@ def _show(report: dict[str, Any], annotated: Path | None) -> None:
         f"false with probability < {max(report['probability_false'], 1e-300):.1g}"
     )
     if report["mirrored"]:
-        console.print("the image is mirrored: roll and attitude are those of the image flipped left to right")
+        console.print("the image is mirrored: roll and attitude refer to the image flipped left to right")
     if report["missing_stars"]:
         brightest = min(report["missing_stars"], key=lambda star: star["v"])
         console.print(
-            f"{len(report['missing_stars'])} stars that should be seen are not, the brightest HIP {brightest['hip']}, "
+            f"{len(report['missing_stars'])} expected stars were not detected, the brightest HIP {brightest['hip']}, "
             f"V {brightest['v']:.1f}"
         )
     table = Table("HIP", "x px", "y px", "flux", box=SIMPLE, title="brightest identified stars")

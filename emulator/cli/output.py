@@ -1,4 +1,4 @@
-"""What commands write: one rule for the paths of files, and text that any terminal can show."""
+"""Output of commands: files, and text that any terminal can show."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ _PLAIN: Final = {
     "µ": "u",
     "π": "parallax",
 }
-"""How an output that does not hold a character shows it."""
+"""Replacement for characters that an output's encoding lacks."""
 
 _HANDLER: Final = "starhil-plain"
 
 
 def output_help(what: str) -> str:
     """Help of an option that names a file to write."""
-    return f"{what} Missing folders are made; /dev/stdout is standard output."
+    return f"{what} Missing folders are created; /dev/stdout is standard output."
 
 
 def prepare_output(path: Path, option: str) -> Path:
-    """Make the folders of a file that is to be written, before the work whose outcome goes there.
+    """Create the folder of an output file, so that a bad path fails before the work starts.
 
     Raises
     ------
     EmulatorError
-        They cannot be made, or the path is a folder.
+        The folder cannot be created, or the path is a folder.
     """
     if path.is_dir():
         raise EmulatorError(f"{path}: is a folder; name a file with {option}")
@@ -58,27 +58,27 @@ def prepare_output(path: Path, option: str) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise EmulatorError(
-            f"{path}: its folder cannot be made ({error.strerror}); choose another file with {option}"
+            f"{path}: its folder cannot be created ({error.strerror}); choose another file with {option}"
         ) from None
     return path
 
 
 def report_stream(output: Path | None) -> TextIO:
-    """Where a command prints its report: standard error where its file itself goes to standard output."""
+    """Return the stream for a command's report: stderr if its output file is stdout, else stdout."""
     from starid.files import is_stdout
 
     return sys.stderr if output is not None and is_stdout(output) else sys.stdout
 
 
 def print_text(text: str) -> None:
-    """Print a document as UTF-8, whatever the locale: its readers know no other encoding."""
+    """Print a document as UTF-8, whatever the locale."""
     sys.stdout.flush()
     sys.stdout.buffer.write(text.encode())
     sys.stdout.buffer.flush()
 
 
 def show_every_character() -> None:
-    """Let both standard streams spell out what their encoding does not hold, instead of failing."""
+    """Make stdout and stderr replace characters that their encoding lacks instead of failing."""
     codecs.register_error(_HANDLER, _spell_out)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -1,4 +1,4 @@
-"""`starhil render`: one frame of the sky as a PNG, with the truth of what is on it."""
+"""`starhil render`: an image of the sky, and the truth behind it."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def command(
     ra: Annotated[float, typer.Option(help="Right ascension of the boresight, degrees.")],
     dec: Annotated[float, typer.Option(help="Declination of the boresight, degrees.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help=output_help("Image to write: .png, or .tiff."))
+        Path, typer.Option("--output", "-o", help=output_help("Image to write: .png or .tiff."))
     ],
     roll: Annotated[
-        float, typer.Option(help="Celestial north counter-clockwise from image up, degrees.")
+        float, typer.Option(help="Angle of celestial north, counter-clockwise from image up, degrees.")
     ] = 0.0,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     rate: Annotated[
@@ -40,10 +40,12 @@ def command(
         typer.Option(metavar="X Y Z", help="Body rate during the exposure, sensor frame, degrees/s."),
     ] = (0.0, 0.0, 0.0),
     exposure: Annotated[float | None, typer.Option(help="Exposure, seconds.")] = None,
-    limit: Annotated[float | None, typer.Option(help="Faintest stars that are drawn, V.")] = None,
-    bits: Annotated[int | None, typer.Option(help="8, 12 or 16.")] = None,
-    gain: Annotated[float | None, typer.Option(help="Analog gain, times.")] = None,
-    fov: Annotated[float | None, typer.Option(help="Full width of the field, degrees.")] = None,
+    limit: Annotated[float | None, typer.Option(help="Limiting magnitude of the stars, V.")] = None,
+    bits: Annotated[int | None, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = None,
+    gain: Annotated[float | None, typer.Option(help="Analog gain, as a factor.")] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Horizontal field of view, edge to edge, degrees.")
+    ] = None,
     size: Annotated[
         str | None, typer.Option(metavar="WIDTH[xHEIGHT]", help="Pixels, such as 1024x768.")
     ] = None,
@@ -51,17 +53,17 @@ def command(
     profile: Annotated[
         str | None,
         typer.Option(
-            help="Picture of the device of this profile: camera, sensor, exposure, gain, catalogue and sky."
+            help="Device profile with camera, sensor, exposure, gain, catalogue and sky: a name or a TOML file."
         ),
     ] = None,
     as_annotated: Annotated[
         bool, typer.Option("--annotate", help="Stretch the image and mark the stars on it.")
     ] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print the truth of the frame as one JSON object.")
+        bool, typer.Option("--json", help="Print the truth of the image as one JSON object.")
     ] = False,
 ) -> None:
-    """Render one frame of the sky; the same options give the same bytes."""
+    """Render an image of the sky; the same options give the same bytes."""
     from starhil.emulator.sensor.renderer import Renderer
     from starid.attitude import Attitude
     from starid.catalog import load_catalog
@@ -69,17 +71,17 @@ def command(
 
     for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
         if not -_TURN_DEG <= value <= _TURN_DEG:
-            raise EmulatorError(f"--{name} {value:g}: degrees from -360 to 360 are needed")
+            raise EmulatorError(f"--{name} {value:g}: must be between -360 and 360 degrees")
     if not -90.0 <= dec <= 90.0:
-        raise EmulatorError(f"--dec {dec}: degrees from -90 to 90 are needed")
+        raise EmulatorError(f"--dec {dec}: must be between -90 and 90 degrees")
     if not math.hypot(*rate) <= _FASTEST_DEG_S:
         raise EmulatorError(
-            f"--rate {' '.join(f'{value:g}' for value in rate)}: at most {_FASTEST_DEG_S:g} degrees/s in all are needed"
+            f"--rate {' '.join(f'{value:g}' for value in rate)}: must be at most {_FASTEST_DEG_S:g} degrees/s in total"
         )
     prepare_output(output, "-o")
     image_suffix(output)
     if fov is not None and not fov >= _NARROWEST_DEG:
-        raise EmulatorError(f"--fov {fov:g}: at least {_NARROWEST_DEG:g} degrees are needed")
+        raise EmulatorError(f"--fov {fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
     scene = _scene(profile, fov, size, model)
     camera = scene.camera
     changes = {
@@ -105,7 +107,7 @@ def command(
 
 @dataclass(frozen=True)
 class _Scene:
-    """What makes the picture, and which stars and other objects there are."""
+    """Camera, sensor, catalogue and sky objects of an image."""
 
     camera: Camera
     sensor: SensorModel
@@ -115,7 +117,7 @@ class _Scene:
 
 
 def _scene(profile: str | None, fov: float | None, size: str | None, model: str | None) -> _Scene:
-    """Scene of a profile, as its device sees it, or of the defaults, with the options put over it."""
+    """Return the scene of a profile's device, or the default, with the camera options applied."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sky.objects import SkyObjects
     from starid.camera import Camera
@@ -158,18 +160,18 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Read `1024` or `1024x768`."""
-    parts = text.lower().replace("×", "x").split("x")
-    if len(parts) not in (1, 2) or not all(part.isdecimal() for part in parts):
-        raise EmulatorError(f"--size {text}: WIDTH or WIDTHxHEIGHT in pixels is needed, such as 1024x768")
-    width, height = int(parts[0]), int(parts[-1])
+    """Parse `1024` or `1024x768`."""
+    numbers = text.lower().replace("×", "x").split("x")
+    if len(numbers) not in (1, 2) or not all(number.isdecimal() for number in numbers):
+        raise EmulatorError(f"--size {text}: must be WIDTH or WIDTHxHEIGHT in pixels, such as 1024x768")
+    width, height = int(numbers[0]), int(numbers[-1])
     if not (16 <= width <= 8192 and 16 <= height <= 8192):
-        raise EmulatorError(f"--size {text}: 16 to 8192 pixels a side are needed")
+        raise EmulatorError(f"--size {text}: must be 16 to 8192 pixels in each direction")
     return width, height
 
 
 def _marked(frame: Frame) -> Any:
-    """Mark the stars of a frame: names and Hipparcos numbers for the bright ones."""
+    """Mark the stars of an image, with names or Hipparcos numbers for the bright ones."""
     from starhil.emulator.cli.annotate import annotate, star_label
 
     stars = frame.stars
@@ -181,7 +183,7 @@ def _marked(frame: Frame) -> Any:
 
 
 def _truth(frame: Frame, camera: Camera, sensor: SensorModel, output: Path) -> dict[str, Any]:
-    """What is on a frame, as plain values."""
+    """Return the truth of an image as plain values."""
     stars = frame.stars
     return {
         "image": str(output),

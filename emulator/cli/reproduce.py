@@ -1,4 +1,4 @@
-"""`starhil reproduce`: the thesis's experiments from the real catalogue, beside the published figures."""
+"""`starhil reproduce`: repeat the experiments of the thesis and compare with the published results."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import AsJson
+
 
 def command(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments; without any, all of them.")
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments; default: all.")
     ] = None,
     output: Annotated[
         Path,
-        typer.Option(
-            "-o", "--output", help="Folder for report.md, tables and figures; made if it is missing."
-        ),
+        typer.Option("-o", "--output", help="Folder for report.md, tables and figures, created if missing."),
     ] = Path("out/reproduce"),
     quick: Annotated[
-        bool, typer.Option("--quick", help="A subset in a few minutes, with its checks.")
+        bool, typer.Option("--quick", help="Run a subset that takes a few minutes, with its checks.")
     ] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all chance.")] = 1,
-    list_them: Annotated[bool, typer.Option("--list", help="Name the experiments and end.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+    list_only: Annotated[bool, typer.Option("--list", help="List the experiments and exit.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Make the thesis's experiments again: tables, figures, and report.md with published values beside ours.
+    """Repeat the experiments of the thesis: tables, figures, and report.md with published and measured values.
 
-    The report holds all that is finished in the folder. A second run in the same folder goes on where the first stopped, and does nothing again that is finished with the
-    same parameters. Every miss is in the report. Exit status 1 when a check is missed that is not a known miss.
+    A second run in the same folder resumes the first and skips experiments finished with the
+    same parameters. The report covers all finished experiments in the folder. Exit status 1 if
+    a check is missed that is not a known miss; the report shows every miss.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -41,7 +42,7 @@ def command(
     from starid.thesis.experiments.report import CLASSES, summary, write_report
     from starid.thesis.experiments.runner import finished_in, run
 
-    if list_them:
+    if list_only:
         _list(as_json=as_json, known={n: (e.title, e.quick is not None) for n, e in experiments().items()})
         return
     chosen = select(names or [], quick=quick)

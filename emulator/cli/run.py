@@ -1,4 +1,4 @@
-"""`starhil run`: the emulator as a process."""
+"""`starhil run`: run the emulator."""
 
 from __future__ import annotations
 
@@ -12,34 +12,40 @@ from starhil.emulator.cli.output import output_help, prepare_output
 
 def command(
     profile: Annotated[
-        str, typer.Argument(help="Name of a profile, or path of a profile file.")
+        str, typer.Argument(help="Name of a device profile, or path of a profile file.")
     ] = "cubestar",
     serial: Annotated[
-        str | None, typer.Option(help="auto (a pty), a device, listen://HOST:PORT, or off.")
+        str | None, typer.Option(help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off.")
     ] = None,
     dialect: Annotated[
         str | None,
         typer.Option(
-            help="Form of serial replies: a for OBC software written for the CubeComputer (a reply begins with the identifier), "
-            "b for a stand-alone node (it does not; the default), c for generation 2. With the wrong one values are "
-            "shifted by a byte."
+            help="Format of serial replies: a for OBC software written for the CubeComputer (replies start with the "
+            "message ID), b for a stand-alone node (no ID; default), c for generation 2. With the wrong dialect, "
+            "values are shifted by one byte."
         ),
     ] = None,
     can: Annotated[
-        str | None, typer.Option(help="auto (vcan0, else the TCP hub), a channel, or off.")
+        str | None,
+        typer.Option(help="CAN link: auto (vcan0 if available, else the TCP hub), a channel, or off."),
     ] = None,
     canopen: Annotated[
-        int | None, typer.Option(min=0, max=127, help="Node of the CANopen slave beside it; 0 is off.")
+        int | None,
+        typer.Option(min=0, max=127, help="Node ID of a CANopen slave on the CAN channel; 0: off."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all noise.")] = None,
-    clock: Annotated[str | None, typer.Option(help="real, scaled:FACTOR or stepped.")] = None,
+    clock: Annotated[
+        str | None, typer.Option(help="Simulation clock: real, scaled:FACTOR or stepped.")
+    ] = None,
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            help="Folder that keeps saved parameters and the boot count over a restart; without it they are lost."
+            help="Folder for state kept over restarts, such as saved parameters; default: keep nothing."
         ),
     ] = None,
-    symlink: Annotated[Path | None, typer.Option(help="Link to the pty, removed at the end.")] = None,
+    symlink: Annotated[
+        Path | None, typer.Option(help="Symbolic link to the pty, removed at the end.")
+    ] = None,
     control: Annotated[
         str,
         typer.Option(
@@ -50,32 +56,33 @@ def command(
     control_token: Annotated[
         str | None,
         typer.Option(
-            envvar="STARHIL_CONTROL_TOKEN", help="What each request on the control channel has to carry."
+            envvar="STARHIL_CONTROL_TOKEN", help="Token required in each request on the control channel."
         ),
     ] = None,
     truth_log: Annotated[
-        Path | None, typer.Option(help=output_help("CSV file of truth and measurement, a row a frame."))
+        Path | None,
+        typer.Option(help=output_help("CSV file of true and measured attitudes, one row per frame.")),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a truth log that exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing truth log.")] = False,
     scenario: Annotated[
         str,
         typer.Option(
-            help="Scenario: a TOML file, or the name of one in configs/scenarios; faults and truths at given times."
+            help="Scenario of timed faults and attitude changes: a TOML file, or a name in configs/scenarios."
         ),
     ] = "",
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", help="section.key=value that overrides the profile; may be repeated."),
+        typer.Option("--set", help="Override a key of the profile: section.key=value. May be repeated."),
     ] = None,
-    log: Annotated[str, typer.Option(help="debug, info, warning or error; to stderr.")] = "warning",
+    log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
 ) -> None:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
-    One line on stdout, `ready serial=… dialect=… can=… seed=…`, tells that it takes commands and where.
+    One line on stdout, `ready serial=… dialect=… can=… seed=…`, reports that it accepts commands, and where.
     """
     from starhil.emulator.pipeline.worker_process import take_worker
 
-    worker = take_worker()  # first of all: it imports and warms up while this process does the rest
+    worker = take_worker()  # first of all: it starts up in parallel with the imports below
 
     import asyncio
     import gc
@@ -93,7 +100,7 @@ def command(
     if dialect is not None and dialect not in list(Dialect):
         raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
     overrides = list(settings or ())
-    given = {
+    values = {
         "links.serial.port": serial,
         "links.serial.dialect": dialect,
         "links.can.channel": can,
@@ -101,7 +108,7 @@ def command(
         "run.state_dir": None if state_dir is None else str(state_dir.resolve()),
         "links.serial.symlink": None if symlink is None else str(symlink.absolute()),
     }
-    overrides += [f"{key}={_quoted(value)}" for key, value in given.items() if value is not None]
+    overrides += [f"{key}={_quoted(value)}" for key, value in values.items() if value is not None]
     if canopen is not None:
         overrides.append(f"links.canopen.node={canopen}")
     if seed is not None:
@@ -112,12 +119,12 @@ def command(
         links.canopen.node or truth_log
     ):
         raise EmulatorError(
-            "no link: nothing could reach the device, and nothing is recorded; "
+            "no link: the device cannot be reached and nothing is recorded; "
             "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
         )
 
     if control_token is not None and not control_token:
-        raise EmulatorError("--control-token: is empty; give a text, or leave it out")
+        raise EmulatorError("--control-token: empty; give a text, or leave the option out")
     options = RunOptions(truth_log, overwrite, control, control_token or "", scenario)
     if truth_log is not None:
         prepare_output(truth_log, "--truth-log")
@@ -128,7 +135,7 @@ def command(
         emulator = Run(loaded, options, worker)
         loop = asyncio.get_running_loop()
         ends = [signal.SIGINT, signal.SIGTERM]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
             ends.append(signal.SIGHUP)
         for number in ends:
             loop.add_signal_handler(number, emulator.ended.set)
@@ -139,7 +146,7 @@ def command(
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
                 gc.collect()
-                gc.freeze()  # what is there now stays: the collector need not stop the links to look at it
+                gc.freeze()  # long-lived objects: scanning them would pause the links
                 print(line.result(), flush=True)
                 await stop
             else:

@@ -9,46 +9,46 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.output import output_help
+from starhil.emulator.cli.options import (
+    AsJson,
+    CanChannel,
+    DeviceAddress,
+    HostAddress,
+    JunitFile,
+    SerialDialect,
+    SerialPort,
+)
 
 
 def command(
     script: Annotated[
-        Path, typer.Argument(help="Session script (TOML), or the name of one that comes along.")
+        Path, typer.Argument(help="Session script (TOML), or the name of one that ships with starhil.")
     ],
-    serial: Annotated[
-        str | None, typer.Option(help="Serial port: /dev/…, socket://host:port; with --start: auto.")
-    ] = None,
-    can: Annotated[
-        str | None,
-        typer.Option(help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …; with --start: auto."),
-    ] = None,
-    start: Annotated[
-        bool, typer.Option("--start", help="Start the emulator as a process for this session, and end it.")
-    ] = False,
+    serial: SerialPort = None,
+    can: CanChannel = None,
+    start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,
     profile: Annotated[
-        str | None, typer.Option(help="With --start: device profile, in place of the script's.")
+        str | None, typer.Option(help="With --start: device profile instead of the script's.")
     ] = None,
     log: Annotated[
-        Path | None, typer.Option(help="Folder for logs, samples and pictures; default out/session/NAME.")
+        Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
     ] = None,
-    junit: Annotated[Path | None, typer.Option(help=output_help("Write a JUnit XML file."))] = None,
+    junit: JunitFile = None,
     truth: Annotated[
-        Path | None, typer.Option(help="File of true attitudes that the emulator writes (--truth-log).")
+        Path | None, typer.Option(help="Truth log that the emulator writes (run --truth-log).")
     ] = None,
-    dialect: Annotated[str, typer.Option(help="Form of serial replies: a, b or c.")] = "b",
+    dialect: SerialDialect = "b",
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
-    host_address: Annotated[int, typer.Option(help="CAN address of this OBC.")] = 1,
-    device_address: Annotated[int, typer.Option(help="CAN address of the device.")] = 4,
-    keep_going: Annotated[bool, typer.Option("--keep-going", help="Go on after a failed step.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object instead of the steps.")
-    ] = False,
+    host_address: HostAddress = 1,
+    device_address: DeviceAddress = 4,
+    keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Run a session script step by step; exit status 0 all as expected, 1 a step failed, 2 refused.
+    """Run a session script step by step.
 
-    SIGINT, SIGTERM and SIGHUP end it and the emulator that it started; the steps left are reported as not run (exit
-    status 128 and the number of the signal).
+    Exit status 0: passed, 1: a step failed, 2: invalid input. SIGINT, SIGTERM and SIGHUP end
+    the session and the emulator it started; the remaining steps are reported as not run, and
+    the exit status is 128 plus the signal's number.
     """
     from starhil.hil_tests.bench import LinkOptions
     from starhil.hil_tests.interruption import interruptible

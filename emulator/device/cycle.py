@@ -23,7 +23,8 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.scheduler import Event, Scheduler
-from starhil.emulator.pipeline.frames import (
+from starhil.emulator.pipeline.imager import Imager, PipelineReply
+from starhil.emulator.pipeline.messages import (
     ZERO,
     Failure,
     FrameRequest,
@@ -32,7 +33,6 @@ from starhil.emulator.pipeline.frames import (
     SolverSettings,
     Triple,
 )
-from starhil.emulator.pipeline.imager import Answer, Imager
 from starhil.emulator.profile import TimingConfig
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
@@ -251,7 +251,7 @@ class FrameCycle:
         ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
         generation = self._generation
 
-        def arrived(answer: Answer) -> None:
+        def arrived(answer: PipelineReply) -> None:
             if generation == self._generation:
                 self._result_arrived(frame, answer)
 
@@ -297,7 +297,7 @@ class FrameCycle:
             return last[1]
         return propagate(last[1], np.array(rate), (mid_ns - last[0]) / NANOSECONDS)
 
-    def _result_arrived(self, frame: _Frame, answer: Answer) -> None:
+    def _result_arrived(self, frame: _Frame, answer: PipelineReply) -> None:
         if isinstance(answer, FrameResult):
             frame.result, self._failure = answer, ""
         else:

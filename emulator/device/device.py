@@ -17,8 +17,8 @@ from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, log_internal_error, one_line
-from starhil.emulator.pipeline.frames import FrameRequest
 from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.pipeline.messages import FrameRequest
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError

@@ -16,8 +16,8 @@ from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.pipeline.binning import mean_over_squares
-from starhil.emulator.pipeline.frames import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
-from starhil.emulator.pipeline.imager import Answer, Imager
+from starhil.emulator.pipeline.imager import Imager, PipelineReply
+from starhil.emulator.pipeline.messages import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
 from starhil.protocol.image_transfer import FRAME_SIZE
 
 STORE_S: Final = 0.1
@@ -190,14 +190,14 @@ class ImageStore:
         """Fetch an image from the pipeline; `take` gets it after `STORE_S`, or None on failure."""
         generation = self._generation
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
-        answers: list[Answer] = []
+        answers: list[PipelineReply] = []
         waiting: list[bool] = []
 
         def finish() -> None:
             answer = answers[0]
             take(answer if isinstance(answer, ImageResult) and answer.frame >= 0 else None)
 
-        def arrived(answer: Answer) -> None:
+        def arrived(answer: PipelineReply) -> None:
             answers.append(answer)
             if waiting and generation == self._generation:
                 finish()

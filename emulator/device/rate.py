@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.pipeline.frames import Triple
+from starhil.emulator.pipeline.messages import Triple
 from starid.attitude import Attitude
 
 HISTORY: Final = 10

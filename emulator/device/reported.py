@@ -11,7 +11,7 @@ from starhil.emulator.device.cycle import as_quaternion
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.pipeline.frames import ZERO, Quaternion, Triple
+from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple
 from starid.attitude import Attitude
 
 

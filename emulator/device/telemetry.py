@@ -10,7 +10,7 @@ from starhil.emulator.clock import NANOSECONDS, split_unix
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import Reported, reported
-from starhil.emulator.pipeline.frames import MatchedStar
+from starhil.emulator.pipeline.messages import MatchedStar
 from starhil.protocol.image_transfer import frame_checksum
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value

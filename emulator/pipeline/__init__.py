@@ -1,1 +1,1 @@
-"""The image pipeline: renders, detects and identifies in a worker process, and the queue in front of it."""
+"""The image pipeline: rendering, detection and identification in a worker process, and its request queue."""

@@ -1,4 +1,4 @@
-"""Smaller images by averaging squares of pixels, fast enough for the process that answers on the bus."""
+"""Smaller images by averaging squares of pixels, fast enough for the process that serves the bus."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def mean_over_squares(image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     if step == 1:
         return image
     height, width = image.shape
-    kind = np.uint16 if step * step * 256 <= 1 << 16 else np.uint32
-    rows = np.zeros((height // step, width), dtype=kind)
+    sum_type = np.uint16 if step * step * 256 <= 1 << 16 else np.uint32
+    rows = np.zeros((height // step, width), dtype=sum_type)
     for offset in range(step):
         rows += image[offset::step]
-    total = np.full((height // step, width // step), step * step // 2, dtype=kind)
+    total = np.full((height // step, width // step), step * step // 2, dtype=sum_type)
     for offset in range(step):
         total += rows[:, offset::step]
     return (total >> (2 * (step.bit_length() - 1))).astype(np.uint8)

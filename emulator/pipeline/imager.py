@@ -1,7 +1,7 @@
-"""Where frames are made and solved, seen from the device: a process or a thread that takes requests in order.
+"""The device's access to the image pipeline: a process or thread that handles requests in order.
 
-The device never waits: it submits a request and is called back in the event loop. `settle` is for the stepped clock, which
-goes on only when all that was asked for has come.
+The device never waits: it submits a request and is called back in the event loop. The stepped clock
+uses `settle` to wait for all pending results before it advances.
 """
 
 from __future__ import annotations
@@ -18,35 +18,35 @@ from typing import Any, Protocol, TypeAlias
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, one_line
-from starhil.emulator.pipeline.frames import (
+from starhil.emulator.pipeline.messages import (
     LENGTH,
     Failure,
     FrameRequest,
     FrameResult,
     ImageRequest,
     ImageResult,
+    PipelineReady,
     PipelineSetup,
-    Warm,
 )
 from starhil.emulator.pipeline.worker_process import EXIT_GRACE_S, WorkerProcess
 
-log = logging.getLogger("starhil.picture")
+log = logging.getLogger("starhil.pipeline")
 
-Asked: TypeAlias = FrameRequest | ImageRequest
-Answer: TypeAlias = FrameResult | ImageResult | Failure
-Done: TypeAlias = Callable[[Answer], None]
+PipelineRequest: TypeAlias = FrameRequest | ImageRequest
+PipelineReply: TypeAlias = FrameResult | ImageResult | Failure
+ReplyCallback: TypeAlias = Callable[[PipelineReply], None]
 
 
 class Imager(Protocol):
-    """What the device asks frames of."""
+    """What the device needs of an image pipeline."""
 
     @property
     def pending(self) -> int:
-        """Requests that are not answered yet."""
+        """Number of requests without a result yet."""
         ...
 
-    def submit(self, request: Asked, done: Done) -> None:
-        """Ask for something; `done` is called once, in the event loop, in the order of the requests."""
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
+        """Queue a request; `done` is called once, in the event loop, in the order of the requests."""
         ...
 
     async def settle(self) -> None:
@@ -54,16 +54,16 @@ class Imager(Protocol):
         ...
 
 
-class _Queue:
-    """Callbacks that wait for their answers, in order, and the start that they need."""
+class _RequestQueue:
+    """Callbacks of pending requests, in order, and the future that reports the start of the pipeline."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Done] = deque()
+        self._waiting: deque[ReplyCallback] = deque()
         self._idle = asyncio.Event()
         self._idle.set()
-        self._warm: asyncio.Future[Warm] = asyncio.get_running_loop().create_future()
+        self._started: asyncio.Future[PipelineReady] = asyncio.get_running_loop().create_future()
         self.on_failure: Callable[[str], None] | None = None
-        """Called when the pipeline is lost after it was ready; a start that fails raises instead."""
+        """Called with the reason if the pipeline ends after it was ready; if the start fails, `start` raises."""
 
     @property
     def pending(self) -> int:
@@ -73,46 +73,47 @@ class _Queue:
         """Wait until nothing is pending."""
         await self._idle.wait()
 
-    def _enqueue(self, done: Done) -> None:
+    def _add_pending(self, done: ReplyCallback) -> None:
         self._waiting.append(done)
         self._idle.clear()
 
-    def _answer(self, answer: Answer) -> None:
+    def _deliver_reply(self, reply: PipelineReply) -> None:
         done = self._waiting.popleft()
-        call_guarded("answer of the picture pipeline", done, answer)
+        call_guarded("result of the image pipeline", done, reply)
         if not self._waiting:
             self._idle.set()
 
-    def _ready(self, warm: Warm) -> None:
-        if not self._warm.done():
-            self._warm.set_result(warm)
+    def _start_succeeded(self, ready: PipelineReady) -> None:
+        if not self._started.done():
+            self._started.set_result(ready)
 
     def _start_failed(self, text: str) -> None:
-        if not self._warm.done():
-            self._warm.set_exception(EmulatorError(text))
+        if not self._started.done():
+            self._started.set_exception(EmulatorError(text))
 
-    def _lost(self, text: str) -> None:
-        """Fail all that is pending, and report the loss to whoever waits for the start, or else to `on_failure`."""
-        warm = self._warm
-        was_ready = warm.done() and not warm.cancelled() and warm.exception() is None
+    def _pipeline_ended(self, text: str) -> None:
+        """Fail all pending requests and report the end to the caller of `start`, or else to `on_failure`."""
+        started = self._started
+        was_ready = started.done() and not started.cancelled() and started.exception() is None
         self._start_failed(text)
         while self._waiting:
-            self._answer(Failure(text))
+            self._deliver_reply(Failure(text))
         if was_ready:
             log.error("%s", text)
             if self.on_failure is not None:
-                call_guarded("loss of the picture pipeline", self.on_failure, text)
+                call_guarded("end of the image pipeline", self.on_failure, text)
 
-    def _forget_start(self) -> None:
-        """Take note of a failed start that was reported already, so that it is not reported again at exit."""
-        if self._warm.done() and not self._warm.cancelled():
-            self._warm.exception()
+    def _mark_start_failure_retrieved(self) -> None:
+        """Keep asyncio from reporting a failed start again at exit."""
+        if self._started.done() and not self._started.cancelled():
+            self._started.exception()
 
 
-class ProcessImager(_Queue):
-    """A worker process of its own, reached over a socket pair.
+class ProcessImager(_RequestQueue):
+    """The pipeline in a separate worker process, connected by a socket pair.
 
-    The emulator's process needs no numerics then, and its answers on the bus do not wait for the interpreter's lock.
+    Keeps numerics out of the emulator's process, whose replies on the bus then never wait for the
+    interpreter lock.
     """
 
     def __init__(self, setup: PipelineSetup, worker: WorkerProcess) -> None:
@@ -125,74 +126,74 @@ class ProcessImager(_Queue):
 
     @property
     def pid(self) -> int:
-        """Process identifier of the worker."""
+        """Process ID of the worker."""
         return self._worker.process.pid
 
-    async def start(self) -> Warm:
+    async def start(self) -> PipelineReady:
         """Wait until the pipeline is ready.
 
         Raises
         ------
         EmulatorError
-            It cannot be: the worker's own one-line reason.
+            The start failed: the worker's one-line reason.
         """
-        self._warm = asyncio.get_running_loop().create_future()
+        self._started = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
-        self._writer.write(_packed(self._setup))
-        self._task = asyncio.create_task(self._read(reader))
-        return await self._warm
+        self._writer.write(_with_length(self._setup))
+        self._task = asyncio.create_task(self._read_messages(reader))
+        return await self._started
 
-    async def restart(self) -> Warm:
+    async def restart(self) -> PipelineReady:
         """Start another worker in place of one that has ended, and wait until it is ready.
 
         Raises
         ------
         EmulatorError
-            That one cannot be either.
+            The start failed.
         OSError
-            The system starts no process.
+            The process could not be created.
         """
         self._disconnect()
         await asyncio.get_running_loop().run_in_executor(None, self._worker.end)
         self._worker = WorkerProcess()
         return await self.start()
 
-    def submit(self, request: Asked, done: Done) -> None:
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Send a request to the worker."""
         if not self._worker.running or self._writer is None:
-            done(Failure("picture worker: not running"))
+            done(Failure("pipeline worker: not running"))
             return
-        data = _packed(request)
-        self._enqueue(done)
+        data = _with_length(request)
+        self._add_pending(done)
         self._writer.write(data)
 
     def _disconnect(self) -> None:
-        """Close the connection: what is asked for until another worker is reached is refused."""
+        """Close the connection; requests fail until another worker is connected."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
 
-    async def _read(self, reader: asyncio.StreamReader) -> None:
+    async def _read_messages(self, reader: asyncio.StreamReader) -> None:
         try:
             while True:
                 (length,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
-                message: Any = pickle.loads(await reader.readexactly(length))  # noqa: S301 (our own child process)
-                self._take(message)
+                message: Any = pickle.loads(await reader.readexactly(length))  # noqa: S301 (from our child process)
+                self._handle_message(message)
         except (asyncio.IncompleteReadError, ConnectionError):
-            text = "picture worker: ended by itself; see the last lines of stderr"
-        except Exception as error:  # noqa: BLE001 (no answer: nothing that follows can be trusted)
-            text = f"picture worker: its answer cannot be read: {one_line(error)}"
+            text = "pipeline worker: ended unexpectedly; see the last lines of stderr"
+        except Exception as error:  # noqa: BLE001 (nothing that follows in the stream can be trusted)
+            text = f"pipeline worker: its reply cannot be read: {one_line(error)}"
         if not self._closing:
             self._disconnect()
-            self._lost(text)
+            self._pipeline_ended(text)
 
-    def _take(self, message: Warm | Answer) -> None:
-        if isinstance(message, Warm):
-            self._ready(message)
-        elif isinstance(message, Failure) and not self._warm.done():
+    def _handle_message(self, message: PipelineReady | PipelineReply) -> None:
+        if isinstance(message, PipelineReady):
+            self._start_succeeded(message)
+        elif isinstance(message, Failure) and not self._started.done():
             self._start_failed(message.text)
         else:
-            self._answer(message)
+            self._deliver_reply(message)
 
     async def close(self) -> None:
         """End the worker and wait for it."""
@@ -201,78 +202,78 @@ class ProcessImager(_Queue):
         if self._task is not None:
             self._task.cancel()
         await asyncio.get_running_loop().run_in_executor(None, self._worker.end)
-        self._forget_start()
+        self._mark_start_failure_retrieved()
 
 
-class ThreadImager(_Queue):
-    """A worker thread: less memory than a process, but Python's lock is shared with the links."""
+class ThreadImager(_RequestQueue):
+    """The pipeline in a thread: less memory than a process, but it shares the interpreter lock with the links."""
 
     def __init__(self, setup: PipelineSetup) -> None:
         super().__init__()
         self._setup = setup
         self._loop = asyncio.get_running_loop()
-        self._requests: queue.SimpleQueue[Asked | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[PipelineRequest | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
-        """The thread; None before the start and after a loss."""
+        """None before the start and after an unexpected end."""
 
-    async def start(self) -> Warm:
+    async def start(self) -> PipelineReady:
         """Wait until the pipeline is ready.
 
         Raises
         ------
         EmulatorError
-            It cannot be; one line.
+            The start failed; one line.
         """
-        self._warm = self._loop.create_future()
+        self._started = self._loop.create_future()
         self._requests = queue.SimpleQueue()
         self._thread = threading.Thread(
-            target=self._work, args=(self._requests,), name="picture", daemon=True
+            target=self._run_thread, args=(self._requests,), name="pipeline", daemon=True
         )
         self._thread.start()
-        return await self._warm
+        return await self._started
 
-    async def restart(self) -> Warm:
+    async def restart(self) -> PipelineReady:
         """Start another thread in place of one that has ended, and wait until it is ready.
 
         Raises
         ------
         EmulatorError
-            That one cannot be either.
+            The start failed.
         """
         return await self.start()
 
-    def submit(self, request: Asked, done: Done) -> None:
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Hand a request to the thread."""
         if self._thread is None:
-            done(Failure("picture thread: not running"))
+            done(Failure("pipeline thread: not running"))
             return
-        self._enqueue(done)
+        self._add_pending(done)
         self._requests.put(request)
 
-    def _lost(self, text: str) -> None:
+    def _pipeline_ended(self, text: str) -> None:
         self._thread = None
-        super()._lost(text)
+        super()._pipeline_ended(text)
 
-    def _work(self, requests: queue.SimpleQueue[Asked | None]) -> None:
+    def _run_thread(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
         try:
             self._serve(requests)
-        except BaseException as error:  # noqa: BLE001 (whatever ends the thread, its requests are failed)
-            self._in_loop(self._lost, f"picture thread: ended: {one_line(error)}")
+        except BaseException as error:  # noqa: BLE001 (whatever ends the thread, its pending requests must fail)
+            self._in_loop(self._pipeline_ended, f"pipeline thread: ended: {one_line(error)}")
 
-    def _serve(self, requests: queue.SimpleQueue[Asked | None]) -> None:
-        from starhil.emulator.pipeline.pipeline import make_picture
+    def _serve(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
+        from starhil.emulator.pipeline.pipeline import make_pipeline
 
-        made = make_picture(self._setup)
+        made = make_pipeline(self._setup)
         if isinstance(made, Failure):
             self._in_loop(self._start_failed, made.text)
             return
-        picture, warm = made
-        self._in_loop(self._ready, warm)
+        pipeline, ready = made
+        self._in_loop(self._start_succeeded, ready)
         while (request := requests.get()) is not None:
-            self._in_loop(self._answer, picture.handle(request))
+            self._in_loop(self._deliver_reply, pipeline.handle(request))
 
     def _in_loop(self, callback: Callable[..., None], *args: object) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop may have ended while a frame was being made
+        with contextlib.suppress(RuntimeError):  # the loop may have closed while a frame was being rendered
             self._loop.call_soon_threadsafe(callback, *args)
 
     async def close(self) -> None:
@@ -280,9 +281,9 @@ class ThreadImager(_Queue):
         self._requests.put(None)
         if self._thread is not None:
             await self._loop.run_in_executor(None, self._thread.join, EXIT_GRACE_S)
-        self._forget_start()
+        self._mark_start_failure_retrieved()
 
 
-def _packed(message: object) -> bytes:
+def _with_length(message: object) -> bytes:
     data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
     return LENGTH.pack(len(data)) + data

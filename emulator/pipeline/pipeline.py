@@ -1,4 +1,4 @@
-"""The picture pipeline: renders what the sensor sees, detects stars, identifies them. All numerics of a run are here."""
+"""The image pipeline: renders what the sensor sees, detects stars and identifies them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
 from starhil.emulator.pipeline.binning import mean_over_squares
-from starhil.emulator.pipeline.frames import (
+from starhil.emulator.pipeline.messages import (
+    IDENTITY,
     ZERO,
     Failure,
     FrameRequest,
@@ -22,12 +23,12 @@ from starhil.emulator.pipeline.frames import (
     ImageRequest,
     ImageResult,
     MatchedStar,
+    PipelineReady,
     PipelineSetup,
     SolverSettings,
-    Warm,
 )
-from starhil.emulator.pipeline.identifiers import IdentifierChoice, Identifiers
-from starhil.emulator.pipeline.precompile import picture_was_compiled, start_helper
+from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
+from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame, Renderer
 from starhil.emulator.sky.objects import SkyObjects
@@ -40,10 +41,10 @@ from starid.interface import StarIdentifier
 from starid.solution import Reason, Solution
 
 STARS_SENT: Final = 16
-"""Identified stars that go back to the device, the brightest."""
+"""Number of identified stars returned to the device, the brightest."""
 
-BYTE_LEVELS: Final = 8
-"""Bits of an image for download."""
+DOWNLOAD_BITS: Final = 8
+"""Bits per pixel of an image for download."""
 
 REASONS: Final[dict[Reason, str]] = {
     Reason.OK: "ok",
@@ -54,29 +55,28 @@ REASONS: Final[dict[Reason, str]] = {
     Reason.PREDICTION_LOST: "prediction_lost",
     Reason.BAD_INPUT: "bad_input",
 }
-"""Reason of the identification → its name in telemetry."""
-
+"""Reason of the star identifier → its name in telemetry."""
 
 _WARM_UP_RATES_RAD_S: Final = ((1e-3, 0.0, 0.0), (0.03, 0.0, 0.0))
-"""Rates at which the stars of a default exposure are round, and at which they leave trails of some pixels."""
+"""Rates at which stars in a default exposure are round, and at which they leave trails of a few pixels."""
 
 
-def make_picture(setup: PipelineSetup) -> tuple[Picture, Warm] | Failure:
-    """Make the pipeline and solve a first frame with it, or say in one line why it cannot be."""
+def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Failure:
+    """Make a pipeline and warm it up; a failure holds the reason in one line."""
     begin = time.perf_counter()
     try:
-        picture = Picture(setup)
-        picture.warm_up()
+        pipeline = Pipeline(setup)
+        pipeline.warm_up()
     except (EmulatorError, StaridError) as error:
         return Failure(str(error))
-    except Exception as error:  # noqa: BLE001 (in one line, instead of a traceback of a process that is gone)
-        return Failure(f"picture pipeline: internal error: {one_line(error)}")
-    warm = Warm(picture.camera.to_dict(), len(picture.catalog), time.perf_counter() - begin)
-    return picture, warm
+    except Exception as error:  # noqa: BLE001 (reported in one line instead of the worker's traceback)
+        return Failure(f"pipeline: internal error: {one_line(error)}")
+    warm = PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), time.perf_counter() - begin)
+    return pipeline, warm
 
 
-class Picture:
-    """Renderer, detection and identifier of a run, with what they keep between frames."""
+class Pipeline:
+    """Renderer, detector and star identifier of a run, with the state they keep between frames."""
 
     def __init__(self, setup: PipelineSetup) -> None:
         self._setup = setup
@@ -84,14 +84,16 @@ class Picture:
         self.catalog = load_catalog(setup.catalog_path or None, setup.epoch)
         self._sensor = SensorModel().with_(**setup.sensor)
         self._renderer = Renderer(self.camera, self.catalog, self._sensor, setup.seed)
-        self._identifiers = Identifiers(lambda choice: choice.make(self.catalog), beside=setup.build_beside)
+        self._identifiers = StarIdentifiers(
+            lambda wanted: wanted.make(self.catalog), in_background=setup.build_in_background
+        )
         self._sky = SkyObjects.from_dict(setup.sky)
         self._last: Frame | None = None
 
     def warm_up(self) -> None:
-        """Make and solve frames of the default settings, lost in space and tracking, so that no kernel is cold.
+        """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
 
-        A kernel that is compiled in a run stops the frames for seconds, so the stars leave trails on some.
+        Compiling a kernel during a run would stop the frames for seconds, so some of these have star trails.
         """
         camera = self.camera
         k1, k2, p1, p2, _ = camera.distortion
@@ -104,11 +106,11 @@ class Picture:
             p1=p1,
             p2=p2,
         )
-        here = (0.0, 0.0, 0.0, 1.0)
-        helper = start_helper() if picture_was_compiled() else None
+        attitude = IDENTITY
+        helper = start_helper() if kernel_cache_was_cold() else None
         request = FrameRequest(
             index=0,
-            attitude_xyzw=here,
+            attitude_xyzw=attitude,
             rate_rad_s=ZERO,
             exposure_s=0.1,
             gain=self._sensor.gain,
@@ -118,23 +120,23 @@ class Picture:
             for rate in _WARM_UP_RATES_RAD_S:
                 frame = self._renderer.render(Attitude.identity(), rate)
                 detect(frame.image, detection_settings(self._sensor, settings))
-            helper.wait()  # what it has compiled is loaded below; what it could not is compiled there
-        for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, here)):
-            self._frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
+            helper.wait()  # kernels it compiled are loaded below; any others are compiled there
+        for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
+            self._process_frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
         self._last = None
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
-        """Do one request; what a setting makes impossible comes back as a failure."""
+        """Process one request; return a failure if the settings make it impossible."""
         try:
             if isinstance(request, ImageRequest):
-                return self._image(request)
-            return self._frame(request)
+                return self._scaled_image(request)
+            return self._process_frame(request)
         except (EmulatorError, StaridError) as error:
             return Failure(str(error))
         except Exception as error:  # noqa: BLE001 (one frame that fails must not end those after it)
-            return Failure(f"picture pipeline: internal error: {one_line(error)}")
+            return Failure(f"pipeline: internal error: {one_line(error)}")
 
-    def _frame(self, request: FrameRequest) -> FrameResult:
+    def _process_frame(self, request: FrameRequest) -> FrameResult:
         begin = time.perf_counter()
         sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
         if sensor.gain != self._renderer.sensor.gain:
@@ -150,10 +152,10 @@ class Picture:
             return FrameResult(request.index, solved=False, render_s=rendered - begin)
         found = detect(frame.image, detection_settings(sensor, request.settings))
         detected = time.perf_counter()
-        identifier, current = self._identifiers.get(self._choice(request.settings))
+        identifier, current = self._identifiers.get(self._identifier_setup(request.settings))
         solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
-        result = self._result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
         return result if current else replace(result, index_pending=True)
 
     def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
@@ -173,18 +175,18 @@ class Picture:
             return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
         return solution
 
-    def _choice(self, settings: SolverSettings) -> IdentifierChoice:
-        """What the identifier for the device's own idea of its camera is made for."""
+    def _identifier_setup(self, settings: SolverSettings) -> StarIdentifierSetup:
+        """Return the setup of the star identifier for these parameters and the calibrated camera."""
         setup = self._setup
         options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
-        if setup.algorithm != "geometric":  # these count the stars of a field, and so need their magnitudes
+        if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
-        camera = own_camera(self.camera, settings)
+        camera = calibrated_camera(self.camera, settings)
         margin = settings.error_margin / 100.0
-        return IdentifierChoice(setup.algorithm, camera, margin, tuple(sorted(options.items())))
+        return StarIdentifierSetup(setup.algorithm, camera, margin, tuple(sorted(options.items())))
 
-    def _result(
+    def _frame_result(
         self,
         request: FrameRequest,
         sensor: SensorModel,
@@ -234,7 +236,7 @@ class Picture:
             identify_s=solved - detected,
         )
 
-    def _image(self, request: ImageRequest) -> ImageResult:
+    def _scaled_image(self, request: ImageRequest) -> ImageResult:
         if self._last is None:
             return ImageResult(0, 0, -1, b"")
         image, bits, frame = self._last.image, self._sensor.bits, self._last.frame_index
@@ -247,15 +249,15 @@ class Picture:
 def _within_margin(
     identifier: StarIdentifier, solution: Solution, xy: NDArray[np.float64], settings: SolverSettings
 ) -> int:
-    """Count the matched stars that lie within the validation margin of their place."""
+    """Count the matched stars within the validation margin of their expected position."""
     icrs = identifier.catalog.vectors[solution.catalog_index]
-    places, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
-    off = np.hypot(*(places - xy[solution.detection_index]).T)
-    return int(np.count_nonzero(off <= settings.validation_margin))
+    expected_xy, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
+    offset_px = np.hypot(*(expected_xy - xy[solution.detection_index]).T)
+    return int(np.count_nonzero(offset_px <= settings.validation_margin))
 
 
 def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
-    """Detection as the device's parameters set it."""
+    """Return the detection settings for the device's parameters."""
     return sensor.detection_settings(
         threshold_sigma=settings.detection_threshold,
         pixel_sigma=settings.star_threshold,
@@ -264,8 +266,8 @@ def detection_settings(sensor: SensorModel, settings: SolverSettings) -> Detecti
     )
 
 
-def own_camera(optics: Camera, settings: SolverSettings) -> Camera:
-    """Return the camera as the device's parameters describe it; what they do not tell is that of the optics."""
+def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
+    """Return the camera as calibrated in the device's parameters; constants they lack come from the optics."""
     return Camera(
         optics.width,
         optics.height,
@@ -277,25 +279,25 @@ def own_camera(optics: Camera, settings: SolverSettings) -> Camera:
 
 
 def tracking_window(settings: SolverSettings) -> float:
-    """How far a star may be from its prediction, pixels: the margin, within the windows that are searched and read."""
+    """Largest distance of a star from its prediction, pixels: the margin, limited by search and read windows."""
     return float(min(settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0))
 
 
 def measured_magnitude(electrons: float, sensor: SensorModel) -> float:
-    """Magnitude of a star that gave so many electrons in the exposure."""
+    """Magnitude of a star from its electrons in one exposure."""
     return -2.5 * math.log10(max(electrons, 1.0) / (sensor.zero_magnitude_e_s * sensor.exposure_s))
 
 
 def eight_bits(image: NDArray[Any], bits: int) -> NDArray[np.uint8]:
-    """Return an image of `bits` bits with its eight highest."""
-    return (image >> max(0, bits - BYTE_LEVELS)).astype(np.uint8)
+    """Reduce an image of `bits` bits to its eight most significant."""
+    return (image >> max(0, bits - DOWNLOAD_BITS)).astype(np.uint8)
 
 
 def square_image(image: NDArray[Any], bits: int, edge: int) -> bytes:
-    """Return an image as a square of `edge` pixels of 8 bit, row by row.
+    """Scale an image to a square of `edge` pixels at 8 bits, row by row.
 
-    The frame stands at the top left of a black square of the next power of two, so that its pixel positions hold; a
-    smaller one is the mean over squares of pixels, a larger one is refused by the caller's choice of sizes.
+    The image is padded with black at the right and bottom to a square of the next power of two, which keeps
+    its pixel positions, and then averaged over squares of pixels. `edge` is one of `IMAGE_EDGES`.
     """
     height, width = image.shape
     full = 1 << (max(height, width) - 1).bit_length()

@@ -1,4 +1,4 @@
-"""The worker process: makes and solves frames for the emulator that started it, over an inherited socket."""
+"""The pipeline worker process: renders and solves frames for the emulator over an inherited socket."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ import sys
 from typing import Any, Final
 
 from starhil.emulator.parent_death_signal import end_with_parent
-from starhil.emulator.pipeline.frames import LENGTH, Failure
+from starhil.emulator.pipeline.messages import LENGTH, Failure
 
 NICE: Final = 5
-"""How much the worker stands back where processors are short: the links of the emulator come first."""
+"""Niceness of the worker: the emulator's links have priority on a busy machine."""
 
 
 def main() -> None:
-    """Take the setup, then requests, until the emulator closes the socket."""
-    end_with_parent()  # closing the socket ends it too, but not in the middle of a long compilation
+    """Receive the setup, then requests, until the emulator closes the socket."""
+    end_with_parent()  # a closed socket is not noticed during a long compilation
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
     link = socket.socket(fileno=int(sys.argv[1]))
-    from starhil.emulator.pipeline.pipeline import make_picture  # while the emulator itself still starts
+    from starhil.emulator.pipeline.pipeline import make_pipeline  # imported while the emulator starts
 
     setup = _receive(link)
     if setup is None:
         return
-    made = make_picture(setup)
+    made = make_pipeline(setup)
     if isinstance(made, Failure):
         _send(link, made)
         return
-    picture, warm = made
+    pipeline, warm = made
     _send(link, warm)
     while (request := _receive(link)) is not None:
-        _send(link, picture.handle(request))
+        _send(link, pipeline.handle(request))
 
 
 def _receive(link: socket.socket) -> Any:
-    """Return the next message, or None at the end."""
+    """Return the next message, or None once the socket is closed."""
     head = _read(link, LENGTH.size)
     if head is None:
         return None
@@ -48,17 +48,17 @@ def _receive(link: socket.socket) -> Any:
 
 
 def _read(link: socket.socket, size: int) -> bytes | None:
-    parts: list[bytes] = []
+    chunks: list[bytes] = []
     while size > 0:
         try:
-            part = link.recv(min(size, 1 << 20))
+            chunk = link.recv(min(size, 1 << 20))
         except ConnectionError:
             return None
-        if not part:
+        if not chunk:
             return None
-        parts.append(part)
-        size -= len(part)
-    return b"".join(parts)
+        chunks.append(chunk)
+        size -= len(chunk)
+    return b"".join(chunks)
 
 
 def _send(link: socket.socket, message: object) -> None:

@@ -1,4 +1,7 @@
-"""The picture worker's process as the emulator holds it: started before anything else is imported, so that both start at once."""
+"""Starts and ends the pipeline worker process.
+
+`starhil run` starts the worker before its own imports, so that both processes start up in parallel.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +14,21 @@ EXIT_GRACE_S: Final = 2.0
 
 
 class WorkerProcess:
-    """A started worker and the socket that leads to it."""
+    """A pipeline worker process and the socket connected to it."""
 
     def __init__(self) -> None:
-        self.socket, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "starhil.emulator.pipeline.worker", str(theirs.fileno())]
-        self.process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)  # noqa: S603
-        theirs.close()
+        self.socket, inherited = socket.socketpair()
+        command = [sys.executable, "-m", "starhil.emulator.pipeline.worker", str(inherited.fileno())]
+        self.process = subprocess.Popen(command, pass_fds=[inherited.fileno()], stdin=subprocess.DEVNULL)  # noqa: S603
+        inherited.close()
 
     @property
     def running(self) -> bool:
-        """Whether the process lives."""
+        """Whether the process is still running."""
         return self.process.poll() is None
 
     def end(self) -> None:
-        """Close the socket, on which the worker ends, and wait for it; one that does not is killed."""
+        """Close the socket, which ends the worker, and wait; kill it if it does not end."""
         self.socket.close()
         try:
             self.process.wait(EXIT_GRACE_S)
@@ -38,10 +41,10 @@ _ahead: Final[list[WorkerProcess]] = []
 
 
 def start_ahead() -> None:
-    """Start the worker of the run that this process is about to assemble, before anything else is imported."""
+    """Start a worker for the run that this process is about to set up."""
     _ahead.append(WorkerProcess())
 
 
 def take_worker() -> WorkerProcess:
-    """Return the worker that was started ahead, or a new one."""
+    """Return the worker started by `start_ahead`, or a new one."""
     return _ahead.pop() if _ahead else WorkerProcess()

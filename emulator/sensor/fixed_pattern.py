@@ -1,4 +1,4 @@
-"""The pixels' own differences, the same in every frame: dark current, sensitivity, hot and dead pixels."""
+"""Fixed-pattern noise: dark current and sensitivity of each pixel, hot and dead pixels."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _HOT_LOG_SPREAD: Final = 1.0
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """What makes one pixel differ from the next.
+    """Differences between pixels that are the same in every frame.
 
     Attributes
     ----------
     sensitivity : ndarray (h, w), float32
-        Signal relative to the mean pixel; 0 for a dead one.
+        Signal relative to the mean pixel; 0 for a dead pixel.
     dark_e_s : ndarray (h, w), float32
         Dark current, electrons/s.
     hot, dead : ndarray (n, 2), int
@@ -37,9 +37,9 @@ class FixedPattern:
 def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPattern:
     """Draw the fixed pattern of a pixel array from the sensor's `pattern_seed`.
 
-    Dark currents are gamma-distributed about the mean (never negative, with the long upper tail of silicon),
-    sensitivities normal; hot pixels are log-normal. No pixel is both hot and dead. The latest patterns are kept, as
-    most changes of a sensor (exposure, gain) leave them as they are.
+    Dark currents are gamma-distributed (never negative, with the long upper tail of silicon), sensitivities
+    normal, hot pixels log-normal. No pixel is both hot and dead. The last two patterns are cached, since
+    changes of exposure or gain do not affect them.
     """
     pixels = (sensor.hot_pixels, sensor.dead_pixels)
     spreads = (sensor.prnu, sensor.dsnu, sensor.dark_e_s, sensor.hot_e_s)
@@ -50,7 +50,7 @@ def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPat
 def _draw(
     seed: int, height: int, width: int, pixels: tuple[int, int], spreads: tuple[float, float, float, float]
 ) -> FixedPattern:
-    """Pattern for (hot, dead) pixels and (prnu, dsnu, dark current, that of hot pixels); arrays read-only."""
+    """Draw a read-only pattern from numbers of (hot, dead) pixels and (prnu, dsnu, dark_e_s, hot_e_s)."""
     hot_pixels, dead_pixels = pixels
     prnu, dsnu, dark_e_s, hot_e_s = spreads
     rng = np.random.default_rng((seed, height, width))

@@ -1,4 +1,4 @@
-"""The sensor: lens, pixels and converter, as numbers, and what a star of a given magnitude yields in it."""
+"""The parameters of lens, pixels and converter, and the signal of a star of a given magnitude."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starid.imaging.detection import DetectionSettings
 
 ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
 SOLAR_COLOUR_B_V: Final = 0.65
-"""B−V of a star whose V magnitude gives its electrons without a colour term."""
+"""B−V of a star for which the colour term is zero."""
 
 _BITS: Final = (8, 12, 16)
 
@@ -47,10 +47,10 @@ _RANGES: Final[dict[str, tuple[float, float, str]]] = {
 class SensorModel:
     """A star sensor's optics and detector; the defaults are of the CubeStar class.
 
-    A 12 mm f/1.2 lens of 14.6 mm focal length puts 42° on 937 pixels of 12 µm. A star of V = 0 and solar colour
-    sends 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8 photons/s/m²/nm (Bessell
-    1979), and a G2 star's photon spectrum keeps 0.92 of that on average over the 500 nm. With 0.75 of the light
-    through the lens and 0.45 caught on the band's average that is 1.8e6 electrons/s, 1 400 in 0.2 s for V = 6.
+    A 12 mm f/1.2 lens of 14.6 mm focal length images 42° onto 937 pixels of 12 µm. A star of V = 0 and solar
+    colour yields 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8 photons/s/m²/nm
+    (Bessell 1979), of which the photon spectrum of a G2 star averages 0.92 over the 500 nm. With a transmission of
+    0.75 and a quantum efficiency of 0.45 this gives 1.8e6 electrons/s, or 1 400 in 0.2 s for V = 6.
 
     Attributes
     ----------
@@ -59,27 +59,27 @@ class SensorModel:
     aperture_m : float
         Diameter of the entrance pupil, metres.
     transmission, quantum_efficiency : float
-        Shares of the photons that pass the lens and that free an electron, averages over the band.
+        Fractions of photons that pass the lens and that free an electron, averaged over the band.
     zero_point_photons_s_m2 : float
         Photons/s/m² in the band from a star of V = 0 and solar colour.
     colour_term : float
         The sensor's magnitude is V − colour_term·(B−V − 0.65); silicon sees red stars brighter (about 0.4).
     psf_sigma_px : float
-        Standard deviation of the Gaussian spot at the centre of the image, pixels. At 0.8 the spot is sampled well
-        enough for a fit without pixel-phase error, and nearly as small as can be.
+        Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot that
+        can be fitted without pixel-phase error.
     psf_growth : float
-        Share by which the spot is wider at the image's edge than at its centre: along x with the square of x,
+        Relative increase of the spot width from the image centre to the edge: along x with the square of x,
         along y with the square of y.
     gain : float
         Analog gain before the converter.
     bits : int
         8, 12 or 16.
     adc_range_e : float
-        Electrons that fill the converter's range at gain 1.
+        Full range of the converter at gain 1, electrons.
     offset_share : float
-        Black level as a share of the range.
+        Black level as a fraction of the range.
     full_well_e : float
-        Electrons that a pixel holds at most.
+        Full-well capacity, electrons.
     read_noise_e : float
         Electrons, standard deviation.
     dark_e_s : float
@@ -87,15 +87,15 @@ class SensorModel:
     sky_mag_arcsec2 : float
         Brightness of the empty sky (zodiacal light and unresolved stars), V magnitudes/arcsec².
     dsnu, prnu : float
-        Spread from pixel to pixel of the dark current and of the sensitivity, as shares of their means.
+        Standard deviation between pixels of the dark current and of the sensitivity, relative to their means.
     hot_pixels, dead_pixels : int
-        How many pixels have much too large a dark current, and no signal at all.
+        Number of pixels with excessive dark current, and without signal.
     hot_e_s : float
-        Median dark current of a hot pixel, electrons/s; they scatter by a factor 2.7 (log-normal).
+        Median dark current of hot pixels, electrons/s; log-normal with a factor of 2.7 per sigma.
     pattern_seed : int
-        Chooses the fixed pattern: which pixels are hot or dead, and the two spreads.
+        Seed of the fixed pattern.
     limiting_magnitude : float
-        Faintest stars that are drawn, V; fainter companions within two pixels of one are drawn with it.
+        V of the faintest rendered stars; fainter companions within two pixels of one are rendered too.
 
     Raises
     ------
@@ -140,7 +140,7 @@ class SensorModel:
                 raise EmulatorError(f"sensor {name}: {value!r} given, {low:g}…{high:g} needed ({unit})")
 
     def with_(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed; an unknown name is refused."""
+        """Return a copy with some fields changed; an unknown name is an error."""
         unknown = sorted(changes.keys() - {field.name for field in dataclasses.fields(self)})
         if unknown:
             raise EmulatorError(f"sensor {unknown[0]}: no such field of the sensor model")
@@ -153,12 +153,12 @@ class SensorModel:
         return self.zero_point_photons_s_m2 * area * self.transmission * self.quantum_efficiency
 
     def electrons(self, magnitude: float, exposure_s: float | None = None) -> float:
-        """Mean electrons from a star of a sensor magnitude in one exposure (the model's own unless given)."""
+        """Mean electrons from a star of a sensor magnitude in one exposure (default: `exposure_s` of the model)."""
         exposure = self.exposure_s if exposure_s is None else exposure_s
         return self.zero_magnitude_e_s * exposure * math.pow(10.0, -0.4 * magnitude)
 
     def sky_e_s(self, pixel_scale_rad: float) -> float:
-        """Electrons/s/pixel from the empty sky, for a pixel that sees `pixel_scale_rad` squared."""
+        """Electrons/s per pixel from the empty sky, for pixels of `pixel_scale_rad` on a side."""
         arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
         return self.zero_magnitude_e_s * arcsec2 * math.pow(10.0, -0.4 * self.sky_mag_arcsec2)
 
@@ -174,7 +174,7 @@ class SensorModel:
 
     @property
     def gain_e_per_dn(self) -> float:
-        """Electrons a count."""
+        """Electrons per count."""
         return self.adc_range_e / self.gain / self.max_dn
 
     @property
@@ -186,14 +186,14 @@ class SensorModel:
 
     @property
     def digitizer(self) -> Digitizer:
-        """What the noise kernel needs."""
+        """Parameters of the noise kernel."""
         return Digitizer(self.read_noise_e, self.full_well_e, self.gain_e_per_dn, self.offset_dn, self.max_dn)
 
     def detection_settings(self, **changes: Any) -> DetectionSettings:
-        """Detection settings that know this sensor's gain, saturation and, where it is the same everywhere, spot."""
-        known = DetectionSettings(
+        """Detection settings with this sensor's gain, saturation and, if uniform over the image, spot width."""
+        settings = DetectionSettings(
             psf_sigma_px=self.psf_sigma_px if self.psf_growth == 0.0 else None,
             gain_e_per_dn=self.gain_e_per_dn,
             saturation_dn=self.saturation_dn,
         )
-        return dataclasses.replace(known, **changes)
+        return dataclasses.replace(settings, **changes)

@@ -1,11 +1,10 @@
-"""Photon, dark and read noise, full well, gain and digitisation of a frame, in one pass over its pixels.
+"""Photon, dark and read noise, full well, gain and digitisation of an image, in one pass over its pixels.
 
-Random bits come from many xoshiro128++ generators side by side (Blackman & Vigna 2021), one a lane, so that the
-compiler turns the loops into vector instructions; normal deviates come from the Box–Muller transform with
-polynomials for the logarithm, sine and cosine. Where an electron count is large against its own discreteness, the
-sum of Poisson and read noise is drawn as a normal deviate with the right mean, variance and skewness
-(Cornish–Fisher); where it is not (few electrons and little read noise) or where the full well cuts it, pixel by
-pixel as a true Poisson number plus read noise.
+Random bits come from parallel xoshiro128++ generators (Blackman & Vigna 2021), one per lane, so that the compiler
+vectorises the loops. Normal deviates come from the Box–Muller transform with polynomials for the logarithm, sine
+and cosine. The sum of Poisson and read noise is drawn as a normal deviate with the right mean, variance and
+skewness (Cornish–Fisher), except where it would show: for few electrons with little read noise, and near the full
+well, each pixel is a true Poisson number plus read noise.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ import numpy.typing as npt
 from starid.jit import compiled_ieee
 
 LANES: Final = 512
-"""Random generators that run side by side; pixels are made in blocks of twice as many."""
+"""Number of parallel random generators; pixels are processed in blocks of twice this size."""
 
 BLOCK: Final = 2 * LANES
 FEW_ELECTRONS: Final = 100.0
-"""Below this mean a sensor that can tell single electrons apart gets true Poisson numbers."""
+"""Mean electrons below which a sensor with little noise gets true Poisson numbers."""
 
 QUIET_NOISE_E: Final = 3.0
-"""Read noise and rounding together, electrons, under which a sensor is said to tell single electrons apart."""
+"""Read and rounding noise, electrons, below which the discreteness of electrons matters."""
 
 _WELL_MARGIN_SIGMA: Final = 7.0
 _LN2: Final = np.float32(0.6931471805599453)
@@ -35,16 +34,16 @@ _LN2: Final = np.float32(0.6931471805599453)
 
 @dataclass(frozen=True)
 class Digitizer:
-    """From electrons to counts: what the noise kernel needs to know of a sensor.
+    """Parameters of a sensor's noise and converter, from electrons to counts.
 
     Attributes
     ----------
     read_noise_e : float
         Standard deviation of the read noise, electrons.
     full_well_e : float
-        Electrons a pixel holds at most.
+        Full-well capacity, electrons.
     gain_e_per_dn : float
-        Electrons a count.
+        Electrons per count.
     offset_dn : float
         Black level, counts.
     max_dn : int
@@ -59,7 +58,7 @@ class Digitizer:
 
 
 def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
-    """Start the generators of one frame.
+    """Return the initial states of the generators of one frame.
 
     Parameters
     ----------
@@ -76,7 +75,7 @@ def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
 
 @compiled_ieee
 def _next_bits(state: npt.NDArray[np.uint32], out: npt.NDArray[np.uint32]) -> None:
-    """One xoshiro128++ step of every lane."""
+    """Advance every lane by one xoshiro128++ step."""
     for lane in range(LANES):
         s0 = state[0, lane]
         s1 = state[1, lane]
@@ -174,7 +173,7 @@ def _digitize_kernel(
     levels: tuple[float, float, float, float, float, float, float],
     counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
 ) -> None:
-    """Turn mean electrons (n,) into counts (n,); `levels` as made in `digitize`."""
+    """Convert mean electrons (n,) to counts (n,); `levels` as in `digitize`."""
     read_noise, full_well, gain_e_per_dn, offset_dn, max_dn, few, near_full = levels
     read = np.float32(read_noise)
     read_variance = np.float32(read_noise * read_noise)
@@ -221,7 +220,7 @@ def _digitize_kernel(
 def digitize(
     expected_e: npt.NDArray[np.float32], digitizer: Digitizer, seed: int, frame_index: int
 ) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Make the counts of a frame from its mean electrons.
+    """Convert mean electrons to the counts of an image, with noise.
 
     Parameters
     ----------
@@ -230,7 +229,7 @@ def digitize(
     digitizer : Digitizer
         The pixel's noise and converter.
     seed, frame_index : int
-        Choose the noise; the same pair and input give the same bytes.
+        Determine the noise; the same pair and input give the same bytes.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Charge that energetic particles leave in the detector."""
+"""Streaks of energetic particles in the detector."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _STREAK_SPREAD: Final = 0.6
 def add_cosmic_rays(
     mean_e: npt.NDArray[np.float32], count: int, rng: np.random.Generator
 ) -> npt.NDArray[np.float64]:
-    """Add the charge of particles to a frame, in place.
+    """Add the charge of particles to an image, in place.
 
-    Each leaves a streak of exponentially distributed length (mean 8 px) in a random direction, some 900 electrons
-    a pixel with a log-normal spread along it.
+    Each leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with about 900
+    electrons per pixel, log-normally distributed along the streak.
 
     Returns
     -------
     ndarray (count, 4)
-        x, y of both ends, pixels.
+        x, y of both ends of each streak, pixels.
     """
     height, width = mean_e.shape
     ends = np.empty((count, 4))
@@ -34,9 +34,9 @@ def add_cosmic_rays(
         angle, length = rng.uniform(0.0, 2.0 * math.pi), rng.exponential(_STREAK_MEAN_PX)
         ends[k] = [*start, start[0] + length * math.cos(angle), start[1] + length * math.sin(angle)]
         steps = max(math.ceil(length / _STREAK_STEP_PX), 1)
-        parts = (np.arange(steps) + 0.5) / steps
-        columns = np.rint(ends[k, 0] + parts * (ends[k, 2] - ends[k, 0])).astype(np.int64)
-        rows = np.rint(ends[k, 1] + parts * (ends[k, 3] - ends[k, 1])).astype(np.int64)
+        fractions = (np.arange(steps) + 0.5) / steps
+        columns = np.rint(ends[k, 0] + fractions * (ends[k, 2] - ends[k, 0])).astype(np.int64)
+        rows = np.rint(ends[k, 1] + fractions * (ends[k, 3] - ends[k, 1])).astype(np.int64)
         charge = _STREAK_E_PER_PX * max(length, 1.0) / steps
         charges = (charge * np.exp(_STREAK_SPREAD * rng.standard_normal(steps))).astype(np.float32)
         inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)

@@ -1,4 +1,4 @@
-"""Star light on the pixels: a Gaussian spot integrated over each pixel and along the path it takes in an exposure."""
+"""Star light on the pixels: a Gaussian spot integrated over each pixel and along its path during an exposure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SQRT_HALF: Final = math.sqrt(0.5)
 
 @lru_cache(maxsize=64)
 def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Nodes on (−1, 1) and weights that sum to 1: Gauss–Legendre, or midpoints where there are very many."""
+    """Return nodes on (−1, 1) and weights that sum to 1: Gauss–Legendre, or midpoints for very many nodes."""
     if count > MOST_GAUSS_NODES:
         nodes = np.linspace(-1.0, 1.0, count, endpoint=False, dtype=np.float64) + 1.0 / count
         return nodes, np.full(count, 1.0 / count, dtype=np.float64)
@@ -32,7 +32,7 @@ def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 
 def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Moments of the exposure at which a moving spot is drawn so that their sum is the smooth trail.
+    """Return the quadrature rule by which a moving spot is summed to a smooth trail.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
     Returns
     -------
     nodes, weights : ndarray (n,)
-        Times from −1 (start of the exposure) to 1 (its end), and their weights, which sum to 1. A path of less
-        than a thousandth of the spot gets one node; else the nodes stand closer than a spot's sigma, at which
-        Gauss–Legendre quadrature of a Gaussian is exact to about 1e-5 of its peak.
+        Times from −1 (start of the exposure) to 1 (its end), and weights that sum to 1. A path below a thousandth
+        of the spot width gets one node. Otherwise nodes are closer than the spot's sigma, for which Gauss–Legendre
+        quadrature of a Gaussian is accurate to about 1e-5 of its peak.
     """
     lengths = longest_px / sigma_px
     if lengths < _STILL_SIGMA:
@@ -58,7 +58,7 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
 
 @compiled_ieee
 def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -> None:
-    """Shares of a Gaussian at 0 that fall in `count` unit cells, the first of which begins at `edge`."""
+    """Compute the fractions of a Gaussian at 0 in `count` unit cells, the first of which starts at `edge`."""
     scale = _SQRT_HALF / sigma
     before = math.erf(edge * scale)
     for k in range(count):

@@ -1,4 +1,4 @@
-"""Frames of the sky as the sensor sees them, with the truth of what is on them."""
+"""Renders exposures of the sky, with the truth of what they show."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from starid.catalog import StarCatalog, companions
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
-_MOST_RATE_RAD_S: Final = 20.0
+_MAX_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
 _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
@@ -32,14 +32,14 @@ _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
 @dataclass(frozen=True)
 class StarTruth:
-    """Catalogue stars on a frame, companions beyond the limiting magnitude among them, brightest first.
+    """Catalogue stars in an image, including companions beyond the limiting magnitude, brightest first.
 
     Attributes
     ----------
     hip : ndarray (n,), int32
         Hipparcos numbers.
     catalog_index : ndarray (n,), int64
-        Rows of the catalogue that the renderer was given.
+        Rows of the renderer's catalogue.
     xy_px : ndarray (n, 2)
         Position at mid-exposure, pixels.
     electrons : ndarray (n,)
@@ -60,18 +60,18 @@ class StarTruth:
 
 @dataclass(frozen=True)
 class ObjectTruth:
-    """What else is on a frame.
+    """Other objects in an image.
 
     Attributes
     ----------
     false_xy_px : ndarray (n, 2)
-        Places of the false stars, the fixed ones first.
+        Positions of the false stars, the fixed ones first.
     planet_xy_px : ndarray (m, 2)
-        Places of the planets, in the order given; NaN for those outside the image.
+        Positions of the planets in the order of `SkyObjects.planets`; NaN outside the image.
     cosmic_rays_px : ndarray (k, 4)
         x, y of both ends of each streak.
     covered_share : float
-        Share of the image on which less than half of the sky's light is seen.
+        Fraction of the image that receives less than half of the sky's light.
     """
 
     false_xy_px: npt.NDArray[np.float64]
@@ -89,9 +89,9 @@ class Frame:
     image : ndarray (h, w), uint8 or uint16
         Counts.
     stars : StarTruth
-        The catalogue stars on it.
+        Catalogue stars in the image.
     objects : ObjectTruth or None
-        What else is on it, where there is anything else.
+        Other objects in the image, if the sky has any.
     attitude : Attitude
         Attitude at mid-exposure.
     rate_rad_s : tuple of 3 floats
@@ -99,7 +99,7 @@ class Frame:
     exposure_s : float
         Length of the exposure, seconds.
     seed, frame_index : int
-        What chose the noise.
+        Seeds of the noise.
     """
 
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -113,23 +113,23 @@ class Frame:
 
 
 class Renderer:
-    """Makes frames for one camera, sky and sensor, and keeps what does not change between them.
+    """Renders exposures for one camera, catalogue and sensor, and caches what they share.
 
-    The image depends on the arguments and on (seed, frame_index) alone, not on the frames made before.
+    An image depends only on the arguments and on (seed, frame_index), not on earlier images.
 
     Parameters
     ----------
     camera : Camera
-        Where directions fall on the pixels.
+        Projection and image size.
     catalog : StarCatalog
-        The sky; stars fainter than the sensor's limiting magnitude are left out, but for the companions of brighter
-        ones that a sensor sees as one with them.
+        The stars. Those fainter than the sensor's limiting magnitude are omitted, except unresolved companions
+        of brighter stars.
     sensor : SensorModel
         Optics and detector.
     seed : int
-        Seed of a run, not negative.
+        Seed of the run, not negative.
     objects : SkyObjects, optional
-        What else there is in all frames that are not told otherwise.
+        Default sky objects of all exposures.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Renderer:
         return np.asarray(self.catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
 
     def with_sensor(self, sensor: SensorModel) -> Renderer:
-        """Renderer of the same sky, camera and seed for another sensor (this one if nothing changes)."""
+        """Return a renderer with another sensor; this one if the sensor is equal."""
         if sensor == self.sensor:
             return self
         return Renderer(self.camera, self.catalog, sensor, self.seed, self.objects)
@@ -180,7 +180,7 @@ class Renderer:
         exposure_s: float | None = None,
         objects: SkyObjects | None = None,
     ) -> Frame:
-        """Make one frame.
+        """Render one exposure.
 
         Parameters
         ----------
@@ -189,16 +189,16 @@ class Renderer:
         rate_rad_s : array (3,)
             Body rate, sensor frame, rad/s; constant over the exposure.
         frame_index : int
-            Number of the frame in the run; chooses the noise together with the seed.
+            Number of the frame in the run; determines the noise together with the seed.
         exposure_s : float, optional
-            Other exposure than the sensor's.
+            Exposure instead of the sensor's, seconds.
         objects : SkyObjects, optional
-            What else is there in this frame, instead of the renderer's own objects.
+            Sky objects instead of the renderer's default.
 
         Raises
         ------
         EmulatorError
-            A rate, exposure or index that is not a number or out of range.
+            A rate, exposure or index is not a number or out of range.
         """
         exposure = (
             self.sensor.exposure_s
@@ -242,11 +242,11 @@ class Renderer:
         path: npt.NDArray[np.float64],
         electrons: npt.NDArray[np.float64],
     ) -> ObjectTruth:
-        """Add all that is no star, and dim the stars (in place) that lie behind it."""
+        """Add sky objects to `mean`, and dim the stars behind them; both in place."""
         rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
         covered = 0.0
         area: AreaLight | None = None
-        if objects.any_light_or_cover:
+        if objects.has_extended_objects:
             area = self._painter.paint(objects, attitude)
             light = area.electrons_s + (area.transmission - np.float32(1.0)) * self._sky_e_s
             light *= self._pattern.sensitivity * np.float32(exposure_s)
@@ -268,17 +268,17 @@ class Renderer:
         exposure_s: float,
         area: AreaLight | None,
     ) -> npt.NDArray[np.float64]:
-        """Add points of light at fixed directions; return where (n, 2) they fall."""
-        places = np.full((len(planets), 2), np.nan)
+        """Add point sources at fixed directions; return their positions (n, 2)."""
+        xy = np.full((len(planets), 2), np.nan)
         if not planets:
-            return places
+            return xy
         vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
         path, inside, touching = self._path_of(vectors, attitude, rate, exposure_s)
-        places[inside] = path[inside, :2]
+        xy[inside] = path[inside, :2]
         electrons = np.array([self.sensor.electrons(planet.magnitude, exposure_s) for planet in planets])
         path, electrons = path[touching], electrons[touching]
         self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))
-        return places
+        return xy
 
     def _add_false_stars(
         self,
@@ -287,20 +287,20 @@ class Renderer:
         rng: np.random.Generator,
         exposure_s: float,
     ) -> npt.NDArray[np.float64]:
-        """Add points of light at random places of the image; return where (n, 2)."""
+        """Add false stars at random positions; return the positions (n, 2)."""
         fixed = np.random.default_rng((self.seed, _OBJECT_STREAM))
         size = np.array([self.camera.width, self.camera.height])
         low, high = objects.false_star_magnitudes
         numbers = ((objects.fixed_false_stars, fixed), (objects.false_stars, rng))
-        places = np.concatenate([source.uniform(-0.5, size - 0.5, (count, 2)) for count, source in numbers])
+        xy = np.concatenate([source.uniform(-0.5, size - 0.5, (count, 2)) for count, source in numbers])
         magnitudes = np.concatenate([source.uniform(low, high, count) for count, source in numbers])
-        path = np.zeros((len(places), 6))
-        path[:, :2] = places
+        path = np.zeros((len(xy), 6))
+        path[:, :2] = xy
         self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * 10.0 ** (-0.4 * magnitudes))
-        return places
+        return xy
 
     def trails(self, frame: Frame) -> npt.NDArray[np.float64]:
-        """Trails (n, 2) of a frame's stars during its exposure: from start to end along x and y, pixels."""
+        """Return the displacements (n, 2) of a frame's stars during its exposure, pixels."""
         icrs = self.catalog.vectors[frame.stars.catalog_index]
         half = 0.5 * frame.exposure_s * np.array(frame.rate_rad_s)
         start, _ = self.camera.project(frame.attitude.rotated(-half).to_sensor(icrs))
@@ -308,7 +308,7 @@ class Renderer:
         return end - start
 
     def _mean_without_stars(self, exposure_s: float) -> npt.NDArray[np.float32]:
-        """Mean electrons (h, w) of sky and dark current, in the buffer that a frame is built in."""
+        """Return the mean electrons (h, w) of sky and dark current, in a buffer that is reused."""
         if exposure_s != self._still_exposure_s:
             np.multiply(self._pattern.sensitivity, self._sky_e_s, out=self._still)
             self._still += self._pattern.dark_e_s
@@ -320,9 +320,9 @@ class Renderer:
     def _paths(
         self, attitude: Attitude, rate: npt.NDArray[np.float64], exposure_s: float
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-        """Paths (n, 6) of the stars whose light may reach the pixels, their numbers, and which centres are inside.
+        """Return paths (n, 6), numbers and centre-inside mask of the stars whose light may reach the image.
 
-        The path is the parabola through the projections at the start, middle and end of the exposure.
+        A path is the parabola through the projections at the start, middle and end of the exposure.
         """
         sweep = float(np.linalg.norm(rate)) * exposure_s
         cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
@@ -337,7 +337,7 @@ class Renderer:
         rate: npt.NDArray[np.float64],
         exposure_s: float,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        """Paths (n, 6) of directions (n, 3), which of them have their middle inside, and which touch the pixels."""
+        """Return paths (n, 6) of directions (n, 3), and masks of those centred inside and touching the image."""
         middle, inside = self.camera.project(attitude.to_sensor(icrs))
         path = np.zeros((len(icrs), 6))
         path[:, :2] = middle
@@ -360,7 +360,7 @@ class Renderer:
         path: npt.NDArray[np.float64],
         electrons: npt.NDArray[np.float64],
     ) -> None:
-        """Add stars to the mean electrons, each with the spot of its place in the field."""
+        """Add stars to the mean electrons, each with the spot width of its position."""
         base = self.sensor.psf_sigma_px
         half = 0.5 * np.array([self.camera.width, self.camera.height])
         off_axis = (path[:, :2] + 0.5 - half) / half
@@ -381,7 +381,7 @@ def render(
     frame_index: int = 0,
     objects: SkyObjects | None = None,
 ) -> Frame:
-    """Make a single frame; for several in a row keep a `Renderer`, whose caches this makes anew."""
+    """Render a single exposure; for a series use one `Renderer`, which caches what they share."""
     return Renderer(camera, catalog, sensor, seed, objects).render(attitude, rate_rad_s, frame_index)
 
 
@@ -395,8 +395,8 @@ def _whole_number(name: str, value: int) -> int:
 def _rate(value: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Check a body rate."""
     rate = np.asarray(value, dtype=np.float64)
-    if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MOST_RATE_RAD_S:
+    if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MAX_RATE_RAD_S:
         raise EmulatorError(
-            f"body rate: {value!r} given, three numbers of at most {_MOST_RATE_RAD_S} rad/s needed"
+            f"body rate: {value!r} given, three numbers of at most {_MAX_RATE_RAD_S} rad/s needed"
         )
     return rate

@@ -1,1 +1,1 @@
-"""The sky around the stars of the catalogue: Sun, Moon, Earth, planets, obstructions and false stars."""
+"""The sky besides the catalogue stars: Sun, Moon, Earth, planets, obstructions and false stars."""

@@ -25,21 +25,21 @@ _SUN_SOFT_DEG: Final = 3.0
 
 @dataclass(frozen=True)
 class AreaLight:
-    """Light of extended things, and how much of the sky they leave to see.
+    """Light of extended objects, and the fraction of the sky's light that passes them.
 
     Attributes
     ----------
     electrons_s : ndarray (h, w), float32
         Electrons/s in a pixel of mean sensitivity.
     transmission : ndarray (h, w), float32
-        Share of the sky behind that is seen, 0…1.
+        Fraction of the light from behind that is visible, 0…1.
     """
 
     electrons_s: Image
     transmission: Image
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Transmission (n,) at positions (n, 2), that of the nearest pixel."""
+        """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
         height, width = self.transmission.shape
         columns = np.clip(np.rint(xy_px[:, 0]), 0, width - 1).astype(np.int64)
         rows = np.clip(np.rint(xy_px[:, 1]), 0, height - 1).astype(np.int64)
@@ -74,12 +74,12 @@ def _add_glare(
 
 
 class AreaPainter:
-    """Paints the extended objects of a sky for one camera; keeps the directions of its pixels.
+    """Paints the extended objects of a sky for one camera; caches the directions of its pixels.
 
     Parameters
     ----------
     camera : Camera
-        Where the pixels look.
+        Directions of the pixels.
     zero_magnitude_e_s : float
         Electrons/s from a source of magnitude 0.
     psf_sigma_px : float
@@ -93,7 +93,7 @@ class AreaPainter:
 
     @cached_property
     def _directions(self) -> Image:
-        """Unit vectors (3, h, w) of the pixels, sensor frame; opposite to the boresight where a pixel sees nothing."""
+        """Unit vectors (3, h, w) of the pixels, sensor frame; −z for pixels without a direction."""
         camera = self._camera
         rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
         vectors = camera.back_project(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
@@ -101,33 +101,33 @@ class AreaPainter:
         return np.ascontiguousarray(vectors.T.reshape(3, camera.height, camera.width), dtype=np.float32)
 
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
-        """Light and transmission of all that is extended, at one attitude."""
+        """Return light and transmission of all extended objects at one attitude."""
         shape = (self._camera.height, self._camera.width)
         light = AreaLight(np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32))
         if objects.sun is not None:
-            self._sun(light, objects.sun, attitude)
+            self._paint_sun(light, objects.sun, attitude)
         if objects.moon is not None:
-            self._moon(light, objects.moon, attitude)
+            self._paint_moon(light, objects.moon, attitude)
         if objects.earth is not None:
-            self._earth(light, objects.earth, attitude)
+            self._paint_earth(light, objects.earth, attitude)
         for obstruction in objects.obstructions:
-            cover = self._cover(obstruction)
-            light.electrons_s[:] *= cover
-            light.transmission[:] *= cover
+            transmission = self._obstruction_transmission(obstruction)
+            light.electrons_s[:] *= transmission
+            light.transmission[:] *= transmission
         if objects.blank:
             light.electrons_s[:] = 0.0
             light.transmission[:] = 0.0
         return light
 
-    def _sun(self, light: AreaLight, sun: SunGlare, attitude: Attitude) -> None:
-        """Stray light of the Sun, falling with the cube of the angle."""
+    def _paint_sun(self, light: AreaLight, sun: SunGlare, attitude: Attitude) -> None:
+        """Add stray light of the Sun, which falls with the cube of the angle."""
         source = attitude.to_sensor(icrs_vector(sun.ra_deg, sun.dec_deg)).astype(np.float32)
         reference = 2.0 * math.sin(math.radians(_SUN_REFERENCE_DEG) / 2.0)
         soft = 2.0 * math.sin(math.radians(_SUN_SOFT_DEG) / 2.0)
         _add_glare(light.electrons_s, self._directions, source, sun.electrons_s * reference**3, soft**2, True)  # noqa: FBT003
 
-    def _moon(self, light: AreaLight, moon: Moon, attitude: Attitude) -> None:
-        """Glare over the field, and the disc with its terminator."""
+    def _paint_moon(self, light: AreaLight, moon: Moon, attitude: Attitude) -> None:
+        """Add the Moon's glare over the field, and its disc with the terminator."""
         import cv2
 
         centre = icrs_vector(moon.ra_deg, moon.dec_deg)
@@ -150,7 +150,7 @@ class AreaPainter:
         box = self._box(xy[0], reach)
         if box is None:
             return
-        # position on the disc in units of its radius, along its bright limb's direction and across
+        # position on the disc in units of its radius, towards the bright limb and across
         ra, dec, angle = (math.radians(value) for value in (moon.ra_deg, moon.dec_deg, moon.bright_limb_deg))
         north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
         east = np.array([-math.sin(ra), math.cos(ra), 0.0])
@@ -170,7 +170,7 @@ class AreaPainter:
         light.transmission[box] *= (1.0 - inside).astype(np.float32)
 
     def _box(self, xy: npt.NDArray[np.float64], reach: float) -> tuple[slice, slice] | None:
-        """Part of the image within `reach` pixels of a place; None if there is none."""
+        """Return the slices of the image within `reach` pixels of a position; None if outside."""
         if not np.all(np.isfinite(xy)):
             return None
         left, right = max(math.floor(xy[0] - reach), 0), min(math.ceil(xy[0] + reach) + 1, self._camera.width)
@@ -180,8 +180,8 @@ class AreaPainter:
         )
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
-    def _earth(self, light: AreaLight, earth: EarthLimb, attitude: Attitude) -> None:
-        """The Earth's face, fading over the atmosphere; nothing behind it is seen."""
+    def _paint_earth(self, light: AreaLight, earth: EarthLimb, attitude: Attitude) -> None:
+        """Add the Earth's disc, fading over the atmosphere; it hides everything behind it."""
         import cv2
 
         source = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg)).astype(np.float32)
@@ -195,8 +195,8 @@ class AreaPainter:
         light.electrons_s[:] = light.electrons_s * (1.0 - face) + blurred
         light.transmission[:] *= (1.0 - face).astype(np.float32)
 
-    def _cover(self, obstruction: Obstruction) -> Image:
-        """Transmission (h, w) of an obstruction."""
+    def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
+        """Return the transmission (h, w) of an obstruction."""
         import cv2
 
         height, width = self._camera.height, self._camera.width

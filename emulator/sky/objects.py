@@ -1,6 +1,6 @@
-"""What else a star sensor sees, or does not see: bodies, stray light, hidden parts of the field, false and missing stars.
+"""Sky objects besides the catalogue stars: bodies, stray light, obstructions, false and missing stars.
 
-All are plain values, so that profiles and tests can name them; how they look is in `starhil.emulator.sky.light`.
+All are plain values for profiles and tests; `starhil.emulator.sky.light` renders them.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any, Final, Self
 from starhil.emulator.errors import EmulatorError
 
 _ANGLE: Final = (-360.0, 360.0)
-_MOST_OBJECTS: Final = 100_000
+_MAX_OBJECTS: Final = 100_000
 
 
 @dataclass(frozen=True)
 class Moon:
-    """The Moon: a disc that saturates, and the light that it scatters in the lens.
+    """The Moon: a saturated disc, and its light scattered in the lens.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class Moon:
     magnitude : float
         V of the whole disc; −12.7 when full.
     illuminated : float
-        Share of the disc that is lit, 0…1.
+        Illuminated fraction of the disc, 0…1.
     bright_limb_deg : float
-        Position angle of the middle of the bright limb, from north through east.
+        Position angle of the midpoint of the bright limb, from north through east.
     glare_share : float
-        Share of its light that the lens scatters over the field, falling with the square of the angle.
+        Fraction of its light that the lens scatters over the field; falls with the square of the angle.
     """
 
     ra_deg: float
@@ -47,14 +47,14 @@ class Moon:
 
 @dataclass(frozen=True)
 class SunGlare:
-    """Stray light of the Sun, which itself stays outside the field, behind the baffle's edge.
+    """Stray light of the Sun, which itself is outside the field of view.
 
     Attributes
     ----------
     ra_deg, dec_deg : float
         Direction of the Sun, ICRS.
     electrons_s : float
-        Electrons/s/pixel where the Sun is 30° away; it falls with the cube of the angle.
+        Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle.
     """
 
     ra_deg: float
@@ -64,18 +64,18 @@ class SunGlare:
 
 @dataclass(frozen=True)
 class EarthLimb:
-    """The Earth's disc before part of the sky.
+    """The Earth's disc in front of part of the sky.
 
     Attributes
     ----------
     ra_deg, dec_deg : float
         Direction of the Earth's centre, ICRS.
     radius_deg : float
-        Angular radius of the Earth: 64° from 700 km above it.
+        Angular radius of the Earth; 64° at an altitude of 700 km.
     electrons_s : float
-        Electrons/s/pixel of its face: 0 over the night side, millions by day.
+        Electrons/s per pixel of the disc: 0 for the night side, millions for the day side.
     atmosphere_deg : float
-        Height over which the limb fades.
+        Angular height over which the limb fades.
     """
 
     ra_deg: float
@@ -87,16 +87,16 @@ class EarthLimb:
 
 @dataclass(frozen=True)
 class PointSource:
-    """A planet, satellite or other point of light that is in no star catalogue.
+    """A planet, satellite or other point source that is not in the star catalogue.
 
     Attributes
     ----------
     ra_deg, dec_deg : float
         Direction, ICRS.
     magnitude : float
-        V, as the sensor sees it.
+        V magnitude in the sensor's band.
     name : str
-        For the truth.
+        Name in the truth.
     """
 
     ra_deg: float
@@ -107,18 +107,18 @@ class PointSource:
 
 @dataclass(frozen=True)
 class Obstruction:
-    """A dark thing near the lens that covers part of the image: all beyond a straight edge, or inside a polygon.
+    """A dark object near the lens that covers the image beyond a straight edge or inside a polygon.
 
     Attributes
     ----------
     share : float
-        Share of the image that lies beyond the edge, 0…1; not used with a polygon.
+        Fraction of the image beyond the edge, 0…1; not used with a polygon.
     angle_deg : float
-        Direction in which the edge is left, 0 to the right, 90 down.
+        Direction from the image to the covered side, 0 to the right, 90 down.
     polygon_px : tuple of (x, y)
-        Corners, pixels; empty for the edge.
+        Corners, pixels; empty for an edge.
     softness_px : float
-        Width over which it fades, as it is out of focus.
+        Blur of the out-of-focus outline, pixels.
     """
 
     share: float = 0.5
@@ -142,38 +142,38 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     "angle_deg": _ANGLE,
     "polygon_px": (-1e5, 1e5),
     "softness_px": (0.0, 1000.0),
-    "false_stars": (0, _MOST_OBJECTS),
-    "fixed_false_stars": (0, _MOST_OBJECTS),
+    "false_stars": (0, _MAX_OBJECTS),
+    "fixed_false_stars": (0, _MAX_OBJECTS),
     "false_star_magnitudes": (-5.0, 20.0),
-    "missing_stars": (0, _MOST_OBJECTS),
+    "missing_stars": (0, _MAX_OBJECTS),
     "cosmic_rays_s": (0.0, 1e6),
 }
 
 
 @dataclass(frozen=True)
 class SkyObjects:
-    """All that is in the field or before it besides the stars.
+    """Everything that changes an image besides the catalogue stars.
 
     Attributes
     ----------
     moon, sun, earth : optional
-        The bodies, where there are.
+        The bodies, if present.
     planets : tuple of PointSource
-        Points of light at fixed directions.
+        Point sources at fixed directions.
     obstructions : tuple of Obstruction
-        What covers parts of the image.
+        Objects that cover parts of the image.
     false_stars : int
-        Points of light at random places, others in every frame.
+        Number of false stars at random positions that change with every frame.
     fixed_false_stars : int
-        Points of light at random places of the image, the same in all frames of a run.
+        Number of false stars at random positions that stay the same during a run.
     false_star_magnitudes : (float, float)
-        Their magnitudes are uniform between these.
+        Range of the magnitudes of false stars, brighter first; uniformly distributed.
     missing_stars : int
-        That many of the brightest catalogue stars of the field are not drawn.
+        Number of catalogue stars left out, the brightest of the field.
     cosmic_rays_s : float
-        Mean number of particles that cross the detector in a second, each leaving a streak.
+        Mean number of particles per second that hit the detector, each leaving a streak.
     blank : bool
-        No light at all reaches the detector.
+        True if no light reaches the detector.
 
     Raises
     ------
@@ -196,56 +196,54 @@ class SkyObjects:
     def __post_init__(self) -> None:
         for body in (self.moon, self.sun, self.earth, *self.planets, *self.obstructions):
             if body is not None:
-                _check(type(body).__name__, body)
-        _check("SkyObjects", self)
+                _check_fields(type(body).__name__, body)
+        _check_fields("SkyObjects", self)
         low, high = self.false_star_magnitudes
         if low > high:
             raise EmulatorError(
-                f"sky false_star_magnitudes: {low} to {high} given, the brighter one comes first"
+                f"sky false_star_magnitudes: {low} to {high} given; put the brighter one first"
             )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Sky objects from plain values, as TOML and JSON hold them.
+        """Make sky objects from the plain values of TOML or JSON.
 
-        Keys are those of this class; bodies are tables with the keys of theirs, lists of tables for `planets` and
-        `obstructions`. `blocked_share` stands for one obstruction with a straight edge.
+        The keys are the fields of this class. Bodies are tables of their fields; `planets` and `obstructions`
+        are lists of tables. `blocked_share` adds an obstruction with a straight edge.
         """
-        given = dict(values)
-        share = given.pop("blocked_share", None)
+        fields = dict(values)
+        share = fields.pop("blocked_share", None)
         for name, kind in (("moon", Moon), ("sun", SunGlare), ("earth", EarthLimb)):
-            if given.get(name) is not None:
-                given[name] = _body(name, kind, given[name])
+            if fields.get(name) is not None:
+                fields[name] = _from_table(name, kind, fields[name])
         for name, element in (("planets", PointSource), ("obstructions", Obstruction)):
-            rows = given.get(name, ())
+            rows = fields.get(name, ())
             if not isinstance(rows, (list, tuple)):
                 raise EmulatorError(f"sky {name}: a list of tables is needed")
-            given[name] = tuple(_body(name, element, row) for row in rows)
+            fields[name] = tuple(_from_table(name, element, row) for row in rows)
         if share is not None and share != 0:
-            given["obstructions"] = (
-                *given["obstructions"],
-                _body("blocked_share", Obstruction, {"share": share}),
-            )
-        if "false_star_magnitudes" in given:
-            given["false_star_magnitudes"] = _pair("false_star_magnitudes", given["false_star_magnitudes"])
-        made: Self = _body("", cls, given)
-        return made
+            edge = _from_table("blocked_share", Obstruction, {"share": share})
+            fields["obstructions"] = (*fields["obstructions"], edge)
+        if "false_star_magnitudes" in fields:
+            fields["false_star_magnitudes"] = _pair("false_star_magnitudes", fields["false_star_magnitudes"])
+        objects: Self = _from_table("", cls, fields)
+        return objects
 
     @property
-    def any_light_or_cover(self) -> bool:
-        """Whether something changes the sky's light over areas."""
+    def has_extended_objects(self) -> bool:
+        """Whether anything lights or covers an area of the image."""
         return bool(self.moon or self.sun or self.earth or self.obstructions or self.blank)
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
-    """Two numbers."""
+    """Return a list of two numbers as a tuple."""
     if not isinstance(value, (list, tuple)) or len(value) != 2:
         raise EmulatorError(f"sky {name}: {value!r} given, two numbers needed")
     return (value[0], value[1])
 
 
-def _body(name: str, kind: Any, values: Any) -> Any:
-    """Make one of the classes above from a table, or pass one that is made."""
+def _from_table(name: str, kind: Any, values: Any) -> Any:
+    """Make an object of class `kind` from a table; an instance is returned unchanged."""
     where = f"sky {name}".strip()
     if isinstance(values, kind):
         return values
@@ -254,30 +252,30 @@ def _body(name: str, kind: Any, values: Any) -> Any:
     fields = {field.name: field for field in dataclasses.fields(kind)}
     unknown = sorted(values.keys() - fields.keys())
     if unknown:
-        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(sorted(fields))}")
+        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}; known: {', '.join(sorted(fields))}")
     required = {key for key, field in fields.items() if field.default is dataclasses.MISSING}
     missing = sorted(required - values.keys())
     if missing:
         raise EmulatorError(f"{where}: key {missing[0]!r} is missing")
-    chosen = dict(values)
-    if "polygon_px" in chosen:
-        if not isinstance(chosen["polygon_px"], (list, tuple)):
-            raise EmulatorError(f"{where}: polygon_px is a list of corners [x, y]")
-        chosen["polygon_px"] = tuple(_pair("polygon_px", corner) for corner in chosen["polygon_px"])
-    return kind(**chosen)
+    arguments = dict(values)
+    if "polygon_px" in arguments:
+        if not isinstance(arguments["polygon_px"], (list, tuple)):
+            raise EmulatorError(f"{where}: polygon_px must be a list of corners [x, y]")
+        arguments["polygon_px"] = tuple(_pair("polygon_px", corner) for corner in arguments["polygon_px"])
+    return kind(**arguments)
 
 
-def _flat(value: Any) -> Iterator[Any]:
-    """Each value of a tuple, of the tuples in it, or the value itself."""
+def _flatten(value: Any) -> Iterator[Any]:
+    """Yield a value, or all values in nested tuples."""
     if isinstance(value, tuple):
         for element in value:
-            yield from _flat(element)
+            yield from _flatten(element)
     else:
         yield value
 
 
-def _check(where: str, body: Any) -> None:
-    """Check the values of one of the classes above."""
+def _check_fields(where: str, body: Any) -> None:
+    """Check types and ranges of an object's fields."""
     for field in dataclasses.fields(body):
         value = getattr(body, field.name)
         if type(field.default) is bool and not isinstance(value, bool):
@@ -288,7 +286,7 @@ def _check(where: str, body: Any) -> None:
             continue
         low, high = _RANGES[field.name]
         whole = isinstance(low, int)
-        for number in _flat(value):
+        for number in _flatten(value):
             good = isinstance(number, int if whole else (int, float)) and not isinstance(number, bool)
             if not good or not low <= number <= high:
                 kind = "a whole number" if whole else "a number"

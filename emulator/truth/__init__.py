@@ -1,1 +1,1 @@
-"""Where the sensor looks: the truth of a run, from a formula, a file or a live feed."""
+"""The true attitude of the sensor during a run: computed, from a file or from a live feed."""

@@ -1,4 +1,4 @@
-"""Truth sources as a profile or the control channel write them, and how they become sources."""
+"""Configuration of truth sources in a profile, a scenario or on the control channel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from starid.attitude import Attitude
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
-"""Body rate in the sensor frame, degrees a second."""
+"""Body rate in the sensor frame, degrees per second."""
 
 Turn: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
 """Right ascension or roll, degrees."""
@@ -35,7 +35,7 @@ SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 class Strict(BaseModel):
-    """A part of a profile: unknown keys, numbers in quotes and not-finite numbers are refused."""
+    """Base of configuration models: rejects unknown keys, numbers in quotes and non-finite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -89,7 +89,7 @@ class FixedConfig(Strict):
 
 
 class RateConfig(Strict):
-    """A turn at a constant body rate from an attitude."""
+    """A rotation at a constant body rate, starting from an attitude."""
 
     kind: Literal["rate"]
     """Which truth source this is."""
@@ -99,12 +99,12 @@ class RateConfig(Strict):
     """Body rate about x, y and z of the sensor frame."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
-        """Make the source; the turn begins now."""
+        """Make the source; the rotation begins now."""
         return RateTruth(self.attitude.build(), np.radians(self.rate_deg_s), start_s=now_s)
 
 
 class HoldConfig(Strict):
-    """Rest for a time."""
+    """Hold the attitude for a time."""
 
     do: Literal["hold"]
     """Which segment this is."""
@@ -117,7 +117,7 @@ class HoldConfig(Strict):
 
 
 class TurnConfig(Strict):
-    """Turn at a constant body rate for a time."""
+    """Rotate at a constant body rate for a time."""
 
     do: Literal["rate"]
     """Which segment this is."""
@@ -132,7 +132,7 @@ class TurnConfig(Strict):
 
 
 class SlewToConfig(Strict):
-    """Turn about one axis to an attitude, starting and ending at rest."""
+    """Slew about one axis to an attitude, from rest to rest."""
 
     do: Literal["slew"]
     """Which segment this is."""
@@ -159,7 +159,7 @@ SegmentConfig: TypeAlias = Annotated[HoldConfig | TurnConfig | SlewToConfig, Fie
 
 
 class SlewConfig(Strict):
-    """A profile of rests, turns and slews."""
+    """A sequence of holds, constant rates and slews."""
 
     kind: Literal["slew"]
     """Which truth source this is."""
@@ -177,14 +177,14 @@ class SlewConfig(Strict):
 
 
 class FileConfig(Strict):
-    """A table of times and attitudes; a relative path counts from the profile's folder."""
+    """A table of times and attitudes; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
     """Which truth source this is."""
     path: str
     """CSV file of times and attitudes."""
     start: Literal["run", "now"] = "run"
-    """What the file's time zero is: the start of the run, or the moment the source is taken into use."""
+    """Time zero of the file: the start of the run, or the time at which the source is set."""
     repeat: bool = False
     """Begin again after the last row."""
 
@@ -195,7 +195,7 @@ class FileConfig(Strict):
 
 
 class LiveConfig(Strict):
-    """A feed of JSON lines, the message of `starhil.emulator.truth.live`."""
+    """A feed of JSON lines in the format of `starhil.emulator.truth.live`."""
 
     kind: Literal["live"]
     """Which truth source this is."""
@@ -210,10 +210,10 @@ class LiveConfig(Strict):
     timeline: Literal["anchor", "run"] = "anchor"
     """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds of simulation time."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """Attitude until the first message comes."""
+    """Attitude before the first message."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
-        """Make the source; its socket is opened by whoever runs it."""
+        """Make the source; the emulation opens its socket."""
         return LiveTruth(self.attitude.build(), stale_s=self.stale_s, timeline=self.timeline)
 
 

@@ -1,16 +1,16 @@
-"""Truth from a file: a table of times and attitudes, interpolated on the shortest turn.
+"""Truth from a file: a table of times and attitudes, interpolated along the shortest rotation.
 
 The file is CSV with one header line. Columns, in any order:
 
-- ``t``: seconds of run time, rising from row to row;
+- ``t``: simulation time in seconds, increasing from row to row;
 - either ``qx, qy, qz, qw`` (quaternion ICRS→sensor, scalar last) or ``ra_deg, dec_deg, roll_deg``;
-- if known, ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them the rate between two rows is
-  the constant one that leads from the first to the second.
+- optional ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them the rate between
+  two rows is the constant rate that leads from one to the next.
 
-A truth log (`starhil run --truth-log`) is such a file too: its ``run_time_s``, ``true_qx`` … ``true_qw`` and ``true_wx_deg_s`` …
-stand for the columns above and its other columns are passed over, so that a run can be replayed.
+A truth log (`starhil run --truth-log`) is accepted too, so that a run can be replayed: its columns
+``run_time_s``, ``true_qx`` … ``true_qw`` and ``true_wx_deg_s`` … are used, the others ignored.
 
-Empty lines and lines that begin with ``#`` are passed over.
+Empty lines and lines that begin with ``#`` are ignored.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ LOG_COLUMNS: Final = {
     "run_time_s": "t",
     **{f"true_{name}": name for name in (*QUATERNION_COLUMNS, *RATE_COLUMNS)},
 }
-"""Columns of a truth log → what they are here."""
+"""Column of a truth log → column of a truth file."""
 
 NORM_TOLERANCE: Final = 0.01
-"""A quaternion whose length is off by more than this is taken for a mistake, not for rounding."""
+"""Largest error of a quaternion's length that is attributed to rounding."""
 
 MAX_BYTES: Final = 500 * MEGABYTE
-"""Largest truth file that is read: a day at 50 rows a second."""
+"""Largest truth file that is read: a day at 50 rows per second."""
 
 BOUNDS: Final = {
     "t": 1e9,
@@ -52,24 +52,24 @@ BOUNDS: Final = {
     "roll_deg": 1e6,
     **dict.fromkeys(RATE_COLUMNS, MAX_RATE_DEG_S),
 }
-"""Largest absolute value in each column; right ascension and roll may count whole turns."""
+"""Largest absolute value in each column; right ascension and roll may exceed a full turn."""
 
 
 class FileTruth:
-    """Rows of attitudes, interpolated in time; at rest before the first and after the last.
+    """Attitudes interpolated in time; at rest before the first row and after the last.
 
     Parameters
     ----------
     times_s
-        Run time (n,) of each row, seconds, rising.
+        Times (n,) of the rows, seconds, increasing.
     attitudes
         Attitude of each row.
     rates_rad_s
-        Body rates (n, 3), radians a second, sensor frame; None to take them from the rows' differences.
+        Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows.
     start_s
-        Run time that the file's zero stands for.
+        Simulation time of the file's time zero.
     repeat
-        Begin anew after the last row.
+        Restart after the last row.
     """
 
     kind: Final = "file"
@@ -92,7 +92,7 @@ class FileTruth:
         self.repeat = repeat
 
     def state(self, t_s: float) -> TruthState:
-        """Truth at a run time in seconds."""
+        """Return the truth at a simulation time in seconds."""
         first, last = float(self.times_s[0]), float(self.times_s[-1])
         t = t_s - self.start_s
         if self.repeat and t > last > first:
@@ -104,7 +104,7 @@ class FileTruth:
         upper = int(np.searchsorted(self.times_s, t, side="right"))
         if upper == len(self.attitudes):
             if upper == 1:
-                return TruthState(self.attitudes[0], self._given(0, ZERO_RATE))
+                return TruthState(self.attitudes[0], self._rate_of_row(0, ZERO_RATE))
             upper -= 1
         low = upper - 1
         span = float(self.times_s[upper] - self.times_s[low])
@@ -116,19 +116,20 @@ class FileTruth:
             rate = (1.0 - fraction) * self.rates_rad_s[low] + fraction * self.rates_rad_s[upper]
         return TruthState(interpolate(before, after, fraction), rate)
 
-    def _given(self, row: int, otherwise: Vector) -> Vector:
-        return otherwise if self.rates_rad_s is None else self.rates_rad_s[row]
+    def _rate_of_row(self, row: int, default: Vector) -> Vector:
+        return default if self.rates_rad_s is None else self.rates_rad_s[row]
 
 
 def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -> FileTruth:
-    """Read a truth file; the first bad row is named by its line.
+    """Read a truth file.
 
-    No message quotes the file: whoever may name one on the control channel need not be allowed to read it.
+    Messages never quote the file: a client of the control channel may name files it is not allowed to read.
 
     Raises
     ------
     EmulatorError
-        The file is missing, has not the columns of this module's head, or a row is not numbers, not a rotation, or not later than the row before.
+        The file cannot be read, lacks columns, or a row is not numeric, not a rotation, or not later than
+        the row before; the message names the line.
     """
     try:
         text = read_text(path, MAX_BYTES)
@@ -152,7 +153,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     rates: list[list[float]] = []
     for number, line in lines[1:]:
         where = f"truth file {path} line {number}"
-        row = _row(where, columns, line)
+        row = _parse_row(where, columns, line)
         if times and row["t"] <= times[-1]:
             raise EmulatorError(f"{where}: t is not later than in the row before")
         times.append(row["t"])
@@ -163,7 +164,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
             rate = np.degrees(rate_between(attitudes[-2], attitudes[-1], times[-1] - times[-2]))
             if np.abs(rate).max() > MAX_RATE_DEG_S:
                 raise EmulatorError(
-                    f"{where}: the turn from the row before is faster than {MAX_RATE_DEG_S:g} degrees a second; "
+                    f"{where}: the turn from the row before is faster than {MAX_RATE_DEG_S:g} degrees per second; "
                     f"give {', '.join(RATE_COLUMNS)} if the attitude jumps"
                 )
     if not times:
@@ -187,7 +188,7 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
         raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(known))}")
     twice = [name for name in columns if name and columns.count(name) > 1]
     if twice:
-        raise EmulatorError(f"{where}: column {twice[0]} stands there twice; leave one out")
+        raise EmulatorError(f"{where}: column {twice[0]} appears twice; leave one out")
     missing = [name for name in RATE_COLUMNS if name not in columns]
     if 0 < len(missing) < len(RATE_COLUMNS):
         raise EmulatorError(
@@ -204,7 +205,7 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     raise EmulatorError(f"{where}: columns t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg needed")
 
 
-def _row(where: str, columns: list[str], line: str) -> dict[str, float]:
+def _parse_row(where: str, columns: list[str], line: str) -> dict[str, float]:
     cells = _cells(where, line)
     if len(cells) != len(columns):
         raise EmulatorError(f"{where}: {len(cells)} values for {len(columns)} columns")

@@ -1,25 +1,29 @@
 """Truth from a live feed: a dynamics simulator sends attitudes as JSON lines over UDP or TCP.
 
-One message a line (TCP) or one or more lines a datagram (UDP)::
+One message per line (TCP), or one or more lines per datagram (UDP)::
 
     {"t": 12.25, "q": [0.0, 0.0, 0.0, 1.0], "rate": [0.0, 0.3, 0.0]}
 
 ``t``
-    Seconds on the sender's own time line, rising. May be left out: then the time of receipt counts.
+    Seconds on the sender's clock, increasing. Optional; default: time of receipt.
 ``q``
     Quaternion ICRS→sensor, scalar last (x, y, z, w), of length 1 within 1 %.
 ``rate``
-    Body rate in the sensor frame, degrees a second, at most `MAX_RATE_DEG_S` an axis. May be left out: then it is taken from the
-    last two messages, without ``t`` from messages at least `RECEIPT_BASELINE_S` apart. One that contradicts the attitudes makes
-    a bad message (`starhil.emulator.truth.feed_rates`).
+    Body rate in the sensor frame, degrees per second, at most `MAX_RATE_DEG_S` per axis. Optional;
+    default: derived from the last two messages, or without ``t`` from messages at least
+    `RECEIPT_BASELINE_S` apart. A rate that contradicts the attitudes makes a bad message
+    (`starhil.emulator.truth.feed_rates`).
 
-The sender's clock is tied to run time by its first message, what came first is taken to hold at its receipt, and followed where
-it slips (`starhil.emulator.truth.sender_clock`); rates are those of run time. With ``timeline = "run"`` in the profile, ``t`` is run time
-as it stands. Between two messages the attitude is interpolated, after the last one it is carried on at the last rate, for at
-most ``stale_s``; when the feed has been silent for that long the attitude stands still and is flagged ``stale``. On
-``timeline = "run"`` it is so too when the last ``t`` is older than that. A bad message is counted, logged (the 1st, 10th, 100th …),
-the last one's fault is kept, and nothing else happens. A ``t`` that does not rise is a bad message, except that a jump back by
-more than `RESTART_S` begins a new time line.
+The first message sets the offset between the sender's clock and simulation time; drift is tracked
+(`starhil.emulator.truth.sender_clock`) and rates are scaled accordingly. With ``timeline = "run"`` in the
+profile, ``t`` is simulation time.
+
+Between two messages the attitude is interpolated. After the last one it is propagated at the last rate for
+at most ``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the
+last ``t`` is older than that.
+
+A bad message is counted, logged (the 1st, 10th, 100th …) and otherwise ignored. A ``t`` that does not
+increase makes a bad message, except that a jump back by more than `RESTART_S` starts a new timeline.
 """
 
 from __future__ import annotations
@@ -45,19 +49,19 @@ from starid.attitude import Attitude, interpolate, propagate
 log = logging.getLogger("starhil.truth")
 
 HISTORY: Final = 512
-"""Messages kept for exposures whose middle has passed already."""
+"""Number of messages kept, for exposures whose midpoint has already passed."""
 
 RESTART_S: Final = 1.0
-"""A sender's time that falls back by more than this begins a new time line, seconds."""
+"""A sender's time that jumps back by more than this starts a new timeline, seconds."""
 
 NORM_TOLERANCE: Final = 0.01
 MAX_LINE: Final = 4096
-"""A line longer than this is refused, bytes."""
+"""Longest accepted line, bytes."""
 
 
 @dataclass(frozen=True)
 class FeedMessage:
-    """One decoded message: the sender's time (or None), attitude and rate (radians a second, or None)."""
+    """A decoded message: the sender's time (or None), attitude and rate (rad/s, or None)."""
 
     t: float | None
     attitude: Attitude
@@ -70,7 +74,7 @@ def parse_message(line: bytes | str) -> FeedMessage:
     Raises
     ------
     FeedError
-        The line is not the documented message; the text names the key.
+        The line is not a valid message; the text names the key.
     """
     try:
         message: Any = parse_json(line)
@@ -90,7 +94,7 @@ def parse_message(line: bytes | str) -> FeedMessage:
         raise FeedError("q is not of length 1")
     rate = _numbers("rate", message["rate"], 3) if message.get("rate") is not None else None
     if rate is not None and np.abs(rate).max() > MAX_RATE_DEG_S:
-        raise FeedError(f"rate is beyond {MAX_RATE_DEG_S:g} degrees a second")
+        raise FeedError(f"rate exceeds {MAX_RATE_DEG_S:g} degrees per second")
     t = _numbers("t", [message["t"]], 1)[0] if message.get("t") is not None else None
     return FeedMessage(
         None if t is None else float(t), Attitude(quaternion), None if rate is None else np.radians(rate)
@@ -107,16 +111,17 @@ def _numbers(key: str, value: object, count: int) -> Vector:
 
 
 class LiveTruth:
-    """What a live feed has told so far.
+    """Truth from the messages of a live feed.
 
     Parameters
     ----------
     attitude
-        Attitude until the first message comes.
+        Attitude before the first message.
     stale_s
-        Silence, in seconds of run time, after which the truth is flagged and stands still.
+        Silence, in seconds of simulation time, after which the attitude is held and flagged stale.
     timeline
-        `anchor`: the sender's time line is tied to run time by the first message; `run`: it is run time.
+        `anchor`: the first message sets the offset of the sender's clock; `run`: the sender uses
+        simulation time.
     """
 
     kind: Final = "live"
@@ -133,30 +138,30 @@ class LiveTruth:
         self._clock = SenderClock()
         self._rates = FeedRates(timed=True)
         self._last_t: float | None = None
-        """The sender's time in the last message that had one."""
+        """The sender's time in the last message with a time."""
         self._received_s = 0.0
-        """Run time at which the last message was accepted."""
+        """Simulation time at which the last message was accepted."""
         self._times: deque[float] = deque(maxlen=HISTORY)
         self._states: deque[tuple[Attitude, Vector]] = deque(maxlen=HISTORY)
 
     def receive(self, line: bytes | str, received_s: float) -> bool:
-        """Take in one line at a run time in seconds; a bad one is counted and kept by name in `last_fault`."""
+        """Process one line received at a simulation time in seconds; return whether it was accepted."""
         try:
-            self._push(parse_message(line), received_s)
+            self._add_message(parse_message(line), received_s)
         except FeedError as fault:
-            self.refuse(str(fault))
+            self.reject(str(fault))
             return False
         self.accepted += 1
         return True
 
-    def refuse(self, fault: str) -> None:
-        """Count a bad message."""
+    def reject(self, fault: str) -> None:
+        """Count a bad message and keep its fault in `last_fault`."""
         self.refused += 1
         self.last_fault = fault
         if str(self.refused).rstrip("0") == "1":
-            log.warning("truth feed: message refused (%d so far): %s", self.refused, fault)
+            log.warning("truth feed: message rejected (%d so far): %s", self.refused, fault)
 
-    def _push(self, message: FeedMessage, received_s: float) -> None:
+    def _add_message(self, message: FeedMessage, received_s: float) -> None:
         timed = message.t is not None
         if message.t is not None:
             self._check_time(message.t)
@@ -164,18 +169,18 @@ class LiveTruth:
         if self._rates.timed != timed:
             self._rates = FeedRates(timed=timed)
         at_s = received_s if message.t is None else message.t
-        rate = self._rates.take(at_s, message.attitude, message.rate_rad_s)
+        rate = self._rates.body_rate(at_s, message.attitude, message.rate_rad_s)
         t = at_s
         if timed and self.timeline == "anchor":
-            t = self._clock.run_time(at_s, received_s, self.stale_s)
+            t = self._clock.simulation_time(at_s, received_s, self.stale_s)
             rate = rate * (1.0 - self._clock.slope)
-        self._keep_rising(t, timed=timed)
+        self._drop_superseded(t, timed=timed)
         self._received_s = received_s
         self._times.append(t)
         self._states.append((message.attitude, rate))
 
     def _check_time(self, t: float) -> None:
-        """Reject a time of the sender that does not rise; one that falls far begins a new time line."""
+        """Reject a sender's time that does not increase; a long jump back starts a new timeline."""
         if self._last_t is None or t >= self._last_t + SHORTEST_S:
             return
         if self._last_t - t <= RESTART_S:
@@ -184,8 +189,8 @@ class LiveTruth:
         self._states.clear()
         self._clock, self._rates = SenderClock(), FeedRates(timed=True)
 
-    def _keep_rising(self, t: float, *, timed: bool) -> None:
-        """Forget what a message takes the place of: one received at the same time, or a time line that has been left."""
+    def _drop_superseded(self, t: float, *, timed: bool) -> None:
+        """Drop messages that a new one replaces: one received at the same time, or an abandoned timeline."""
         if not self._times or t >= self._times[-1] + SHORTEST_S:
             return
         if not timed and t >= self._times[-1]:
@@ -198,7 +203,7 @@ class LiveTruth:
             raise FeedError(f"its time is {self._times[-1] - t:.3g} s before that of the message before")
 
     def state(self, t_s: float) -> TruthState:
-        """Truth at a run time in seconds."""
+        """Return the truth at a simulation time in seconds."""
         if not self._times:
             return TruthState(self._start, ZERO_RATE, TruthStatus.WAITING)
         age = t_s - self._times[-1]
@@ -221,13 +226,13 @@ class LiveTruth:
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """Hands each line of each datagram on."""
+    """Passes each line of each datagram to the feed."""
 
     def __init__(self, feed: LiveFeed) -> None:
         self._feed = feed
 
     def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
-        """Take in a datagram."""
+        """Process a datagram."""
         for line in data.splitlines():
             if line.strip():
                 self._feed.receive(line)
@@ -239,9 +244,9 @@ class LiveFeed:
     Parameters
     ----------
     truth
-        Where messages go.
+        Receives the messages.
     now_s
-        Run time in seconds.
+        Returns the simulation time in seconds.
     """
 
     def __init__(self, truth: LiveTruth, now_s: Callable[[], float]) -> None:
@@ -252,7 +257,7 @@ class LiveFeed:
         self._writers: set[asyncio.StreamWriter] = set()
 
     async def start(self, protocol: Literal["udp", "tcp"], host: str, port: int) -> str:
-        """Listen; return where, as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
+        """Start listening; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
         loop = asyncio.get_running_loop()
         try:
             if protocol == "udp":
@@ -264,14 +269,14 @@ class LiveFeed:
             else:
                 self._server = await asyncio.start_server(self._serve, host, port, limit=MAX_LINE)
                 address = self._server.sockets[0].getsockname()
-        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+        except (OSError, ValueError) as error:  # ValueError: not a valid host name
             raise EmulatorError(
                 f"truth feed {protocol}:{host}:{port}: cannot listen ({reason(error)}); choose another port, or 0"
             ) from None
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, line: bytes) -> None:
-        """Take in one line, at the time now."""
+        """Process one line received now."""
         self.truth.receive(line, self._now_s())
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -279,11 +284,11 @@ class LiveFeed:
         try:
             async for line in read_lines(reader):
                 if line is None:
-                    self.truth.refuse(f"line longer than {MAX_LINE} bytes")
+                    self.truth.reject(f"line longer than {MAX_LINE} bytes")
                 elif line.strip():
                     self.receive(line)
         except ConnectionError:
-            self.truth.refuse("connection broken")
+            self.truth.reject("connection broken")
         finally:
             self._writers.discard(writer)
             writer.close()

@@ -1,7 +1,6 @@
-"""Truth: where the sensor really points, and how it turns, at any run time.
+"""Truth sources: the true attitude and body rate of the sensor at any simulation time.
 
-A source answers `state(t)` for a time in seconds of run time: the attitude, the body rate in the sensor frame, and whether
-the answer can be trusted. Sources hold no clock and no socket.
+A source has neither clock nor socket; `state(t)` depends only on the time and the data received.
 """
 
 from __future__ import annotations
@@ -24,26 +23,26 @@ ZERO_RATE: Final[Vector] = np.zeros(3)
 ZERO_RATE.flags.writeable = False
 
 MAX_RATE_DEG_S: Final = 600.0
-"""Largest body rate about one axis, degrees a second: with all three at it frames can still be drawn."""
+"""Largest body rate per axis, degrees per second; images can still be rendered at this rate on all three."""
 
 SMOOTH_PEAK: Final = 1.875
 """Peak of the derivative of the quintic 10τ³ − 15τ⁴ + 6τ⁵, at τ = ½."""
 
 
 class TruthStatus(StrEnum):
-    """How a truth state came about."""
+    """Quality of a truth state."""
 
     OK = "ok"
     WAITING = "waiting"
-    """A live feed that has not sent anything yet: the starting attitude."""
+    """No message from a live feed yet: the configured attitude."""
     EXTRAPOLATED = "extrapolated"
-    """Past the last message of a live feed, carried on at its last rate."""
+    """After the last message of a live feed: propagated at its last rate."""
     STALE = "stale"
-    """The live feed has been silent for too long: the attitude stands still."""
+    """The live feed has been silent for too long: the attitude is held."""
     BEFORE_START = "before_start"
     """Before the first row of a file: its first attitude, at rest."""
     AFTER_END = "after_end"
-    """After the last row of a file or segment of a profile: its last attitude, at rest."""
+    """After the last row of a file or segment of a slew: its last attitude, at rest."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +54,9 @@ class TruthState:
     attitude
         ICRS→sensor.
     rate_rad_s
-        Body rate (3,), radians a second, sensor frame.
+        Body rate (3,), rad/s, sensor frame.
     status
-        Whether this is given, carried on or out of date.
+        Whether the state is known, extrapolated or stale.
     """
 
     attitude: Attitude
@@ -66,14 +65,14 @@ class TruthState:
 
 
 class TruthSource(Protocol):
-    """What the emulator asks the truth of."""
+    """A source of true attitudes and rates."""
 
     @property
     def kind(self) -> str:
-        """The name of the source as in a profile."""
+        """Kind of source, as named in a profile."""
 
     def state(self, t_s: float) -> TruthState:
-        """Truth at a run time in seconds."""
+        """Return the truth at a simulation time in seconds."""
 
 
 @dataclass(frozen=True)
@@ -84,18 +83,18 @@ class FixedTruth:
     kind: str = "fixed"
 
     def state(self, t_s: float) -> TruthState:  # noqa: ARG002 (any time gives the same)
-        """Truth at a run time in seconds."""
+        """Return the truth at a simulation time in seconds."""
         return TruthState(self.attitude, ZERO_RATE)
 
 
 @dataclass(frozen=True)
 class RateTruth:
-    """A turn at a constant rate that begins from `attitude` at `start_s`.
+    """A rotation at a constant rate that starts from `attitude` at `start_s`.
 
     Attributes
     ----------
     rate_rad_s
-        Body rate (3,), radians a second, sensor frame.
+        Body rate (3,), rad/s, sensor frame.
     """
 
     attitude: Attitude
@@ -104,20 +103,20 @@ class RateTruth:
     kind: str = "rate"
 
     def state(self, t_s: float) -> TruthState:
-        """Truth at a run time in seconds."""
+        """Return the truth at a simulation time in seconds."""
         return TruthState(propagate(self.attitude, self.rate_rad_s, t_s - self.start_s), self.rate_rad_s)
 
 
 @dataclass(frozen=True)
 class HoldSegment:
-    """Rest for a time, seconds."""
+    """Hold the attitude for a time, seconds."""
 
     seconds: float
 
 
 @dataclass(frozen=True)
 class RateSegment:
-    """Turn at a constant body rate (3,), radians a second, sensor frame, for a time in seconds."""
+    """Rotate at a constant body rate (3,), rad/s, sensor frame, for a time in seconds."""
 
     seconds: float
     rate_rad_s: Vector
@@ -125,18 +124,18 @@ class RateSegment:
 
 @dataclass(frozen=True)
 class SlewSegment:
-    """Turn about one axis to an attitude.
+    """Slew about one axis to an attitude, from rest to rest.
 
     Attributes
     ----------
     to
-        Where the slew ends, at rest.
+        Final attitude.
     rate_rad_s
-        Largest rate, radians a second.
+        Largest rate, rad/s.
     shape
         `smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant braking).
     acceleration_rad_s2
-        Acceleration of the `limited` shape, radians a second squared.
+        Acceleration of the `limited` shape, rad/s².
     """
 
     to: Attitude
@@ -150,7 +149,7 @@ Segment: TypeAlias = HoldSegment | RateSegment | SlewSegment
 
 @dataclass(frozen=True)
 class _Leg:
-    """A segment with its start and its length in time."""
+    """A segment with its start time, duration and initial attitude."""
 
     start_s: float
     seconds: float
@@ -163,14 +162,14 @@ class _Leg:
         """Truth at `elapsed` seconds into the leg."""
         segment = self.segment
         if isinstance(segment, SlewSegment):
-            turned, rate = _progress(segment, self.angle, self.seconds, elapsed)
-            return TruthState(self.attitude.rotated(self.axis * turned), self.axis * rate)
+            angle, rate = _slew_angle_and_rate(segment, self.angle, self.seconds, elapsed)
+            return TruthState(self.attitude.rotated(self.axis * angle), self.axis * rate)
         rate_vector = segment.rate_rad_s if isinstance(segment, RateSegment) else ZERO_RATE
         return TruthState(propagate(self.attitude, rate_vector, elapsed), rate_vector)
 
 
 def _slew_seconds(segment: SlewSegment, angle: float) -> float:
-    """How long a turn by `angle` (radians) takes."""
+    """Return the duration of a slew by `angle` radians."""
     if segment.shape == "smooth":
         return SMOOTH_PEAK * angle / segment.rate_rad_s
     a, rate = segment.acceleration_rad_s2, segment.rate_rad_s
@@ -179,8 +178,10 @@ def _slew_seconds(segment: SlewSegment, angle: float) -> float:
     return angle / rate + rate / a
 
 
-def _progress(segment: SlewSegment, angle: float, seconds: float, elapsed: float) -> tuple[float, float]:
-    """Angle turned (radians) and rate (radians a second) `elapsed` seconds into a slew."""
+def _slew_angle_and_rate(
+    segment: SlewSegment, angle: float, seconds: float, elapsed: float
+) -> tuple[float, float]:
+    """Return the angle (radians) and rate (rad/s) `elapsed` seconds into a slew."""
     if seconds <= 0.0:
         return angle, 0.0
     if segment.shape == "smooth":
@@ -198,18 +199,18 @@ def _progress(segment: SlewSegment, angle: float, seconds: float, elapsed: float
 
 
 class SlewTruth:
-    """A profile of rests, turns and slews, one after the other, from a starting attitude.
+    """A sequence of holds, constant rates and slews.
 
     Parameters
     ----------
     attitude
-        Where the profile begins.
+        Initial attitude.
     segments
-        What follows, in order.
+        Segments in order.
     start_s
-        Run time at which the first segment begins; before it the sensor rests.
+        Simulation time at which the first segment begins; at rest before.
     repeat
-        Begin anew after the last segment (from the starting attitude) instead of resting there.
+        Restart from the initial attitude after the last segment; otherwise hold the final attitude.
     """
 
     kind: Final = "slew"
@@ -222,25 +223,25 @@ class SlewTruth:
         self.start_s = start_s
         self.repeat = repeat
         self._legs: list[_Leg] = []
-        now, here = 0.0, attitude
+        leg_start_s, current = 0.0, attitude
         for segment in segments:
             if isinstance(segment, SlewSegment):
-                turn = segment.to.error_to(here).rotation_vector_rad
-                angle = float(np.linalg.norm(turn))
-                axis = turn / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
-                leg = _Leg(now, _slew_seconds(segment, angle), here, axis, angle, segment)
-                here = segment.to
+                rotation = segment.to.error_to(current).rotation_vector_rad
+                angle = float(np.linalg.norm(rotation))
+                axis = rotation / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+                leg = _Leg(leg_start_s, _slew_seconds(segment, angle), current, axis, angle, segment)
+                current = segment.to
             else:
-                leg = _Leg(now, segment.seconds, here, ZERO_RATE, 0.0, segment)
-                here = leg.state(segment.seconds).attitude
-            now += leg.seconds
+                leg = _Leg(leg_start_s, segment.seconds, current, ZERO_RATE, 0.0, segment)
+                current = leg.state(segment.seconds).attitude
+            leg_start_s += leg.seconds
             self._legs.append(leg)
-        self.duration_s = now
-        """Length of the whole profile, seconds."""
-        self._begin, self._end = attitude, here
+        self.duration_s = leg_start_s
+        """Duration of all segments, seconds."""
+        self._begin, self._end = attitude, current
 
     def state(self, t_s: float) -> TruthState:
-        """Truth at a run time in seconds."""
+        """Return the truth at a simulation time in seconds."""
         elapsed = t_s - self.start_s
         if elapsed < 0.0:
             return TruthState(self._begin, ZERO_RATE, TruthStatus.BEFORE_START)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from starid.classic.pairs import chord_between
 from starid.errors import StaridError
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 from starid.wahba import solve_wahba
 
 LEAST_GROUP: Final = 3
@@ -75,7 +75,7 @@ def group_around(
     return count
 
 
-@entry
+@compiled_ieee
 def _largest_group(
     directions: NDArray[np.float64],
     vectors: NDArray[np.float64],

@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 KEPT_SHARE: Final = 0.5
 """Share of the highest number of votes that a match needs in the second vote."""
 
 
-@entry
+@compiled_ieee
 def votes_of(table: PairTable, stars: int, seen: NDArray[np.float64], tolerance: float) -> NDArray[np.int32]:
     """Votes (n, stars) of all pairs of observed stars for the catalogue stars of both ends."""
     n = seen.shape[0]
@@ -47,7 +47,7 @@ def votes_of(table: PairTable, stars: int, seen: NDArray[np.float64], tolerance:
     return votes
 
 
-@entry
+@compiled_ieee
 def _second_vote(
     vectors: NDArray[np.float64], seen: NDArray[np.float64], matched: NDArray[np.int64], tolerance: float
 ) -> NDArray[np.int64]:

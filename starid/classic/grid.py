@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 GRID: Final = 40
 """Cells along each side of the grid."""
@@ -72,7 +72,7 @@ def occupied_cells(
     return filled
 
 
-@entry
+@compiled_ieee
 def _patterns(
     vectors: NDArray[np.float64], radius: float, buffer: float
 ) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
@@ -93,7 +93,7 @@ def _patterns(
     return start, owners[order].astype(np.uint16)
 
 
-@entry
+@compiled_ieee
 def _vote(
     start: NDArray[np.int32],
     owner: NDArray[np.uint16],

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from starid.classic.grid import BUFFER_SHARE, GRID, MOST_NEIGHBOURS, RADIUS_SHARE, occupied_cells
 from starid.classic.neighbours import grouped, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 ALIGNMENTS: Final = 3
 """Neighbours that an observed pattern is aligned with in turn."""
@@ -59,7 +59,7 @@ def _bright_neighbour(
     return -1
 
 
-@entry
+@compiled_ieee
 def _patterns(
     vectors: NDArray[np.float64], magnitude: NDArray[np.float64], radius: float, buffer: float
 ) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
@@ -80,7 +80,7 @@ def _patterns(
     return start, owners[order].astype(np.uint16)
 
 
-@entry
+@compiled_ieee
 def _look_up(
     table: tuple[NDArray[np.int32], NDArray[np.uint16]],
     stars: int,

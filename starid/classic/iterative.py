@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from starid.classic.geometric_voting import votes_of
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 FIRST_SHARE: Final = 0.4
 RISE: Final = 0.15
 ROUNDS: Final = 4
 
 
-@entry
+@compiled_ieee
 def _vote_of_candidates(
     table: PairTable, candidate: NDArray[np.bool_], seen: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int32]:

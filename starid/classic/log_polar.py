@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from starid.classic.neighbours import MOST_TIED, add_winners, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 SECTORS: Final = 120
 RINGS: Final = 48
@@ -58,7 +58,7 @@ def log_polar_string(
             code[sector] = 1 + ring
 
 
-@entry
+@compiled_ieee
 def _strings(vectors: NDArray[np.float64], radius: float) -> NDArray[np.uint8]:
     """Strings (n, `SECTORS`) of all stars."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -87,7 +87,7 @@ def _likeness(
     return best
 
 
-@entry
+@compiled_ieee
 def _compare(codes: NDArray[np.uint8], seen: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
     """Matches (m, 2) of each observed star with the guide stars most like it."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)

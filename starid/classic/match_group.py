@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from starid.classic.agreement import group_around
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 MAGNITUDE_GATE: Final = 0.6
 """Largest deviation of the difference of two magnitudes."""
@@ -84,7 +84,7 @@ def group_pairs(partner: NDArray[np.int32], pole: int, candidate: int) -> NDArra
     return pairs[:count]
 
 
-@entry
+@compiled_ieee
 def _largest_match_group(
     table: PairTable,
     guide: tuple[NDArray[np.float64], NDArray[np.float64]],

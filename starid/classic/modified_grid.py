@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from starid.classic.grid import BUFFER_SHARE, GRID, MOST_NEIGHBOURS, RADIUS_SHARE, place_on_grid
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 GREY_WIDTH: Final = 0.7
 """Standard deviation of the grey around a star, cells."""
@@ -35,7 +35,7 @@ GREATEST_COST: Final = 0.65
 LEAST_NEIGHBOURS: Final = 4
 
 
-@entry
+@compiled_ieee
 def _grey_patterns(vectors: NDArray[np.float64], radius: float, buffer: float) -> NDArray[np.uint8]:
     """Grey grids (n, `GRID`²) of all stars; empty for one that has no neighbour to be aligned with."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -56,7 +56,7 @@ def _grey_patterns(vectors: NDArray[np.float64], radius: float, buffer: float) -
     return grey
 
 
-@entry
+@compiled_ieee
 def _least_cost(
     grey: NDArray[np.uint8],
     seen: NDArray[np.float64],

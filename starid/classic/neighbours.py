@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 MOST_TIED: Final = 4
 """Guide stars with equally many votes that a pivot may leave to the last step; more of them say nothing."""
@@ -98,7 +98,7 @@ def nearest_beyond(polar: NDArray[np.float64], count: int, buffer: float) -> int
     return -1
 
 
-@entry
+@compiled_ieee
 def neighbour_list(
     vectors: NDArray[np.float64], pivot: int, radius: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

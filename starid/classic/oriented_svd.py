@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 NEIGHBOURS: Final = 5
 BUFFER_SHARE: Final = 0.05
@@ -34,7 +34,7 @@ LEAST_VOTES: Final = 3
 MARGIN: Final = 1.3
 
 
-@entry
+@compiled_ieee
 def _triangle_rows(vectors: NDArray[np.float64], radius: float, buffer: float) -> NDArray[np.int64]:
     """Corners (m, 3) of the triangles of every star with two of its nearest neighbours, in no order, some twice."""
     n = vectors.shape[0]
@@ -71,7 +71,7 @@ def oriented_triangles(
     return corners, values, np.where(volume < 0.0, -1, 1).astype(np.int8)
 
 
-@entry
+@compiled_ieee
 def _vote(
     database: tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.int8]],
     triangles: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8]],

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.errors import StaridError
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 MOST_STARS: Final = 65_535
 """Stars that 16-bit numbers can name."""
@@ -54,7 +54,7 @@ def chord_between(ones: NDArray[np.float64], i: int, others: NDArray[np.float64]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@entry
+@compiled_ieee
 def _close_pairs(
     vectors: NDArray[np.float64], longest: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.uint16]]:
@@ -126,7 +126,7 @@ def pair_range(table: PairTable, low: float, high: float) -> tuple[int, int]:
     return start, max(start, end)
 
 
-@entry
+@compiled_ieee
 def pairs_within(table: PairTable, low: float, high: float) -> tuple[int, int]:
     """As `pair_range`, for callers in Python."""
     return pair_range(table, low, high)

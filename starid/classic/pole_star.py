@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from starid.classic.neighbours import neighbours_of
 from starid.classic.rings import MOST_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 LEAST_RINGS: Final = 4
 CANDIDATES: Final = 8
 
 
-@entry
+@compiled_ieee
 def _candidates(
     table: tuple[NDArray[np.int32], NDArray[np.uint16]], stars: int, seen: NDArray[np.float64], radius: float
 ) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 
 @inner
@@ -145,7 +145,7 @@ def _complete(
     return count
 
 
-@entry
+@compiled_ieee
 def _pyramid(
     table: PairTable, vectors: NDArray[np.float64], seen: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:

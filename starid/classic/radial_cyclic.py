@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from starid.classic.neighbours import neighbours_of, turned
 from starid.classic.rings import MOST_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_of, ring_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 SECTORS: Final = 60
 LEAST_RINGS: Final = 4
@@ -67,7 +67,7 @@ def common_sectors(seen: int, other: int) -> int:
     return best
 
 
-@entry
+@compiled_ieee
 def _cyclic_words(vectors: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
     """Cyclic words (n,) of all stars."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -77,7 +77,7 @@ def _cyclic_words(vectors: NDArray[np.float64], radius: float) -> NDArray[np.int
     return words
 
 
-@entry
+@compiled_ieee
 def _identify(
     table: tuple[NDArray[np.int32], NDArray[np.uint16]],
     words: NDArray[np.int64],

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.classic.neighbours import grouped, neighbours_of
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 RINGS: Final = 200
 INNER: Final = 0.05
@@ -33,7 +33,7 @@ def ring_of(chord: float, radius: float) -> int:
     return min(int(share * RINGS), RINGS - 1) if share >= 0.0 else -1
 
 
-@entry
+@compiled_ieee
 def ring_table(vectors: NDArray[np.float64], radius: float) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
     """Look-up table: first entry of each ring, and the stars that have a neighbour in it, each once."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)

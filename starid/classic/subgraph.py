@@ -27,7 +27,7 @@ from starid.classic.agreement import group_around
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.errors import StaridError
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 from starid.wahba import solve_wahba
 
 POLES: Final = 10
@@ -87,7 +87,7 @@ def _groups(
                     last[a] = j
 
 
-@entry
+@compiled_ieee
 def _subgraphs(
     table: PairTable,
     vectors: NDArray[np.float64],

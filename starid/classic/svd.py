@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry
+from starid.jit import compiled_ieee
 
 PATTERN: Final = 5
 """Stars of a pattern, the reference with them."""
@@ -36,7 +36,7 @@ CONFIRMED: Final = 4
 """References after which no more are tried."""
 
 
-@entry
+@compiled_ieee
 def _pattern_rows(vectors: NDArray[np.float64], radius: float, buffer: float) -> NDArray[np.int64]:
     """Rows (n, `PATTERN`) of each star and its nearest neighbours beyond a buffer; −1 where it has too few."""
     n = vectors.shape[0]

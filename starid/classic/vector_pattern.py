@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from starid.classic.grid import BUFFER_SHARE, MOST_NEIGHBOURS, RADIUS_SHARE
 from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.geometric.jit_kernels import entry, inner
+from starid.jit import compiled_ieee, inner
 
 ELEMENTS: Final = 200
 ANGLE_TOLERANCE: Final = math.radians(4.0)
@@ -40,7 +40,7 @@ def _element(polar: NDArray[np.float64], i: int, reference: float, radius: float
     return min(max(int(0.5 * (1.0 + x) * ELEMENTS), 0), ELEMENTS - 1)
 
 
-@entry
+@compiled_ieee
 def _patterns(
     vectors: NDArray[np.float64], radius: float, buffer: float
 ) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]]:
@@ -63,7 +63,7 @@ def _patterns(
     return start, owners[order].astype(np.uint16), values[order].astype(np.float32)
 
 
-@entry
+@compiled_ieee
 def _vote(
     index: tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]],
     stars: int,

@@ -14,8 +14,8 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.frames import FrameResult, ImageRequest, ImageResult, MatchedStar
-from starhil.emulator.pipeline.imager import Answer, Asked
+from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
+from starhil.emulator.pipeline.messages import FrameResult, ImageRequest, ImageResult, MatchedStar
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.truth.source import FixedTruth
@@ -152,7 +152,7 @@ class TruthImager:
     def __init__(self) -> None:
         self.last = -1
 
-    def handle(self, request: Asked) -> Answer:
+    def handle(self, request: PipelineRequest) -> PipelineReply:
         if isinstance(request, ImageRequest):
             edge = request.edge or 10
             pixels = bytes(

@@ -1,4 +1,4 @@
-"""A device on a stepped clock, with a pipeline that sees the truth without making pictures."""
+"""A device on a stepped clock, with a pipeline that sees the truth without rendering images."""
 
 from __future__ import annotations
 
@@ -16,8 +16,14 @@ from starhil.emulator.device.state_store import MemoryStore, StateStore
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.launch import Run, RunOptions
 from starhil.emulator.pipeline import worker_process
-from starhil.emulator.pipeline.frames import FrameRequest, FrameResult, ImageRequest, ImageResult, MatchedStar
-from starhil.emulator.pipeline.imager import Answer, Asked
+from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
+from starhil.emulator.pipeline.messages import (
+    FrameRequest,
+    FrameResult,
+    ImageRequest,
+    ImageResult,
+    MatchedStar,
+)
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth, TruthSource
@@ -36,15 +42,15 @@ STARS = (
 
 
 @dataclass
-class FakePicture:
+class FakePipeline:
     """Answers each request at once: the attitude is the truth, unless it is told to fail."""
 
-    requests: list[Asked] = field(default_factory=list)
+    requests: list[PipelineRequest] = field(default_factory=list)
     fail: str = ""
     turn_rad: float = 0.0
     last_index: int = -1
 
-    def handle(self, request: Asked) -> Answer:
+    def handle(self, request: PipelineRequest) -> PipelineReply:
         """Answer a request as the pipeline does."""
         self.requests.append(request)
         if isinstance(request, ImageRequest):
@@ -93,12 +99,12 @@ class Bench:
         truth: TruthSource | None = None,
     ) -> None:
         self.clock = SteppedClock()
-        self.picture = FakePicture()
+        self.pipeline = FakePipeline()
         self.icd = load_icd()
         self.store = store or MemoryStore()
         self.later: list[Reply] = []
         """Answers that came when a telecommand was done."""
-        self.imager = DirectImager(self.picture.handle)
+        self.imager = DirectImager(self.pipeline.handle)
         self.device = Device(
             profile or Profile(),
             self.icd,
@@ -164,8 +170,8 @@ def make_bench() -> Callable[..., Bench]:
 @pytest.fixture
 def run(monkeypatch, make_bench):
     """Run a scenario with an emulation that is started and ready."""
-    picture = make_bench().picture
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(picture.handle))
+    pipeline = make_bench().pipeline
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(pipeline.handle))
 
     def run(scenario, *, clock="stepped", options=None, **overrides):
         profile = Profile.model_validate(
@@ -187,13 +193,13 @@ def run(monkeypatch, make_bench):
 
         return asyncio.run(whole())
 
-    run.picture = picture
+    run.pipeline = pipeline
     return run
 
 
 @pytest.fixture
 def worker(monkeypatch):
-    """Make picture workers that run the given programs, one after the other; the last one from then on."""
+    """Make workers that run the given programs, one after the other; the last one from then on."""
 
     def make(*programs):
         waiting = list(programs)

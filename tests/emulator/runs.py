@@ -1,11 +1,11 @@
-"""A whole run for tests: a pipeline that makes no pictures, and a peer on the control channel."""
+"""A whole run for tests: a pipeline that renders no images, and a peer on the control channel."""
 
 import asyncio
 import json
 from collections.abc import Callable
 
-from starhil.emulator.pipeline.frames import Warm
-from starhil.emulator.pipeline.imager import Answer, Asked, Done
+from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.protocol.messages import ErrorCode, Request
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
@@ -16,10 +16,10 @@ class DirectImager:
 
     pending = 0
 
-    def __init__(self, handle: Callable[[Asked], Answer]) -> None:
+    def __init__(self, handle: Callable[[PipelineRequest], PipelineReply]) -> None:
         self._handle = handle
 
-    def submit(self, request: Asked, done: Done) -> None:
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Do the request and call back."""
         done(self._handle(request))
 
@@ -32,8 +32,8 @@ class FakeImager(DirectImager):
 
     on_failure = None
 
-    async def start(self) -> Warm:
-        return Warm(CAMERA, 5, 0.0)
+    async def start(self) -> PipelineReady:
+        return PipelineReady(CAMERA, 5, 0.0)
 
     async def close(self) -> None:
         return

@@ -1,4 +1,4 @@
-"""A whole run in one process, with a pipeline that makes no pictures: scenarios, files, pumps, refusals."""
+"""A whole run in one process, with a pipeline that renders no images: scenarios, files, pumps, refusals."""
 
 import asyncio
 import csv
@@ -12,8 +12,8 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
-from starhil.emulator.pipeline.frames import Warm
 from starhil.emulator.pipeline.imager import ProcessImager
+from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile, RunConfig, configs_folder
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
@@ -74,7 +74,7 @@ def test_the_truth_log_has_a_row_a_frame(run, tmp_path):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(2.5)
-        run.picture.fail = "no_match"
+        run.pipeline.fail = "no_match"
         await emulation.stepper.step(1.0)
 
     run(scenario, options=RunOptions(truth_log=path))
@@ -280,7 +280,7 @@ def test_a_start_that_is_refused_is_not_counted(run, tmp_path, monkeypatch):
         run(scenario, run=state, options=RunOptions(control="127.0.0.1:99999"))
     assert run(scenario, run=state) == 2
 
-    async def fail(_imager) -> Warm:
+    async def fail(_imager) -> PipelineReady:
         raise EmulatorError("no catalogue")
 
     with monkeypatch.context() as patch:
@@ -295,8 +295,8 @@ def test_a_camera_beyond_its_parameters_is_refused_and_all_is_given_back(run, tm
     links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
     state = {"clock": "stepped", "state_dir": str(tmp_path)}
 
-    async def odd(_imager) -> Warm:
-        return Warm({**CAMERA, "centre_px": [-5.0, 468.0]}, 5, 0.0)
+    async def odd(_imager) -> PipelineReady:
+        return PipelineReady({**CAMERA, "centre_px": [-5.0, 468.0]}, 5, 0.0)
 
     async def scenario(emulation, _line):
         return emulation.device.boot_count

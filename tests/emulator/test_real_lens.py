@@ -7,8 +7,8 @@ from starhil.emulator.device.cycle import as_quaternion
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.emulation import camera_constants, pipeline_setup
-from starhil.emulator.pipeline.frames import FrameRequest, SolverSettings, Warm
-from starhil.emulator.pipeline.pipeline import Picture
+from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady, SolverSettings
+from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.profile import load_profile
 from starhil.protocol.icd import load_icd
 from starid.attitude import Attitude, random_attitude
@@ -18,7 +18,7 @@ IDEAL_ARCSEC = 2.0
 FIELDS = 4
 
 
-def errors_arcsec(picture, parameters) -> list[float]:
+def errors_arcsec(pipeline, parameters) -> list[float]:
     """Errors across the boresight in a few random fields."""
     settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
     rng = np.random.default_rng(7)
@@ -26,7 +26,7 @@ def errors_arcsec(picture, parameters) -> list[float]:
     for index in range(FIELDS):
         truth = random_attitude(rng)
         request = FrameRequest(index, as_quaternion(truth), (0.0, 0.0, 0.0), 0.1, 1.0, settings=settings)
-        result = picture.handle(request)
+        result = pipeline.handle(request)
         assert result.valid, result
         measured = Attitude(np.array(result.quaternion_xyzw))
         errors.append(measured.error_to(truth).cross_boresight_arcsec)
@@ -35,15 +35,15 @@ def errors_arcsec(picture, parameters) -> list[float]:
 
 def test_a_calibration_that_is_a_little_wrong_costs_what_a_data_sheet_allows():
     profile, icd = load_profile("real_lens", ["run.clock=stepped"]), load_icd()
-    picture = Picture(pipeline_setup(profile))
-    constants = camera_constants(Warm(picture.camera.to_dict(), len(picture.catalog), 0.0))
+    pipeline = Pipeline(pipeline_setup(profile))
+    constants = camera_constants(PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), 0.0))
     parameters = Parameters(icd, profile_defaults(profile, icd))
     assert constants.keys() <= profile.parameters.keys()
-    wrong = errors_arcsec(picture, parameters)
+    wrong = errors_arcsec(pipeline, parameters)
     assert 5.0 < np.median(wrong) < DATA_SHEET_ARCSEC
     assert max(wrong) < DATA_SHEET_ARCSEC
     parameters.set(constants)
-    assert max(errors_arcsec(picture, parameters)) < IDEAL_ARCSEC
+    assert max(errors_arcsec(pipeline, parameters)) < IDEAL_ARCSEC
 
 
 @pytest.mark.parametrize("name", ["cubestar", "demo"])

@@ -1,4 +1,4 @@
-"""A picture pipeline that has ended by itself is started again: with bounded attempts, and an end that is reported."""
+"""A pipeline that has ended by itself is started again: with bounded attempts, and an end that is reported."""
 
 import asyncio
 
@@ -11,7 +11,7 @@ from tests.emulator.workers import ANSWERING, WORKER
 
 WITHIN_S = 20.0
 ENDS_AT_ONCE = ""
-ENDS_WHEN_READY = WORKER + f"send(Warm({CAMERA}, 5, 0.0))\n"
+ENDS_WHEN_READY = WORKER + f"send(PipelineReady({CAMERA}, 5, 0.0))\n"
 REJECTS = WORKER + "send(Failure('no catalogue'))\n"
 ATTEMPTS = 3
 

@@ -1,4 +1,4 @@
-"""The picture worker is started before anything else is imported, and a kernel needs no whole `scipy.linalg`."""
+"""The worker is started before anything else is imported, and a kernel needs no whole `scipy.linalg`."""
 
 import subprocess
 import sys

@@ -1,10 +1,10 @@
-"""Programs that stand in for the picture worker: they make no pictures, and fail where a test wants them to."""
+"""Programs that stand in for the pipeline worker: they render no images, and fail where a test wants them to."""
 
 from tests.emulator.runs import CAMERA
 
 WORKER = """
 import pickle, socket, sys
-from starhil.emulator.pipeline.frames import LENGTH, Failure, FrameResult, Warm
+from starhil.emulator.pipeline.messages import LENGTH, Failure, FrameResult, PipelineReady
 link = socket.socket(fileno=int(sys.argv[1]))
 stream = link.makefile("rwb")
 def receive():
@@ -16,8 +16,9 @@ def send(message):
     stream.flush()
 receive()
 """
-"""The beginning of a worker that makes no pictures: what it does then is the test's."""
+"""The beginning of a worker that renders no images: what it does then is the test's."""
 
 ANSWERING = (
-    WORKER + f"send(Warm({CAMERA}, 5, 0.0))\nn = 0\nwhile receive():\n n += 1\n send(FrameResult(n))\n"
+    WORKER
+    + f"send(PipelineReady({CAMERA}, 5, 0.0))\nn = 0\nwhile receive():\n n += 1\n send(FrameResult(n))\n"
 )

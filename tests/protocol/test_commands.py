@@ -45,7 +45,7 @@ def test_list_tells_every_row_and_parameter() -> None:
     [
         (
             ("icd", "export", "html", "-o", "/proc/does/not/exist/icd.html"),
-            "starhil: /proc/does/not/exist/icd.html: its folder cannot be made",
+            "starhil: /proc/does/not/exist/icd.html: its folder cannot be created",
         ),
         (
             ("icd", "export", "html", "--icd", "/does/not/exist"),

@@ -54,7 +54,7 @@ def test_every_option_that_names_a_file_to_write_states_the_rule() -> None:
         and not str(option.help).startswith("Folder")
     }
     assert len(files) >= 11
-    assert [name for name, said in files.items() if "Missing folders are made" not in said] == []
+    assert [name for name, said in files.items() if "Missing folders are created" not in said] == []
 
 
 @pytest.mark.parametrize(
@@ -147,11 +147,11 @@ def test_a_name_that_no_image_can_have_is_refused_before_the_work(arguments: str
     [
         ("database build --overlap 99.9999999", "give less overlap or wider frames"),
         ("database build --overlap 50 --fov 1e-5", "give less overlap or wider frames"),
-        ("features --ra 1 --dec 2 --fov 1e9", "--fov 1e+09: degrees are needed"),
+        ("features --ra 1 --dec 2 --fov 1e9", "--fov 1e+09: must be above 0"),
         ("features --ra 1e300 --dec 2", "right ascension 1e+300"),
-        ("render --ra 1 --dec 2 --fov 1e-9 -o out.png", "--fov 1e-09: at least 0.1"),
+        ("render --ra 1 --dec 2 --fov 1e-9 -o out.png", "--fov 1e-09: must be at least 0.1"),
         ("catalog --path /dev/zero", "cannot be read (not a regular file)"),
-        ("calibrate gone.png --fov 1 -o /proc/x/y", "its folder cannot be made"),
+        ("calibrate gone.png --fov 1 -o /proc/x/y", "its folder cannot be created"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(

@@ -1,4 +1,4 @@
-"""`starhil render` as a user calls it, and the way from its picture back to the attitude."""
+"""`starhil render` as a user calls it, and the way from its image back to the attitude."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_bits_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: st
     assert (image.shape, image.dtype) == ((200, 320), dtype)
 
 
-def test_an_annotated_picture_has_colour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_annotated_image_has_colour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "marked.png"
     rate = ("--rate", "0.5", "0", "1", "--exposure", "0.4", "--limit", "5")
     assert run(monkeypatch, "--ra", "83.8", "--dec", "-1.2", *rate, "--annotate", "-o", str(target)) == 0
@@ -99,29 +99,29 @@ def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
 ) -> None:
     profile = tmp_path / "mine.toml"
 
-    def picture(text: str, *options: str) -> tuple[np.ndarray, float]:
+    def rendered(text: str, *options: str) -> tuple[np.ndarray, float]:
         profile.write_text(text, encoding="utf-8")
         target = tmp_path / "x.png"
         arguments = ("--profile", str(profile), "--ra", "0", "--dec", "40", "-o", str(target), "--json")
         assert run(monkeypatch, *arguments, *options) == 0
         return read_image(target), json.loads(capsys.readouterr().out)["exposure_s"]
 
-    plain, exposure = picture('extends = "cubestar"\n')
+    plain, exposure = rendered('extends = "cubestar"\n')
     assert exposure == 0.1
-    dark, _ = picture('extends = "cubestar"\nsky = { blank = true }\n')
+    dark, _ = rendered('extends = "cubestar"\nsky = { blank = true }\n')
     assert np.count_nonzero(dark > 30) < np.count_nonzero(plain > 30) / 4  # hot pixels stay
-    longer, exposure = picture('extends = "cubestar"\nparameters = { exposure = 400, analog_gain = 2.0 }\n')
+    longer, exposure = rendered('extends = "cubestar"\nparameters = { exposure = 400, analog_gain = 2.0 }\n')
     assert exposure == 0.4
     assert np.median(longer) > np.median(plain)
-    _, exposure = picture('extends = "cubestar"\n', "--exposure", "0.3")
+    _, exposure = rendered('extends = "cubestar"\n', "--exposure", "0.3")
     assert exposure == 0.3
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("--dec", "95"), "--dec 95.0: degrees from -90 to 90"),
-        (("--ra", "361"), "--ra 361: degrees from -360 to 360"),
+        (("--dec", "95"), "--dec 95.0: must be between -90 and 90"),
+        (("--ra", "361"), "--ra 361: must be between -360 and 360"),
         (("--ra", "nan"), "'--ra': must be finite"),
         (("--bits", "9"), "bits: 9 given, 8, 12 or 16 needed"),
         (("--exposure", "-1"), "exposure_s: -1.0 given"),
@@ -130,9 +130,9 @@ def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
         (("--fov", "200"), "fov_deg: 200.0 given"),
         (("--limit", "99"), "limiting_magnitude: 99.0 given"),
         (("--seed", "-3"), "seed: -3 given"),
-        (("--rate", "0", "0", "99999"), "--rate 0 0 99999: at most 1000 degrees/s"),
+        (("--rate", "0", "0", "99999"), "--rate 0 0 99999: must be at most 1000 degrees/s"),
         (("--model", "fish"), "camera model: 'fish'"),
-        (("-o", "picture.foo"), "suffix '.foo' given"),
+        (("-o", "image.foo"), "suffix '.foo' given"),
         (("--profile", "nowhere"), "nowhere"),
     ],
 )

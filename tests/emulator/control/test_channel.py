@@ -112,7 +112,7 @@ def test_a_truth_file_that_is_a_pipe_is_rejected_at_once(run, tmp_path):
 
 
 def test_frames_are_told_with_truth_and_error(run):
-    run.picture.turn_rad = 1e-5
+    run.pipeline.turn_rad = 1e-5
 
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
@@ -276,10 +276,10 @@ def test_optical_faults_go_with_each_frame(run):
             assert (await control.do("fault", optical={"false_stars": 7, "blocked_share": 0.25}))["ok"]
             command(emulation, "set_mode", mode="lost_in_space")
             await control.do("step", seconds=1.0)
-            assert run.picture.frames[-1].faults == {"false_stars": 7, "blocked_share": 0.25}
+            assert run.pipeline.frames[-1].faults == {"false_stars": 7, "blocked_share": 0.25}
             await control.do("clear_faults")
             await control.do("step", seconds=1.0)
-            assert run.picture.frames[-1].faults == {}
+            assert run.pipeline.frames[-1].faults == {}
 
     run(scenario)
 

@@ -63,14 +63,14 @@ def test_tracking_predicts_with_the_rate(make_bench):
     bench = make_bench(truth=truth).start()
     bench.command("set_mode", mode="lost_in_space")
     bench.step(4.5)
-    first, second, third, *_ = bench.picture.frames
+    first, second, third, *_ = bench.pipeline.frames
     assert first.predicted_xyzw is None
     assert second.predicted_xyzw is None  # one attitude gives no rate
     predicted = Attitude(np.array(third.predicted_xyzw))
     assert predicted.error_to(Attitude(np.array(third.attitude_xyzw))).total_arcsec < 0.001
     bench.command("set_parameter", parameter=28, value=0.0)  # prediction off: the last attitude as it was
     bench.step(1.0)
-    last = bench.picture.frames[-1]
+    last = bench.pipeline.frames[-1]
     off = (
         Attitude(np.array(last.predicted_xyzw)).error_to(Attitude(np.array(last.attitude_xyzw))).total_arcsec
     )
@@ -81,7 +81,7 @@ def test_validity_clears_at_the_first_failed_frame_with_its_reason(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(3.5)
     assert bench.read("precise_attitude")["valid"]
-    bench.picture.fail = "too_few_stars"
+    bench.pipeline.fail = "too_few_stars"
     bench.step(1.0)
     attitude = bench.read("precise_attitude")
     assert not attitude["valid"]

@@ -86,7 +86,7 @@ def test_the_highest_rate_that_an_exposure_leaves_is_reached(bench, exposure, ra
     bench.step(10.0)
     attitude = bench.read("precise_attitude")
     assert abs(attitude["frame_counter"] - 10.0 * rate) <= 0.25 * rate
-    mid_points = [frame.index for frame in bench.picture.frames]
+    mid_points = [frame.index for frame in bench.pipeline.frames]
     assert len(set(mid_points)) == len(mid_points)
     assert bench.device.cycle.skipped == 0
 

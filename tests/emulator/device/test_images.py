@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.device.images import StoredImage
-from starhil.emulator.pipeline.frames import Failure
+from starhil.emulator.pipeline.messages import Failure
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 
@@ -34,14 +34,14 @@ def test_an_image_is_captured_in_standby_and_downloaded_by_frames(bench, edge):
     save(bench, f"size_{edge}")
     image = download(bench, edge, f"size_{edge}")
     assert (image == np.arange(edge, dtype=np.uint8)[np.newaxis] % 251).all()
-    assert not bench.picture.frames[-1].solve
+    assert not bench.pipeline.frames[-1].solve
     assert bench.read("device_status")["image_stored"]
 
 
 def test_capture_takes_the_next_frame_while_frames_run(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    count = len(bench.picture.frames)
+    count = len(bench.pipeline.frames)
     bench.command("save_image", image_size="size_64")
     assert bench.read("image_status")["status"] == "waiting_sensor"
     assert bench.read("image_status")["percent"] == 0
@@ -49,8 +49,8 @@ def test_capture_takes_the_next_frame_while_frames_run(bench):
     assert bench.read("image_status") == {"percent": 50, "status": "waiting_frame"}
     bench.step(0.1)
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
-    assert bench.device.images.stored.frame == bench.picture.frames[count].index
-    assert all(request.solve for request in bench.picture.frames)
+    assert bench.device.images.stored.frame == bench.pipeline.frames[count].index
+    assert all(request.solve for request in bench.pipeline.frames)
 
 
 def test_only_one_capture_at_a_time(bench):
@@ -98,7 +98,7 @@ def test_the_last_frame_can_be_downloaded_without_a_capture(bench):
     assert bench.requests.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
     bench.step(0.2)
     assert bench.read("acknowledge")["processed"]
-    assert bench.device.images.download.frame == bench.picture.frames[-1].index
+    assert bench.device.images.download.frame == bench.pipeline.frames[-1].index
     assert len(bench.read("image_frame")["data"]) == 128
 
 
@@ -124,7 +124,7 @@ def test_a_whole_frame_is_taken_beside_what_is_stored(bench):
     bench.step(1.0)
     (frame,) = taken
     assert (frame.width, frame.height, len(frame.pixels)) == (10, 10, 100)
-    assert frame.frame == bench.picture.frames[-1].index
+    assert frame.frame == bench.pipeline.frames[-1].index
     assert bench.device.images.stored.edge == 64
     assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
 
@@ -133,7 +133,7 @@ def test_a_whole_frame_is_taken_beside_what_is_stored(bench):
 def test_a_capture_is_done_though_frames_stop_before_the_next_one(bench, stop):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    count = len(bench.picture.frames)
+    count = len(bench.pipeline.frames)
     bench.command("save_image", image_size="size_64")
     bench.step(0.55)  # in the middle of an exposure
     if stop == "command":
@@ -142,7 +142,7 @@ def test_a_capture_is_done_though_frames_stop_before_the_next_one(bench, stop):
         bench.device.modes.fail("sensor")
     bench.step(0.25)  # exposed anew, and stored
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
-    (frame,) = bench.picture.frames[count:]
+    (frame,) = bench.pipeline.frames[count:]
     assert not frame.solve
     assert bench.device.images.stored.frame == frame.index
     assert not bench.device.images.busy
@@ -155,7 +155,7 @@ def test_a_whole_frame_is_taken_though_frames_stop(bench):
     bench.device.images.capture_full(taken.append)
     bench.command("set_mode", mode="standby")
     bench.step(0.25)
-    assert [frame.frame for frame in taken] == [bench.picture.frames[-1].index]
+    assert [frame.frame for frame in taken] == [bench.pipeline.frames[-1].index]
 
 
 def test_a_capture_ends_when_the_pipeline_is_lost(bench):
@@ -172,11 +172,11 @@ def test_a_capture_ends_when_the_pipeline_is_lost(bench):
 def test_a_capture_does_not_outlive_a_reset(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    count = len(bench.picture.requests)
+    count = len(bench.pipeline.requests)
     bench.command("save_image", image_size="size_64")
     bench.command("reset")
     bench.step(5.0)
-    assert len(bench.picture.requests) == count
+    assert len(bench.pipeline.requests) == count
     assert not bench.device.images.busy
 
 

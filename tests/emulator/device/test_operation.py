@@ -10,7 +10,7 @@ def test_modes_go_by_command_and_by_result(bench):
     assert bench.command("set_mode", mode="lost_in_space") is ErrorCode.OK
     bench.step(2.5)
     assert bench.mode == "tracking"
-    bench.picture.fail = "prediction_lost"
+    bench.pipeline.fail = "prediction_lost"
     bench.step(1.0)
     assert bench.mode == "lost_in_space"
     assert bench.command("set_mode", mode="tracking") is ErrorCode.OK  # from the attitude that it still has

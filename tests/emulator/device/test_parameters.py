@@ -95,7 +95,7 @@ def test_parameters_reach_the_pipeline(bench):
     bench.command("set_star_config", **{**config, **changes})
     bench.command("set_mode", mode="lost_in_space")
     bench.step(1.0)
-    request = bench.picture.frames[-1]
+    request = bench.pipeline.frames[-1]
     assert (request.exposure_s, request.gain) == (0.06, 2.0)
     for name in set(changes) - {"exposure", "analog_gain"}:
         assert getattr(request.settings, name) == pytest.approx(changes[name], rel=F32), name
@@ -106,7 +106,7 @@ def test_tracking_flag_keeps_the_device_lost_in_space(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(5.0)
     assert bench.mode == "lost_in_space"
-    assert all(request.predicted_xyzw is None for request in bench.picture.frames)
+    assert all(request.predicted_xyzw is None for request in bench.pipeline.frames)
 
 
 def test_one_parameter_is_set_read_and_refused(bench):

@@ -7,8 +7,8 @@ import pytest
 
 from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.frames import Failure, FrameResult, ImageRequest, Warm
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageRequest, PipelineReady
 from starhil.emulator.profile import Profile
 from tests.emulator.workers import ANSWERING, WORKER
 
@@ -17,7 +17,7 @@ WITHIN_S = 20.0
 REQUEST = ImageRequest(64)
 
 
-class FakePicture:
+class FakePipeline:
     """Answers with numbered frames; `ImageRequest(0)` ends the thread."""
 
     def __init__(self):
@@ -34,7 +34,8 @@ class FakePicture:
 def make_imager(request, worker, monkeypatch):
     """Make an imager that answers with numbered frames and can be killed."""
     monkeypatch.setattr(
-        "starhil.emulator.pipeline.pipeline.make_picture", lambda _setup: (FakePicture(), Warm({}, 5, 0.0))
+        "starhil.emulator.pipeline.pipeline.make_pipeline",
+        lambda _setup: (FakePipeline(), PipelineReady({}, 5, 0.0)),
     )
 
     def make():
@@ -113,10 +114,10 @@ def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, capl
     run(make_imager, scenario)
 
 
-@pytest.mark.parametrize("bad", ["b'no pickle'", "pickle.dumps(Warm)", "pickle.dumps(None) + b'x'"])
+@pytest.mark.parametrize("bad", ["b'no pickle'", "pickle.dumps(PipelineReady)", "pickle.dumps(None) + b'x'"])
 def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, caplog, bad):
     program = WORKER + (
-        "send(Warm({}, 5, 0.0))\n"
+        "send(PipelineReady({}, 5, 0.0))\n"
         f"data = {bad}\nreceive()\nstream.write(LENGTH.pack(len(data)) + data)\n"
         "send(FrameResult(1)); send(FrameResult(2))\nstream.flush()\nreceive()\n"
     )
@@ -151,7 +152,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
         imager = ProcessImager(SETUP, worker(program))
         imager.on_failure = losses.append
         try:
-            with pytest.raises(EmulatorError, match=r"no catalogue|picture worker"):
+            with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
                 await asyncio.wait_for(imager.start(), WITHIN_S)
             await asyncio.sleep(0.1)
         finally:
@@ -174,7 +175,7 @@ def test_a_thread_whose_pipeline_cannot_be_made_says_so(monkeypatch):
     def fail(_setup):
         raise ValueError("odd\ncamera")
 
-    monkeypatch.setattr("starhil.emulator.pipeline.pipeline.make_picture", fail)
+    monkeypatch.setattr("starhil.emulator.pipeline.pipeline.make_pipeline", fail)
 
     async def scenario():
         imager = ThreadImager(SETUP)

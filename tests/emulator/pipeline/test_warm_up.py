@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from numba.core.dispatcher import Dispatcher
 from starhil.emulator.emulation import pipeline_setup
-from starhil.emulator.pipeline.pipeline import make_picture
+from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import Profile
 
 def kernels():
@@ -23,14 +23,14 @@ def kernels():
 
 requests = []
 from starhil.emulator.pipeline import pipeline as module
-frame = module.Picture._frame
-module.Picture._frame = lambda self, request: (requests.append(request), frame(self, request))[1]
-picture, _ = make_picture(pipeline_setup(Profile()))
+frame = module.Pipeline._process_frame
+module.Pipeline._process_frame = lambda self, request: (requests.append(request), frame(self, request))[1]
+pipeline, _ = make_pipeline(pipeline_setup(Profile()))
 before = kernels()
 for rate in ((0.0, 0.0, 0.0), (0.0, 0.0052, 0.0), (0.01, 0.01, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.05)):
     for index in range(4):
         predicted = requests[0].attitude_xyzw if index % 2 else None
-        answer = picture.handle(replace(requests[0], index=index, rate_rad_s=rate, predicted_xyzw=predicted))
+        answer = pipeline.handle(replace(requests[0], index=index, rate_rad_s=rate, predicted_xyzw=predicted))
         assert answer.valid, answer
 print(len(before), sorted(kernels() - before))
 """

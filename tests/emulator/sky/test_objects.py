@@ -186,7 +186,7 @@ def test_plain_values_make_the_same_objects() -> None:
         ({"planets": 4}, "sky planets: a list of tables"),
         ({"false_stars": 1.5}, "false_stars: 1.5 given, a whole number"),
         ({"false_stars": -1}, "false_stars: -1 given"),
-        ({"false_star_magnitudes": [5, 1]}, "the brighter one comes first"),
+        ({"false_star_magnitudes": [5, 1]}, "put the brighter one first"),
         ({"false_star_magnitudes": "bright"}, "two numbers needed"),
         ({"blocked_share": 1.5}, "share: 1.5 given"),
         ({"obstructions": [{"polygon_px": [1, 2]}]}, "polygon_px"),

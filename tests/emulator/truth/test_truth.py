@@ -164,7 +164,7 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
             "line 1: columns qx, qy, qz, qw and ra_deg, dec_deg, roll_deg both give the attitude",
         ),
         ("t,qx,qy,qz,qw,roll_deg\n0,0,0,0,1,0\n", "line 1: columns qx, qy, qz, qw and roll_deg both give"),
-        ("# c\nt,t,qx,qy,qz,qw\n0,1,0,0,0,1\n", "line 2: column t stands there twice"),
+        ("# c\nt,t,qx,qy,qz,qw\n0,1,0,0,0,1\n", "line 2: column t appears twice"),
         ("t,qx,qy,qz,qw,wx_deg_s,wz_deg_s\n0,0,0,0,1,3,3\n", "line 1: column wy_deg_s is missing"),
         ("t,qx,qy,qz,qw\n0,0,0,0," + "1" * 200_000 + "\n", "line 2: not CSV"),
     ],
@@ -275,7 +275,7 @@ def test_live_feed_on_run_time_takes_times_as_they_stand():
         ('{"q":[0,0,0,1],"rate":[1,2]}', "rate is not 3 numbers"),
         ('{"q":[0,0,0,1],"t":"x"}', "t holds"),
         ('{"q":[0,0,0,1],"t":1e999}', "t holds"),
-        ('{"q": [0, 0, 0, 1], "rate": [0, 1e9, 0]}', "rate is beyond 600"),
+        ('{"q": [0, 0, 0, 1], "rate": [0, 1e9, 0]}', "rate exceeds 600"),
     ],
 )
 def test_bad_messages_are_counted_and_named_and_change_nothing(text, said):

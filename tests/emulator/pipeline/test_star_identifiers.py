@@ -9,14 +9,14 @@ import pytest
 
 from starhil.emulator.device.cycle import as_quaternion
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.frames import FrameRequest, PipelineSetup
-from starhil.emulator.pipeline.identifiers import IdentifierChoice, Identifiers
-from starhil.emulator.pipeline.pipeline import Picture
+from starhil.emulator.pipeline.messages import FrameRequest, PipelineSetup
+from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
 
-DEEP = IdentifierChoice("geometric", DEFAULT_CAMERA, 1.0, (("limiting_magnitude", 6.0),))
+DEEP = StarIdentifierSetup("geometric", DEFAULT_CAMERA, 1.0, (("limiting_magnitude", 6.0),))
 SHALLOW = replace(DEEP, options=(("limiting_magnitude", 5.0),))
 WIDE = replace(DEEP, margin=2.0)
 WITHIN_S = 60.0
@@ -27,14 +27,14 @@ ACCURACY_ARCSEC = 20.0
 class Made:
     """Stands for an identifier."""
 
-    choice: IdentifierChoice
+    choice: StarIdentifierSetup
 
 
 class Factory:
     """Makes what stands for identifiers: at once, or when it is let go."""
 
     def __init__(self) -> None:
-        self.made: list[IdentifierChoice] = []
+        self.made: list[StarIdentifierSetup] = []
         self.go = threading.Event()
         self.go.set()
         self.ended = threading.Semaphore(0)
@@ -63,8 +63,8 @@ def factory():
 
 @pytest.fixture
 def beside(factory):
-    """Identifiers with the deep one in force, the factory held."""
-    identifiers = Identifiers(factory, beside=True)
+    """Star identifiers with the deep one in force, the factory held."""
+    identifiers = StarIdentifiers(factory, in_background=True)
     assert identifiers.get(DEEP) == (Made(DEEP), True)  # the first is waited for
     factory.ended.acquire()
     factory.go.clear()
@@ -109,7 +109,7 @@ def test_what_cannot_be_made_is_refused_until_something_else_is_asked_for(factor
 
 
 def test_without_a_thread_each_one_is_waited_for(factory):
-    identifiers = Identifiers(factory, beside=False)
+    identifiers = StarIdentifiers(factory, in_background=False)
     for choice in (DEEP, SHALLOW, SHALLOW, DEEP):
         assert identifiers.get(choice) == (Made(choice), True)
     assert factory.made == [DEEP, SHALLOW, DEEP]
@@ -133,22 +133,22 @@ def test_without_a_thread_each_one_is_waited_for(factory):
 )
 def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, value, said):
     with pytest.raises(EmulatorError, match=said):
-        IdentifierChoice(algorithm, DEFAULT_CAMERA, 1.0, ((option, value),)).make(None)
+        StarIdentifierSetup(algorithm, DEFAULT_CAMERA, 1.0, ((option, value),)).make(None)
 
 
 def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_holds():
     setup = PipelineSetup(
         camera={"fov_deg": 42.0}, sensor={}, sky={}, identifier={"cache": False}, catalog_path="", epoch=2026.0,
-        algorithm="geometric", seed=1, build_beside=True,
+        algorithm="geometric", seed=1, build_in_background=True,
     )  # fmt: skip
-    picture = Picture(setup)
-    magnitude = dict(zip(picture.catalog.hip.tolist(), picture.catalog.v.tolist(), strict=True))
+    pipeline = Pipeline(setup)
+    magnitude = dict(zip(pipeline.catalog.hip.tolist(), pipeline.catalog.v.tolist(), strict=True))
     truth = Attitude.from_radec_roll(83.8, -1.2, 0.0)
     asked = FrameRequest(0, as_quaternion(truth), (0.0, 0.0, 0.0), 0.1, 1.0)
     bright = replace(asked, settings=replace(asked.settings, limiting_magnitude=4.0))
 
     def solve(request):
-        result = picture.handle(request)
+        result = pipeline.handle(request)
         assert result.valid, result
         error = Attitude(np.array(result.quaternion_xyzw)).error_to(truth)
         assert error.cross_boresight_arcsec < ACCURACY_ARCSEC

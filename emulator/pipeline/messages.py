@@ -1,6 +1,6 @@
-"""What crosses between the device and its picture pipeline: a request for a frame, and what came of it.
+"""Requests to the image pipeline and its results.
 
-Plain values only, so that they travel between processes and compare equal in tests.
+Plain values only, so that they can be pickled between processes and compared in tests.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ ZERO: Final[Triple] = (0.0, 0.0, 0.0)
 IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 
 LENGTH: Final = struct.Struct("<I")
-"""Length that goes before each pickled message between the emulator and its worker process."""
+"""Length prefix of each pickled message between the emulator and its worker process."""
 
 IMAGE_EDGES: Final = (1024, 512, 256, 128, 64)
-"""Edges of the square images that can be downloaded, by the number of the published enumeration."""
+"""Edges of the square images for download, pixels, indexed by the published enumeration."""
 
 
 @dataclass(frozen=True)
 class PipelineSetup:
-    """What the pipeline is made of; fixed for a run.
+    """Configuration of the pipeline, fixed for a run.
 
     Attributes
     ----------
     camera, sensor, sky, identifier
-        Values of the camera, fields of the sensor model, of the sky's objects and options of the algorithm, by name.
+        Fields of the camera, the sensor model and the sky objects, and options of the algorithm, by name.
     catalog_path, epoch
-        The catalogue's file (empty: the installed one) and the Julian year of its positions.
+        Catalogue file (empty: the installed one) and the Julian year of the star positions.
     algorithm
         `geometric`, `lsi` or `rsi`.
     seed
         Seed of all noise.
-    build_beside
-        Answer with the star index in force while another is built; without it frames wait, so that the same run gives
-        the same bytes on a clock that waits too.
+    build_in_background
+        Solve with the current star index while another is built. If false, frames wait for the new index, so
+        that a run on the stepped clock is reproducible byte for byte.
     """
 
     camera: dict[str, Any]
@@ -49,12 +49,12 @@ class PipelineSetup:
     epoch: float
     algorithm: str
     seed: int
-    build_beside: bool = False
+    build_in_background: bool = False
 
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Parameters of the device that reach detection, identification and attitude; names as in the interface definition."""
+    """Device parameters used in detection and identification, named as in the interface definition."""
 
     detection_threshold: float = 5.0
     star_threshold: float = 3.0
@@ -79,24 +79,24 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """One exposure to be made and, where asked for, solved.
+    """Render one exposure and, if requested, solve it.
 
     Attributes
     ----------
     index
-        Number of the frame since the start of the run; with the seed it decides the noise.
+        Number of the frame since the start of the run; together with the seed it determines the noise.
     attitude_xyzw, rate_rad_s
         Truth at mid-exposure: quaternion ICRS→sensor, body rate in the sensor frame.
     exposure_s, gain
         Exposure in seconds and analog gain.
     solve
-        Detect and identify; without it the frame is made and kept.
+        Detect and identify stars; if false, the image is only rendered and kept for download.
     predicted_xyzw
-        Attitude expected at mid-exposure, from which to track; None: lost in space.
+        Attitude predicted for mid-exposure, to track from; None: lost in space.
     settings
         Parameters of detection and identification.
     faults
-        Fields of the sky's objects that take the place of the run's own, as the control channel sets them.
+        Fields of the sky objects that the control channel overrides.
     """
 
     index: int
@@ -112,7 +112,7 @@ class FrameRequest:
 
 @dataclass(frozen=True)
 class MatchedStar:
-    """A detection that was identified: Hipparcos number, position in pixels, measured magnitude, signal to noise."""
+    """An identified star: Hipparcos number, position in pixels, measured magnitude, signal-to-noise ratio."""
 
     hip: int
     x: float
@@ -123,32 +123,32 @@ class MatchedStar:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What came of a frame.
+    """Result of a frame request.
 
     Attributes
     ----------
     valid, reason
-        Whether the attitude holds, and why not, by the names of the interface definition.
+        Whether the attitude is valid, and why not, as named in the interface definition.
     tracked
-        Solved from the prediction.
+        True if solved from the prediction.
     quaternion_xyzw
         Attitude ICRS→sensor at mid-exposure; zeros where invalid.
     sigma_cross_arcsec, sigma_roll_arcsec
-        One sigma per axis across, and about, the boresight.
+        One sigma per axis across the boresight, and about it.
     rate_rad_s
-        Body rate where the algorithm itself estimates one.
+        Body rate, if the algorithm estimates one.
     detected, refused, matched
-        Numbers of stars found, of detections refused as stars, of stars identified.
+        Number of stars found, of detections rejected as not stars, of stars identified.
     stars
-        The brightest identified ones, brightest first.
+        The brightest identified stars, brightest first.
     probability_false, rms_px
-        As the identification reports them.
+        As in `starid.solution.Solution`.
     index_pending
-        Solved with the star index of the settings before; the one for those of the request is being built.
+        True if solved with the star index of earlier settings, while the index for these is being built.
     background_dn, noise_dn
         Level and noise of the background, counts.
     render_s, detect_s, identify_s
-        Wall time that the steps took, for the log; never in telemetry.
+        Wall time of each step, for the log; never in telemetry.
     """
 
     index: int
@@ -176,14 +176,14 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class ImageRequest:
-    """Ask for the last frame as a square image of `edge` pixels, or as it is with `edge` 0; 8 bit."""
+    """Return the last image at 8 bits, scaled to a square of `edge` pixels; `edge` 0: unscaled."""
 
     edge: int
 
 
 @dataclass(frozen=True)
 class ImageResult:
-    """An image, row by row; `frame` is the number of the frame that it shows, or -1 if there was none."""
+    """An 8-bit image, row by row; `frame` is the number of its exposure, or -1 if there is none yet."""
 
     width: int
     height: int
@@ -192,17 +192,17 @@ class ImageResult:
 
 
 @dataclass(frozen=True)
-class Warm:
+class PipelineReady:
     """The pipeline is ready.
 
     Attributes
     ----------
     camera
-        The camera with all its constants worked out.
+        Fields of the camera, with derived constants.
     stars
         Number of stars in the catalogue.
     seconds
-        Wall time that it took.
+        Wall time of the start.
     """
 
     camera: dict[str, Any]
@@ -212,6 +212,6 @@ class Warm:
 
 @dataclass(frozen=True)
 class Failure:
-    """The pipeline could not do what was asked."""
+    """A request, or the start of the pipeline, failed."""
 
     text: str

@@ -1,0 +1,52 @@
+"""Options and arguments that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+
+from starhil.emulator.cli.output import output_help
+from starhil.emulator.errors import EmulatorError
+
+AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+SerialPort: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--serial", help="Serial port: /dev/…, socket://HOST:PORT, or auto with --start."),
+]
+CanChannel: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--can", help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …, or auto with --start."
+    ),
+]
+SerialDialect: TypeAlias = Annotated[
+    str, typer.Option("--dialect", help="Format of serial replies: a, b or c.")
+]
+HostAddress: TypeAlias = Annotated[int, typer.Option("--host-address", help="CAN address of the OBC.")]
+DeviceAddress: TypeAlias = Annotated[int, typer.Option("--device-address", help="CAN address of the device.")]
+CanopenNode: TypeAlias = Annotated[
+    int | None,
+    typer.Option("--canopen", min=1, max=127, help="Node ID of the CANopen slave on the CAN channel."),
+]
+JunitFile: TypeAlias = Annotated[
+    Path | None, typer.Option("--junit", help=output_help("Write a JUnit XML file."))
+]
+
+DIALECTS = ("a", "b", "c")
+
+
+def one_of(option: str, value: str, allowed: tuple[str, ...]) -> str:
+    """Return the value of an option.
+
+    Raises
+    ------
+    EmulatorError
+        The value is not allowed; the message lists the allowed ones.
+    """
+    if value not in allowed:
+        *others, last = allowed
+        raise EmulatorError(f"{option} {value}: must be {', '.join(others)} or {last}")
+    return value

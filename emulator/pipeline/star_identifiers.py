@@ -1,0 +1,164 @@
+"""The star identifier in use, and the building of another in the background when parameters change.
+
+A new limiting magnitude or camera needs a new star index, which takes seconds to build. Until it is
+ready, frames are solved with the current identifier.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Final, get_args, get_type_hints
+
+from starhil.emulator.errors import EmulatorError
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+from starid.errors import StaridError
+from starid.interface import ALGORITHMS, StarIdentifier, make_identifier
+
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "float": (int, float),
+    "int": (int,),
+    "bool": (bool,),
+    "str": (str,),
+}
+"""Type name in an annotation → types accepted from a profile."""
+
+
+@dataclass(frozen=True)
+class StarIdentifierSetup:
+    """Everything a star identifier depends on.
+
+    Attributes
+    ----------
+    algorithm
+        `geometric`, `lsi` or `rsi`.
+    camera
+        Camera as calibrated in the device's parameters.
+    margin
+        Tolerance of triangle sides relative to the nominal one; geometric algorithm only.
+    options
+        Keyword arguments of the algorithm's class, sorted by name.
+    """
+
+    algorithm: str
+    camera: Camera
+    margin: float
+    options: tuple[tuple[str, Any], ...]
+
+    def make(self, catalog: StarCatalog) -> StarIdentifier:
+        """Make the star identifier; takes seconds if its index is not cached on disk.
+
+        Raises
+        ------
+        EmulatorError, StaridError
+            Unknown option, or no index can be built from these values.
+        """
+        options = dict(self.options)
+        self._check_options(options)
+        if self.algorithm == "geometric":
+            from starid.geometric.identifier import Effort
+
+            nominal = Effort()
+            options["effort"] = replace(nominal, tolerance_px=nominal.tolerance_px * self.margin)
+        return make_identifier(self.algorithm, self.camera, catalog, **options)
+
+    def _check_options(self, options: dict[str, Any]) -> None:
+        """Reject an option that the algorithm does not have, or a value of the wrong type."""
+        module, name = ALGORITHMS[self.algorithm]
+        known = _known_options(getattr(importlib.import_module(module), name))
+        for option, value in options.items():
+            if option not in known:
+                raise EmulatorError(
+                    f"identifier.{option}: no option of the algorithm {self.algorithm}; known: {', '.join(sorted(known))}"
+                )
+            allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
+            if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
+                raise EmulatorError(
+                    f"identifier.{option}: {value!r} given, {known[option].removesuffix(' | None')} needed"
+                )
+
+
+def _known_options(algorithm: type) -> dict[str, str]:
+    """Return the type of each option of an algorithm's class: its keywords, and the fields of `options`."""
+    types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
+    for held in get_args(get_type_hints(vars(algorithm)["__init__"]).get("options")):
+        if is_dataclass(held):
+            types |= {field.name: str(field.type) for field in fields(held)}
+    return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}
+
+
+@dataclass(frozen=True)
+class _Build:
+    """A star identifier being built in the background."""
+
+    setup: StarIdentifierSetup
+    future: Future[StarIdentifier]
+
+
+class StarIdentifiers:
+    """Provides the star identifier for a setup, or the previous one while that is being built.
+
+    Parameters
+    ----------
+    make
+        Makes a star identifier.
+    in_background
+        Build in a thread; otherwise `get` blocks until the build is done.
+    """
+
+    def __init__(self, make: Callable[[StarIdentifierSetup], StarIdentifier], *, in_background: bool) -> None:
+        self._make = make
+        self._in_background = in_background
+        self._current: tuple[StarIdentifierSetup, StarIdentifier] | None = None
+        self._failed: tuple[StarIdentifierSetup, EmulatorError | StaridError] | None = None
+        self._build: _Build | None = None
+
+    def get(self, setup: StarIdentifierSetup) -> tuple[StarIdentifier, bool]:
+        """Return the current star identifier, and whether it is the one for this setup.
+
+        Raises
+        ------
+        EmulatorError, StaridError
+            None can be made for this setup; raised again at each call.
+        """
+        self._adopt_finished_build()
+        if self._current is None or not self._in_background:
+            if self._current is None or self._current[0] != setup:
+                self._current = (setup, self._make(setup))
+            return self._current[1], True
+        current_setup, identifier = self._current
+        if current_setup == setup:
+            return identifier, True
+        if self._failed is not None and self._failed[0] == setup:
+            error = self._failed[1]
+            raise type(error)(str(error))
+        if self._build is None:
+            self._build = self._start_build(setup)
+        return identifier, False
+
+    def _adopt_finished_build(self) -> None:
+        """Switch to a finished build, even if the setup has changed since: the next one replaces it."""
+        if self._build is None or not self._build.future.done():
+            return
+        build, self._build = self._build, None
+        try:
+            self._current = (build.setup, build.future.result())
+        except (EmulatorError, StaridError) as error:
+            self._failed = (build.setup, error)
+
+    def _start_build(self, setup: StarIdentifierSetup) -> _Build:
+        future: Future[StarIdentifier] = Future()
+
+        def build() -> None:
+            try:
+                future.set_result(self._make(setup))
+            except Exception as error:  # noqa: BLE001 (raised again by future.result())
+                future.set_exception(error)
+
+        threading.Thread(target=build, name="star-identifier", daemon=True).start()
+        return _Build(setup, future)
