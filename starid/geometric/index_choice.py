@@ -134,7 +134,8 @@ def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str 
     path = folder / f"index-{key}.bin"
     stored = index_file.load(path, key)
     if stored is not None:
-        mark_used(path)
+        if cache is True:
+            mark_used(path)
         return stored
     built = index_file.store(path, build_arrays(stars, settings), key)
     evict(keep=path)
