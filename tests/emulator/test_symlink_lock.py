@@ -31,7 +31,7 @@ def test_a_stale_symlink_may_be_claimed_and_one_of_somebody_else_not(tmp_path):
         lock_symlink(foreign)
 
 
-def test_a_claim_ends_with_its_process_however_that_ends(tmp_path):
+def test_a_lock_ends_with_its_process_however_that_ends(tmp_path):
     path = tmp_path / "tty"
     program = (
         "import sys, time; from pathlib import Path; from starhil.emulator.symlink_lock import lock_symlink;"
@@ -40,7 +40,7 @@ def test_a_claim_ends_with_its_process_however_that_ends(tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True
     ) as holder:
-        assert holder.stdout.readline() == "claimed\n"
+        assert holder.stdout.readline() == "locked\n"
         with pytest.raises(EmulatorError, match=f"process {holder.pid};"):
             lock_symlink(path)
         holder.send_signal(signal.SIGKILL)

@@ -128,7 +128,7 @@ def test_with_a_token_nothing_is_done_without_it(run, control):
                 assert answer == {
                     "id": 7,
                     "ok": False,
-                    "error": "token: missing or wrong; give that of --control-token",
+                    "error": "token: missing or wrong; give the one of --control-token",
                 }
             assert not run.launched.ended.is_set()
             assert (await control.do("status", token="sésame"))["ok"]
@@ -166,7 +166,7 @@ def test_a_key_given_twice_is_refused(run):
             ):
                 answer = await control.raw(line)
                 assert answer["ok"] is False
-                assert "given twice" in answer["error"]
+                assert "is repeated" in answer["error"]
             assert not run.launched.ended.is_set()
 
     run(scenario)

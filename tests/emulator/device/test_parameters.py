@@ -75,7 +75,7 @@ def test_a_profile_with_a_rate_that_its_exposure_leaves_no_time_for_is_rejected(
     with pytest.raises(EmulatorError) as rejection:
         make_bench(Profile(name="bench", parameters={"update_rate": 20.0}))
     assert str(rejection.value) == (
-        "profile bench: parameters.update_rate: 20 Hz leaves 50 ms a frame, exposure 100 ms and delay_time 0 ms take 100 ms; "
+        "profile bench: parameters.update_rate: 20 Hz leaves 50 ms per frame, exposure 100 ms and delay_time 0 ms take 100 ms; "
         "set update_rate to 10 Hz or less, or shorten them"
     )
     assert (
