@@ -105,6 +105,7 @@ def _parts(parameters: Parameters) -> list[Part]:
         (f"six-{kind}-{level:g}", {"kind": kind, "level": level, "spread": 0.0, "six": True})
         for kind in _KINDS
         for level in _LEVELS
+        if kind == "both" or level == _LEVELS[-1]
     ]
     wanted = parameters["cases"]
     return [

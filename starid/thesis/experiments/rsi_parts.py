@@ -37,7 +37,10 @@ BY_EQUATION, BY_TABLE = "equation", "table"
 
 
 def rsi_parts(parameters: Parameters) -> list[Part]:
-    """All runs; the side of table 6.8 is known, and tried, for as many false stars as noise only."""
+    """All runs: sets with as many false stars as noise, which the tables print; the others with the memory alone.
+
+    The side of table 6.8 is tried at the first scale of the noise only.
+    """
     return [
         Part(
             f"p{100 * p:g}-f{f}-m{m}-t{tau:g}-n{memory}-{side}-x{scale:g}",
@@ -56,7 +59,8 @@ def rsi_parts(parameters: Parameters) -> list[Part]:
         for tau, memory, side in parameters["methods"]
         for scale in parameters["scales"]
         if (m > 0 or scale == parameters["scales"][0])
-        and (side == BY_EQUATION or (f == m and scale == parameters["scales"][0]))
+        and (side == BY_EQUATION or scale == parameters["scales"][0])
+        and (f == m or memory)
     ]
 
 
