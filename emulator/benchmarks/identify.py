@@ -137,6 +137,7 @@ class Tally:
             "roll_floor_ratio": _ratio(roll, _median(self.floor_roll)),
             "floor_arcsec": _median(self.floor_boresight),
             "normalised_squared_error": float(np.mean(self.squared)) if self.squared else None,
+            "sky": ROWS[self.row].random_points is None,
         }
 
 

@@ -15,7 +15,7 @@ Answer = Mapping[str, Any]
 _HEAD: Final = """# Leaderboard of star identification
 
 `{command}`: the same scenes for all solvers. A row is named by σ of the positions in px, false stars and missing stars of a sensor of 42°
-and stars to V 5.5 where nothing else is said. *Right* counts answers within 0.1° of the truth, *wrong* those farther off; the rest gave none.
+and stars to V 5.5 where nothing else is said. *Right* counts answers within 0.1° of the truth (of random points: none), *wrong* those farther off; the rest gave none.
 A solver that had spent its budget answered fewer scenes.
 """
 
@@ -59,8 +59,8 @@ def ranked(answer: Answer, row: str) -> list[Mapping[str, Any]]:
 
 
 def right(entry: Mapping[str, Any]) -> float:
-    """Share of scenes answered rightly, %."""
-    return float(entry["valid_pct"]) - _wrong(entry)
+    """Share of scenes answered rightly, %; where there is no sky behind the points, no answer is the right one."""
+    return (float(entry["valid_pct"]) if entry["sky"] else 100.0) - _wrong(entry)
 
 
 def _wrong(entry: Mapping[str, Any]) -> float:
@@ -134,16 +134,16 @@ def _plot_rates(answer: Answer, path: Path) -> None:
 
 
 def _plot_times(answer: Answer, path: Path) -> None:
-    """Draw median and 99 % of the time of a solve over all rows."""
+    """Draw median and 99 % of the processor time of a solve, each for the row in the middle of a solver's."""
     from starid.thesis.experiments.plots import figure, save
 
     solvers = _names(answer, "solver")
     fig, axis = figure(width=7.0, height=1.2 + 0.28 * len(solvers))
     places = np.arange(len(solvers))
-    for value, word, marker in (("median_ms", "median", "o"), ("p99_ms", "99 %", "x")):
+    for value, word, marker in (("cpu_median_ms", "median", "o"), ("cpu_p99_ms", "99 %", "x")):
         table = _table(answer, value)
-        axis.plot(np.nanmedian(table, axis=1), places, marker, label=f"{word}: row in the middle")
-    axis.set(xscale="log", xlabel="time of a solve / ms", yticks=places)
+        axis.plot(np.nanmedian(table, axis=1), places, marker, label=word)
+    axis.set(xscale="log", xlabel="processor time of a solve / ms", yticks=places)
     axis.set_yticks(places, solvers, fontsize=7)
     axis.invert_yaxis()
     axis.legend()

@@ -10,7 +10,8 @@ the number of sectors that agree at the best one is their likeness.
 own choice: 120 sectors of 3° and 48 radial bins between 0.1 and 1 times the pattern radius, which is 0.65 of the width of the
 field: at the rim a bin is 29 px wide of 937, at the inner end 3 px. A bin more or less counts as agreement.
 own choice: the paper finds the shift by a string search (Knuth, Morris, Pratt) that bears with misses. Here a histogram
-of the shifts that bring equal codes together gives the number of agreements of all shifts at once.
+of the shifts that bring equal codes together gives the number of agreements of all shifts at once, and an index of the strings by radial
+bin leads to those codes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.classic.neighbours import MOST_TIED, add_winners, neighbours_of, turned
+from starid.classic.neighbours import MOST_TIED, add_winners, grouped, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
@@ -68,38 +69,58 @@ def _strings(vectors: NDArray[np.float64], radius: float) -> NDArray[np.uint8]:
     return codes
 
 
+@compiled_ieee
+def _ring_index(
+    codes: NDArray[np.uint8],
+) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.uint8]]:
+    """Entries of all strings by ring: first entry of each ring, star and sector of each entry."""
+    count = np.count_nonzero(codes)
+    rings, stars = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.uint16)
+    sectors = np.empty(count, dtype=np.uint8)
+    filled = 0
+    for star in range(codes.shape[0]):
+        for sector in range(SECTORS):
+            if codes[star, sector] > 0:
+                rings[filled], stars[filled], sectors[filled] = codes[star, sector] - 1, star, sector
+                filled += 1
+    start, order = grouped(rings, RINGS)
+    return start, stars[order], sectors[order]
+
+
 @inner
-def _likeness(
-    seen: NDArray[np.uint8], places: NDArray[np.int64], other: NDArray[np.uint8], shifts: NDArray[np.int32]
-) -> int:
-    """Most sectors that agree at any shift, a sector and a ring more or less allowed."""
-    shifts[:] = 0
-    for sector in range(SECTORS):
-        if other[sector] == 0:
-            continue
-        for place in places:
-            if abs(int(seen[place]) - int(other[sector])) <= 1:
-                shifts[(sector - place) % SECTORS] += 1
-    best = 0
-    for shift in range(SECTORS):
-        total = shifts[shift - 1] + shifts[shift] + shifts[(shift + 1) % SECTORS]
-        best = max(best, total)
-    return best
+def _most_agreeing(shifts: NDArray[np.int16], agreeing: NDArray[np.int32]) -> None:
+    """Fill in, for each star, the most sectors that agree at any shift, a sector more or less allowed."""
+    for star in range(shifts.shape[0]):
+        agreeing[star] = 0
+        for shift in range(SECTORS):
+            total = shifts[star, shift - 1] + shifts[star, shift] + shifts[star, (shift + 1) % SECTORS]
+            agreeing[star] = max(agreeing[star], total)
 
 
 @compiled_ieee
-def _compare(codes: NDArray[np.uint8], seen: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
+def _compare(
+    index: tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.uint8]],
+    stars: int,
+    seen: NDArray[np.float64],
+    radius: float,
+) -> NDArray[np.int64]:
     """Matches (m, 2) of each observed star with the guide stars most like it."""
+    start, owner, sectors = index
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    code, shifts = np.empty(SECTORS, dtype=np.uint8), np.empty(SECTORS, dtype=np.int32)
+    code, shifts = np.empty(SECTORS, dtype=np.uint8), np.empty((stars, SECTORS), dtype=np.int16)
     matches = np.empty((seen.shape[0] * MOST_TIED, 2), dtype=np.int64)
-    agreeing = np.empty(codes.shape[0], dtype=np.int32)
+    agreeing = np.empty(stars, dtype=np.int32)
     filled = 0
     for pivot in range(seen.shape[0]):
         log_polar_string(seen, pivot, radius, polar, rows, code)
-        places = np.flatnonzero(code)
-        for star in range(codes.shape[0]):
-            agreeing[star] = _likeness(code, places, codes[star], shifts)
+        shifts[:] = 0
+        for place in range(SECTORS):
+            ring = int(code[place]) - 1
+            if ring < 0:
+                continue
+            for entry_row in range(start[max(ring - 1, 0)], start[min(ring + 2, RINGS)]):
+                shifts[owner[entry_row], (sectors[entry_row] + SECTORS - place) % SECTORS] += 1
+        _most_agreeing(shifts, agreeing)
         filled = add_winners(agreeing, LEAST_AGREEING, pivot, matches, filled)
     return matches[:filled]
 
@@ -111,8 +132,8 @@ class LogPolarIdentifier(ClassicIdentifier):
 
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad
-        self.codes = _strings(self.guide.vectors, self._radius)
-        return (self.codes,)
+        self.index = _ring_index(_strings(self.guide.vectors, self._radius))
+        return self.index
 
     def _match(self, observed: Observed) -> NDArray[np.int64]:
-        return _compare(self.codes, observed.directions, self._radius)
+        return _compare(self.index, len(self.guide), observed.directions, self._radius)

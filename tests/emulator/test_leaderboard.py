@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def oracle(tmp_path, monkeypatch):
 def entry(solver: str, *, valid: float, wrong: int, cpu: float, row: str = "0.5") -> dict:
     return {
         "row": row, "solver": solver, "frames": 10, "valid_pct": valid, "wrong": wrong, "boresight_median_arcsec": 9.0,
-        "floor_ratio": 1.0, "median_ms": cpu, "p99_ms": 2.0 * cpu, "cpu_median_ms": cpu,
+        "floor_ratio": 1.0, "median_ms": cpu, "p99_ms": 2.0 * cpu, "cpu_median_ms": cpu, "cpu_p99_ms": 2.0 * cpu, "sky": True,
     }  # fmt: skip
 
 
@@ -65,6 +66,7 @@ def test_wrong_answers_rank_below_missing_ones_and_slow_below_fast() -> None:
     order = [item["solver"] for item in ranked({"rows": entries}, "0.5")]
     assert order == ["fast", "slow", "silent", "wrong"]
     assert right(entries[0]) == pytest.approx(90.0)
+    assert right(entry("silent", valid=0.0, wrong=0, cpu=0.1) | {"sky": False}) == pytest.approx(100.0)
 
 
 def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
@@ -180,3 +182,14 @@ def test_the_command_writes_report_data_and_pictures(tmp_path, oracle) -> None:
     assert {path.name for path in (tmp_path / "board").iterdir()} == {
         "leaderboard.md", "leaderboard.json", "rates.png", "times.png",
     }  # fmt: skip
+
+
+def test_the_solver_of_the_documents_works_as_it_stands(tmp_path, monkeypatch) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    program = text.split("```python\n")[1].split("```")[0]
+    assert len(program.splitlines()) <= 30
+    (tmp_path / "my_solver.py").write_text(program)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    answer = bench.run(2, 5, own=["my_solver:make"], rows=["0.5"])
+    assert (answer["rows"][0]["valid_pct"], answer["rows"][0]["wrong"]) == (100.0, 0)
+    assert answer["solvers"][0]["database_kb"] > 0
