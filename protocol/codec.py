@@ -25,7 +25,7 @@ from starhil.protocol.values import (
 RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
-_CONSTRUCTS: Final[dict[str, Any]] = {
+_SCALARS: Final[dict[str, Any]] = {
     "u8": construct.Int8ul,
     "i8": construct.Int8sl,
     "u16": construct.Int16ul,
@@ -52,10 +52,10 @@ class Slot:
     size: int
     """Number of bytes."""
 
-    @property
-    def key(self) -> str:
-        """Name of the slot in the construct layout."""
-        return f"slot_{self.index}"
+    @cached_property
+    def bits_key(self) -> str:
+        """Name of the slot's group of bits in the construct; no field can have this name."""
+        return f"bits of slot {self.index}"
 
 
 @dataclass(frozen=True)
@@ -286,6 +286,21 @@ class Field:
         return whole
 
 
+def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
+    """Return the construct of one slot: a scalar, raw bytes, a bit field or padding."""
+    if fields[0].width:
+        bits = construct.BitStruct(
+            *(
+                field.name / construct.BitsInteger(field.width) if field.name else construct.Padding(field.width)
+                for field in reversed(fields)  # construct declares the most significant bit first
+            )
+        )
+        return slot.bits_key / construct.ByteSwapped(bits)
+    if not fields[0].name:
+        return construct.Padding(slot.size)
+    return fields[0].name / (construct.Bytes(slot.size) if slot.type == "bytes" else _SCALARS[slot.type])
+
+
 @dataclass(frozen=True, repr=False)
 class Row:
     """A telecommand or telemetry row: its identity, its layout, and the codec between values and bytes."""
@@ -314,12 +329,10 @@ class Row:
 
     @cached_property
     def layout(self) -> Any:
-        """The construct declaration of the row's bytes, slot by slot."""
-        members = [
-            slot.key / (construct.Bytes(slot.size) if slot.type == "bytes" else _CONSTRUCTS[slot.type])
-            for slot in self.slots
-        ]
-        return construct.Struct(*members)
+        """The construct of the row's bytes: raw values by field name, bits in a group per slot."""
+        return construct.Struct(
+            *(_slot_layout(slot, [field for field in self.fields if field.slot is slot]) for slot in self.slots)
+        )
 
     def encode(
         self, values: Mapping[str, Value] | None = None, *, check: bool = True, saturate: bool = False
@@ -347,9 +360,7 @@ class Row:
         if unknown:
             known = ", ".join(self.named_fields) or "none"
             raise FieldError(f"{self.name}.{min(unknown)}: no such field (fields: {known})")
-        raw: dict[str, Any] = {
-            slot.key: bytes(slot.size) if slot.type == "bytes" else 0 for slot in self.slots
-        }
+        raw: dict[str, Any] = {slot.bits_key: {} for slot in self.slots}
         for index, (name, item) in enumerate(self.named_fields.items()):
             where = f"{self.name}.{name}"
             value = given.get(name)
@@ -357,11 +368,8 @@ class Row:
                 if self.kind == "telecommand" and item.default is None:
                     raise FieldError(f"{where}: no value given", index=index)
                 value = item.empty
-            number = item.to_raw(value, where, check=check, saturate=saturate, index=index)
-            if item.width:
-                raw[item.slot.key] |= int(number) << item.shift
-            else:
-                raw[item.slot.key] = number
+            group = raw[item.slot.bits_key] if item.width else raw
+            group[name] = item.to_raw(value, where, check=check, saturate=saturate, index=index)
         return bytes(self.layout.build(raw))
 
     def decode(self, data: bytes, *, check: bool | None = None) -> dict[str, Value]:
@@ -377,9 +385,7 @@ class Row:
         raw = self.layout.parse(data)
         values: dict[str, Value] = {}
         for index, (name, item) in enumerate(self.named_fields.items()):
-            number = raw[item.slot.key]
-            if item.width:
-                number = (number >> item.shift) & (2**item.width - 1)
+            number = (raw[item.slot.bits_key] if item.width else raw)[name]
             if strict:
                 item.check_raw(number, f"{self.name}.{name}", index)
             values[name] = item.to_physical(number)
