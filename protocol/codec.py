@@ -291,7 +291,9 @@ def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
     if fields[0].width:
         bits = construct.BitStruct(
             *(
-                field.name / construct.BitsInteger(field.width) if field.name else construct.Padding(field.width)
+                field.name / construct.BitsInteger(field.width)
+                if field.name
+                else construct.Padding(field.width)
                 for field in reversed(fields)  # construct declares the most significant bit first
             )
         )
@@ -331,7 +333,10 @@ class Row:
     def layout(self) -> Any:
         """The construct of the row's bytes: raw values by field name, bits in a group per slot."""
         return construct.Struct(
-            *(_slot_layout(slot, [field for field in self.fields if field.slot is slot]) for slot in self.slots)
+            *(
+                _slot_layout(slot, [field for field in self.fields if field.slot is slot])
+                for slot in self.slots
+            )
         )
 
     def encode(

@@ -16,6 +16,13 @@ WINDOW: Final = 16 * 1024
 """Bytes that each buffer on the way of a connection holds at most: what lies there delays what comes after it."""
 
 
+KEEPALIVE: Final = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 3}
+"""Probe a connection after 5 s of silence, then every 2 s; it is lost after 3 probes without an answer."""
+
+UNREAD_LIMIT_MS: Final = 10_000
+"""A server is lost when it has not acknowledged sent data for this time."""
+
+
 class TurnProtocol(asyncio.BufferedProtocol):
     """A connection that reads at most `TURN` bytes before the loop serves the others."""
 
@@ -37,11 +44,32 @@ class TurnProtocol(asyncio.BufferedProtocol):
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
-    """Let the kernel hold little of a TCP connection: by itself it takes megabytes, which are seconds of work."""
-    connection: socket.socket | None = transport.get_extra_info("socket")
-    if connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6):
+    """Limit the kernel's buffers of a TCP connection: by default they hold megabytes, seconds of work."""
+    connection = _tcp_socket(transport)
+    if connection is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WINDOW)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
+
+
+def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
+    """Close a silent TCP connection within about ten seconds of the other machine's disappearance.
+
+    With `must_read` a peer that is alive but reads nothing for that long is lost too. That is right for a server, but
+    not for a client program that is halted in a debugger.
+    """
+    connection = _tcp_socket(transport)
+    if connection is None:
+        return
+    options = KEEPALIVE | {socket.TCP_USER_TIMEOUT: UNREAD_LIMIT_MS} if must_read else KEEPALIVE
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in options.items():
+        connection.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
+def _tcp_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
+    connection: socket.socket | None = transport.get_extra_info("socket")
+    is_tcp = connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6)
+    return connection if is_tcp else None
 
 
 class FairQueue:

@@ -21,8 +21,7 @@ from typing import Final, TextIO, cast
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import format_candump
 from starhil.protocol.errors import ProtocolError, reason
-from starhil.protocol.flow import WINDOW, FairQueue, TurnProtocol, limit_buffers
-from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.flow import WINDOW, FairQueue, TurnProtocol, detect_lost_peer, limit_buffers
 from starhil.protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
 _LOGGER: Final = logging.getLogger("starhil.hub")
@@ -81,7 +80,7 @@ class _Client(TurnProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        notice_a_lost_peer(transport)
+        detect_lost_peer(transport)
         limit_buffers(transport)
         self._transport.set_write_buffer_limits(high=WINDOW)
         self._transport.write(b"< hi >")

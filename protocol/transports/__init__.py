@@ -2,7 +2,8 @@
 
 from starhil.protocol.transports.base import Statistics, Transport, TransportError
 from starhil.protocol.transports.can import CanTransport, open_can
-from starhil.protocol.transports.serial import SerialTransport, open_serial
+from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.transports.serial import open_serial
 
 __all__ = [
     "CanTransport",

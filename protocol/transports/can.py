@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import fcntl
-import logging
 import socket
 import struct
 from functools import partial
@@ -15,13 +13,10 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.errors import ProtocolError
-from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT, CanHub
+from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT
 from starhil.protocol.transports.base import Transport, TransportError
-from starhil.protocol.transports.hub_client import HubTransport
+from starhil.protocol.transports.hub_client import AutoHubTransport, HubTransport
 from starhil.protocol.transports.python_can import OpenBus, PythonCanTransport
-
-_LOGGER: Final = logging.getLogger("starhil.transport")
 
 CanTransport = Transport[CanFrame]
 
@@ -133,46 +128,3 @@ def _check_kernel(channel: str) -> None:
         raise OSError(errno.ENODEV, f"no such interface; {remedy}")
     if not kernel_can_is_up(channel):
         raise OSError(errno.ENETDOWN, f"interface is down; bring it up: ip link set {channel} up")
-
-
-class AutoHubTransport(HubTransport):
-    """Joins the hub at an address, and starts it in this process whenever nobody answers there.
-
-    Port 0 starts a hub of its own at a free port.
-    """
-
-    def __init__(self, host: str, port: int) -> None:
-        super().__init__(host, port, DEFAULT_BUS, self._ensure_hub)
-        self._hub: CanHub | None = None
-
-    async def _ensure_hub(self) -> None:
-        if self._hub is not None or (self._port and await self._answers()):
-            return
-        hub = CanHub(self._host, self._port)
-        try:
-            await hub.start()
-        except ProtocolError:
-            if not await self._answers():
-                raise
-            return
-        self._hub = hub
-        if self._comeback is not None:
-            _LOGGER.warning("CAN %s: the hub there has ended; this process serves it now", self.description)
-        self._port = hub.port
-        self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
-
-    async def _answers(self) -> bool:
-        """Whether somebody listens at the address."""
-        try:
-            _, writer = await asyncio.open_connection(self._host, self._port)
-        except OSError:
-            return False
-        writer.close()
-        return True
-
-    async def close(self) -> None:
-        """Leave the bus, and end the hub if it was started here."""
-        await super().close()
-        if self._hub is not None:
-            await self._hub.close()
-            self._hub = None

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Awaitable, Callable
 from typing import Final, cast
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.errors import reason
-from starhil.protocol.flow import WINDOW, TurnProtocol, limit_buffers
-from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.errors import ProtocolError, reason
+from starhil.protocol.flow import WINDOW, TurnProtocol, detect_lost_peer, limit_buffers
+from starhil.protocol.hub import DEFAULT_BUS, CanHub
 from starhil.protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from starhil.protocol.transports.base import ReturningTransport, TransportError
+
+_LOGGER: Final = logging.getLogger("starhil.transport")
 
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
 """Bytes that wait for a hub that does not read at most."""
@@ -49,7 +52,7 @@ class _Connection(TurnProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)
-        notice_a_lost_peer(transport, must_read=True)
+        detect_lost_peer(transport, must_read=True)
         limit_buffers(transport)
         self.transport.set_write_buffer_limits(high=0)
 
@@ -220,3 +223,46 @@ class HubTransport(ReturningTransport[CanFrame]):
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.drain(), CLOSE_S)
         await super().close()
+
+
+class AutoHubTransport(HubTransport):
+    """Joins the hub at an address, and starts it in this process whenever nobody answers there.
+
+    Port 0 starts a hub of its own at a free port.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(host, port, DEFAULT_BUS, self._ensure_hub)
+        self._hub: CanHub | None = None
+
+    async def _ensure_hub(self) -> None:
+        if self._hub is not None or (self._port and await self._answers()):
+            return
+        hub = CanHub(self._host, self._port)
+        try:
+            await hub.start()
+        except ProtocolError:
+            if not await self._answers():
+                raise
+            return
+        self._hub = hub
+        if self._comeback is not None:
+            _LOGGER.warning("CAN %s: the hub there has ended; this process serves it now", self.description)
+        self._port = hub.port
+        self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
+
+    async def _answers(self) -> bool:
+        """Whether somebody listens at the address."""
+        try:
+            _, writer = await asyncio.open_connection(self._host, self._port)
+        except OSError:
+            return False
+        writer.close()
+        return True
+
+    async def close(self) -> None:
+        """Leave the bus, and end the hub if it was started here."""
+        await super().close()
+        if self._hub is not None:
+            await self._hub.close()
+            self._hub = None

@@ -15,7 +15,7 @@ import serial
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports import TransportError, open_serial
-from starhil.protocol.transports.paced_writer import BACKLOG_LIMIT
+from starhil.protocol.transports.paced import BACKLOG_LIMIT
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 
 

@@ -1,14 +1,19 @@
-"""Bytes leave as on a serial line: at the bit rate, without ever blocking, with a bounded backlog."""
+"""Serial transports that send at the bit rate of a line, never block, and keep a bounded backlog."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
+import termios
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 from starhil.protocol.serial_framing import PacingSchedule
-from starhil.protocol.transports.base import Statistics
+from starhil.protocol.transports.base import Statistics, Transport
 
 BACKLOG_LIMIT: Final = 64 * 1024
 """Bytes that wait at most, for the line or for a peer that does not read."""
@@ -143,3 +148,79 @@ class PacedWriter:
         while self._queue and count >= len(self._queue[0][1]):
             count -= len(self._queue.popleft()[1])
         self._gone = count
+
+
+class SerialTransport(Transport[bytes]):
+    """A serial port."""
+
+    @abstractmethod
+    def set_baud(self, baud: int) -> None:
+        """Go on at another bit rate as soon as all that was queued has left."""
+
+
+class PacedTransport(SerialTransport):
+    """Common part: the paced writer in front of the port."""
+
+    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
+        super().__init__(description)
+        self._schedule = schedule
+        self._writer: PacedWriter | None = None
+
+    def set_baud(self, baud: int) -> None:
+        """Change the bit rate once the queue is empty."""
+        if self._writer is None:
+            self._change_rate(baud)
+        else:
+            self._writer.when_idle(partial(self._change_rate, baud))
+
+    def _change_rate(self, baud: int) -> None:
+        """Take another bit rate into use; nothing is queued."""
+        if self._schedule is not None:
+            self._schedule = PacingSchedule(baud)
+            if self._writer is not None:
+                self._writer.schedule = self._schedule
+
+    @abstractmethod
+    def _write(self, data: bytes) -> int:
+        """Write without blocking; return how many bytes were taken."""
+
+    def _make_writer(self) -> None:
+        self._writer = PacedWriter(self._write, self._schedule, self.statistics)
+
+    def send(self, item: bytes) -> bool:
+        """Queue a message, whole or not at all; without an open port it is dropped."""
+        if self._writer is None:
+            self.statistics.dropped += len(item)
+            return False
+        return self._writer.send(item)
+
+    async def drain(self) -> None:
+        """Wait until the queue is empty."""
+        if self._writer is not None:
+            await self._writer.drain()
+
+    def _drop_writer(self) -> None:
+        if self._writer is not None:
+            self._writer.clear()
+            self._writer = None
+
+    def _take(self, data: bytes) -> None:
+        self.statistics.received += len(data)
+        self._receive(data)
+
+
+def write_fd(fd: int, data: bytes) -> int:
+    """Write to a non-blocking descriptor; return how many bytes it accepted, 0 if it is full."""
+    try:
+        return os.write(fd, data)
+    except BlockingIOError:
+        return 0
+
+
+@contextlib.contextmanager
+def termios_as_os_error() -> Iterator[None]:
+    """Raise what the terminal settings refuse as the OSError that it is, which `termios.error` does not derive from."""
+    try:
+        yield
+    except termios.error as error:
+        raise OSError(*error.args) from None

@@ -1,0 +1,234 @@
+"""Serial transport over a pseudo-terminal, and the detection of who has its slave side open.
+
+A wire keeps nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while nobody has the
+slave side open. inotify reports the openings and closings when one peer leaves and another comes at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import errno
+import os
+import select
+import struct
+import termios
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from starhil.protocol.flow import TURN
+from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
+
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
+_IN_CLOSE: Final = 0x08 | 0x10
+_IN_OPEN: Final = 0x20
+_EVENT: Final = struct.Struct("iIII")
+_EVENTS_SIZE: Final = 256 * _EVENT.size
+
+
+class PtyPeers:
+    """Watches the slave side of a pseudo-terminal that this process does not hold open itself.
+
+    Parameters
+    ----------
+    master
+        File descriptor of the master side.
+    path
+        Path of the slave side.
+
+    Without inotify (the system's instances are used up) only a peer that leaves and is not replaced at once is noticed.
+    """
+
+    def __init__(self, master: int, path: str) -> None:
+        self._master = master
+        self._path = path
+        self._hang_up = select.poll()
+        self._hang_up.register(master, 0)
+        self._events = _watch(path)
+        self._wake = select.epoll()
+        self._wake.register(master, select.EPOLLIN | select.EPOLLET)  # a hang-up lasts: report it once
+        if self._events >= 0:
+            self._wake.register(self._events, select.EPOLLIN)
+        self._present = self.present
+
+    def fileno(self) -> int:
+        """File descriptor that is readable when there is something to read, or peers came or left."""
+        return self._wake.fileno()
+
+    def acknowledge(self) -> None:
+        """Take note of the wake-up: the next one comes when there is more."""
+        self._wake.poll(0)
+
+    @property
+    def present(self) -> bool:
+        """Whether anybody has the slave side open now."""
+        return not self._hang_up.poll(0)
+
+    def all_left(self) -> bool:
+        """Whether all peers have left since the last call, if only for a moment."""
+        before, self._present = self._present, self.present
+        return _replaced(self._new_events()) or (before and not self._present)
+
+    def discard_unread(self) -> None:
+        """Drop what was written to the master and not read."""
+        termios.tcflush(self._master, termios.TCOFLUSH)  # what is on its way to the line discipline
+        with contextlib.suppress(PermissionError, BlockingIOError):
+            slave = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            try:
+                termios.tcflush(slave, termios.TCIFLUSH)  # what the line discipline holds
+            finally:
+                os.close(slave)
+        for _ in self._new_events():  # this visit, and whoever came since: nothing stale is left for them
+            pass
+        self._present = self.present
+
+    def close(self) -> None:
+        """Give the descriptors back."""
+        self._wake.close()
+        if self._events >= 0:
+            os.close(self._events)
+            self._events = -1
+
+    def _new_events(self) -> Iterator[int]:
+        """Masks of the events since the last call, oldest first."""
+        while self._events >= 0:
+            try:
+                data = os.read(self._events, _EVENTS_SIZE)
+            except BlockingIOError:
+                return
+            for _, mask, _, _ in _EVENT.iter_unpack(data):  # a file by itself: events carry no names
+                yield mask
+
+
+def _replaced(events: Iterator[int]) -> bool:
+    """Whether somebody opened the file after somebody had closed it."""
+    closed = replaced = False
+    for mask in events:
+        closed |= bool(mask & _IN_CLOSE)
+        replaced |= closed and bool(mask & _IN_OPEN)
+    return replaced
+
+
+def _watch(path: str) -> int:
+    """File descriptor of the openings and closings of a file, or -1 where the system gives none."""
+    events = int(_LIBC.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC))
+    if events >= 0 and _LIBC.inotify_add_watch(events, os.fsencode(path), _IN_OPEN | _IN_CLOSE) < 0:
+        os.close(events)
+        return -1
+    return events
+
+
+class PtyTransport(PacedTransport):
+    """An own pseudo-terminal; the peer opens its slave side like any tty, as often as it wants.
+
+    As on a wire, what is sent while nobody has the slave side open is lost, and so is what a peer has left unread.
+    """
+
+    def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
+        super().__init__("pty", schedule)
+        self._symlink = symlink
+        self._path = ""
+        self._master = -1
+        self._peers: PtyPeers | None = None
+
+    async def _open(self) -> None:
+        try:
+            self._master, slave = os.openpty()
+        except OSError as error:
+            raise TransportError(
+                f"serial pty: the system gives no pseudo-terminal: {error.strerror}"
+            ) from None
+        try:
+            with termios_as_os_error():
+                tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            self._path = os.ttyname(slave)
+            if self._symlink is not None:
+                self._link(self._symlink, self._path)
+        except OSError as error:
+            self._close_master()
+            raise TransportError(f"serial pty: cannot be set up: {error.strerror}; try again") from None
+        except TransportError:
+            self._close_master()
+            raise
+        finally:
+            os.close(slave)  # the master hangs up while no peer has it open
+        self.description = str(self._symlink) if self._symlink is not None else self._path
+        self._make_writer()
+        self._peers = PtyPeers(self._master, self._path)
+        asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
+
+    def _link(self, link: Path, path: str) -> None:
+        try:
+            if link.exists() and not link.is_symlink():
+                raise TransportError(f"serial: {link} exists and is no symlink; choose another name")
+            fresh = link.with_name(f".{link.name}.{os.getpid()}")
+            fresh.symlink_to(path)
+            fresh.replace(link)
+        except OSError as error:
+            raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
+
+    def _readable(self) -> None:
+        if self._peers is None:
+            return
+        self._peers.acknowledge()
+        self._lose_unread(self._peers)
+        try:
+            data = os.read(self._master, TURN)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            if error.errno != errno.EIO:  # that is: nobody has the slave side open
+                self._complain(f"serial {self.description}: {error.strerror}")
+            return
+        asyncio.get_running_loop().call_soon(self._readable)  # the wake-up came once for all there is
+        self._take(data)
+
+    def _lose_unread(self, peers: PtyPeers) -> None:
+        """Drop what a peer that left has not read, and what was still to be sent to it."""
+        if peers.all_left():
+            if self._writer is not None:
+                self._writer.clear()
+            peers.discard_unread()
+
+    def send(self, item: bytes) -> bool:
+        """Queue a message, whole or not at all; without a peer it is lost."""
+        if self._peers is not None:
+            self._lose_unread(self._peers)
+            if not self._peers.present:
+                self.statistics.dropped += len(item)
+                return False
+        return super().send(item)
+
+    def _write(self, data: bytes) -> int:
+        if self._peers is None:
+            raise OSError(errno.EBADF, "port is closed")
+        if self._peers.all_left():
+            self._peers.discard_unread()
+            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops what was to be sent to it
+        if not self._peers.present:
+            raise OSError(errno.ENOTCONN, "no peer")
+        return write_fd(self._master, data)
+
+    async def close(self) -> None:
+        """Give the pseudo-terminal back and take away the symlink, if it still leads here."""
+        if self._peers is None:
+            return
+        asyncio.get_running_loop().remove_reader(self._peers.fileno())
+        self._drop_writer()
+        if self._symlink is not None:
+            with contextlib.suppress(OSError):
+                if str(self._symlink.readlink()) == self._path:
+                    self._symlink.unlink()
+        self._peers.close()
+        self._peers = None
+        self._close_master()
+
+    def _close_master(self) -> None:
+        os.close(self._master)
+        self._master = -1
