@@ -1,4 +1,11 @@
-"""Rows of the interface definition as codecs: physical values to wire bytes and back, over construct."""
+"""Codecs of the rows of an interface definition: physical values to wire bytes and back.
+
+construct declares and packs the layout of a row; `Field` converts between raw and physical values, with limits and
+error texts that name row and field. Against scalars in construct and shifts of our own, the declaration of bit fields
+in construct costs nothing to encode and 1.4 times the time to decode, at most: 146 and 110 µs for the 39 fields of
+`star_tracker`, 21 and 15 µs for the 3 of `quaternion`. `Struct.compile` would save up to half of that, but takes
+1.3 ms per row at first use.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +48,7 @@ _SCALARS: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Slot:
-    """A run of bytes in a row: one scalar, or the raw bytes of a field."""
+    """Consecutive bytes of a row: one scalar, or the raw bytes of a field."""
 
     index: int
     """Position among the row's slots."""
@@ -60,22 +67,22 @@ class Slot:
 
 @dataclass(frozen=True)
 class Field:
-    """One value of a row: a slot of its own, or some bits of one."""
+    """One value of a row: a whole slot, or some bits of one."""
 
     name: str
-    """Key in the row's values; empty for unused bytes."""
+    """Key in the row's values; empty for unused bytes or bits."""
     kind: FieldKind
     slot: Slot
     shift: int = 0
     """Lowest bit in the slot (flags and bit groups)."""
     width: int = 0
-    """Bits in the slot; 0 where the field has the slot to itself."""
+    """Bits in the slot; 0 if the field is the whole slot."""
     unit: str = ""
     scale: float = 1.0
     """Physical = raw * scale + bias."""
     bias: float = 0.0
     minimum: float | None = None
-    """Least physical value; None if only the type limits it."""
+    """Lowest physical value; None if only the type limits it."""
     maximum: float | None = None
     enum: EnumDefinition | None = None
     default: bool | int | float | str | None = None
@@ -84,7 +91,7 @@ class Field:
     provenance: str = "ours"
     doc: str = ""
     wrap: bool = False
-    """Beyond its range telemetry carries the lowest bits (a counter) instead of the nearest limit."""
+    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the nearest limit."""
 
     @property
     def type(self) -> str:
@@ -108,7 +115,7 @@ class Field:
 
     @cached_property
     def raw_limits(self) -> tuple[int, int]:
-        """Least and greatest raw value of an integer, flag, bit group or enumeration."""
+        """Lowest and highest raw value of an integer, flag, bit group or enumeration."""
         low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
         if self.minimum is not None:
             low = max(low, round((self.minimum - self.bias) / self.scale))
@@ -118,7 +125,7 @@ class Field:
 
     @cached_property
     def physical_limits(self) -> tuple[float, float]:
-        """Least and greatest physical value of a number."""
+        """Lowest and highest physical value of a number."""
         if self.kind == "float":
             widest = F32_MAX if self.slot.type == "f32" else math.inf
             low = -widest if self.minimum is None else self.minimum
@@ -128,13 +135,13 @@ class Field:
 
     @cached_property
     def _divisor(self) -> int | None:
-        """1/scale where that is a whole number: dividing by it gives the nearest decimal."""
+        """1/scale if that is an integer: division by it is exact to the nearest decimal, multiplication is not."""
         inverse = round(1.0 / self.scale)
         return inverse if inverse and abs(inverse * self.scale - 1.0) < 1e-12 else None
 
     @cached_property
     def empty(self) -> bool | int | float | str | bytes:
-        """The value that telemetry carries where none is given: the default, else zero moved into the limits."""
+        """The value that telemetry sends if none is given: the default, else the value nearest zero within the limits."""
         if self.default is not None:
             return self.default
         match self.kind:
@@ -154,17 +161,17 @@ class Field:
                 return min(max(0, self.raw_limits[0]), self.raw_limits[1]) * self.scale + self.bias
 
     def clips(self, value: float) -> bool:
-        """Whether telemetry would carry the nearest limit in place of a number."""
+        """Return whether telemetry would send the nearest limit instead of this number."""
         if self.wrap:
             return False
         low, high = self.physical_limits
-        slack = self.scale / 2.0 if self.kind == "integer" else 0.0
-        return not low - slack <= value <= high + slack
+        margin = self.scale / 2.0 if self.kind == "integer" else 0.0
+        return not low - margin <= value <= high + margin
 
     def to_raw(
         self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
     ) -> int | float | bytes:
-        """Turn a physical value into the raw value of its slot or bits; raise FieldError if it cannot be."""
+        """Convert a physical value to the raw value of its slot or bits; raise FieldError if it does not fit."""
         match self.kind:
             case "bytes":
                 return self._bytes_to_raw(value, where, index)
@@ -182,7 +189,7 @@ class Field:
                 return self._integer_to_raw(value, where, check=check, saturate=saturate, index=index)
 
     def to_physical(self, raw: Any) -> Value:
-        """Turn a raw value into the physical one; an enumeration's unknown number stays a number."""
+        """Convert a raw value to the physical one; a number that is not in the enumeration stays a number."""
         match self.kind:
             case "flag":
                 return bool(raw)
@@ -305,7 +312,7 @@ def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
 
 @dataclass(frozen=True, repr=False)
 class Row:
-    """A telecommand or telemetry row: its identity, its layout, and the codec between values and bytes."""
+    """A telecommand or telemetry row: id and name, layout, and the codec between values and bytes."""
 
     kind: RowKind
     id: int
@@ -321,7 +328,7 @@ class Row:
     source: str = ""
 
     def __repr__(self) -> str:
-        """Return what tells the row apart."""
+        """Return kind, id and name."""
         return f"Row({self.kind} {self.id} {self.name})"
 
     @cached_property
@@ -342,23 +349,23 @@ class Row:
     def encode(
         self, values: Mapping[str, Value] | None = None, *, check: bool = True, saturate: bool = False
     ) -> bytes:
-        """Turn physical values into the row's bytes.
+        """Encode physical values as the row's bytes.
 
         Parameters
         ----------
         values:
-            Value of each field by name. Telemetry fills what is missing with the default or zero; a telecommand
-            needs every field that has no default.
+            Values by field name. In telemetry a missing value becomes the default or zero; a telecommand needs every
+            field that has no default.
         check:
-            Refuse what is outside the limits. Without it only what the type cannot hold is refused (for tests
-            that send bad values on purpose).
+            Reject values outside the limits. If false, reject only what the type cannot hold (for tests that send
+            invalid values on purpose).
         saturate:
-            Clip numbers to the limits, or wrap counters, instead of refusing them, as the unit does with telemetry.
+            Clip numbers to the limits, or wrap counters, instead of rejecting them, as the unit does with telemetry.
 
         Raises
         ------
         FieldError
-            Names row.field, the value and what is allowed.
+            The text names row.field, the value and what is allowed.
         """
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()
@@ -378,11 +385,10 @@ class Row:
         return bytes(self.layout.build(raw))
 
     def decode(self, data: bytes, *, check: bool | None = None) -> dict[str, Value]:
-        """Turn the row's bytes into physical values by name.
+        """Decode the row's bytes to physical values by name.
 
-        `check` refuses values outside the limits with FieldError; by default that is done for telecommands (the
-        device guards itself) and not for telemetry (the OBC wants to see what came). A wrong length always
-        raises LengthError.
+        With `check`, a value outside the limits raises FieldError. By default telecommands are checked (the device
+        protects itself) and telemetry is not (the OBC sees what arrived). A wrong length always raises LengthError.
         """
         if len(data) != self.size:
             raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {self.size}")
@@ -397,7 +403,7 @@ class Row:
         return values
 
     def clipped(self, values: Mapping[str, Value]) -> list[str]:
-        """Names of the numbers among the values that telemetry carries as the nearest limit."""
+        """Return the names of the numbers that telemetry would send as the nearest limit."""
         return [
             name
             for name, item in self.named_fields.items()
@@ -405,5 +411,5 @@ class Row:
         ]
 
     def example(self) -> dict[str, Value]:
-        """Return values that the row accepts: defaults, else zeros moved into the limits."""
+        """Return values that the row accepts: defaults, else the values nearest zero within the limits."""
         return {name: item.empty for name, item in self.named_fields.items()}

@@ -12,7 +12,7 @@ from starhil.protocol.messages import Reply
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
 
 if TYPE_CHECKING:
-    from starhil.protocol.transports.serial import SerialTransport
+    from starhil.protocol.transports import SerialTransport
 
 JUNK_BYTES: Final = 8
 

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-from starhil.protocol.can_framing import MAX_FRAME_DATA, CanIdentifier, MessageType
+from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.icd import InterfaceDefinition
 
 EXTENDED: Final = 0x80000000
-"""Flag of 29-bit identifiers in DBC files."""
+"""Flag of a 29-bit CAN ID in DBC files."""
 
 _SIGNED: Final = ("i8", "i16", "i32", "i64")
 
@@ -26,7 +26,7 @@ _SIGNED: Final = ("i8", "i16", "i32", "i64")
 class _Message:
     """One message of the database."""
 
-    identifier: int
+    can_id: int
     name: str
     size: int
     sender: str
@@ -46,28 +46,28 @@ def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
     yield from (f'VERSION "{icd.name} {icd.version}"', "", "NS_ :", "", "BS_:", "", "BU_: OBC SENSOR")
     for message in messages:
         yield ""
-        yield f"BO_ {message.identifier | EXTENDED} {message.name}: {message.size} {message.sender}"
+        yield f"BO_ {message.can_id | EXTENDED} {message.name}: {message.size} {message.sender}"
         for signal in message.signals:
             yield from _signals(signal, "OBC" if message.sender == "SENSOR" else "SENSOR")
     yield ""
     yield f'CM_ "{_text(icd.doc)} Messages longer than 8 bytes describe the data after their segments are joined.";'
     for message in messages:
-        yield f'CM_ BO_ {message.identifier | EXTENDED} "{_text(message.doc)}";'
+        yield f'CM_ BO_ {message.can_id | EXTENDED} "{_text(message.doc)}";'
         for signal in message.signals:
             if signal.slot.type != "bytes":
-                yield f'CM_ SG_ {message.identifier | EXTENDED} {signal.name} "{_text(signal.doc)}";'
+                yield f'CM_ SG_ {message.can_id | EXTENDED} {signal.name} "{_text(signal.doc)}";'
     yield 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";'
     yield 'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";'
     for message in messages:
         for signal in message.signals:
             if signal.enum is not None:
                 values = " ".join(f'{value} "{name}"' for name, value in signal.enum.values.items())
-                yield f"VAL_ {message.identifier | EXTENDED} {signal.name} {values} ;"
+                yield f"VAL_ {message.can_id | EXTENDED} {signal.name} {values} ;"
     for message in messages:
         for signal in message.signals:
             if signal.kind == "float":
                 precision = 1 if signal.type == "f32" else 2
-                yield f"SIG_VALTYPE_ {message.identifier | EXTENDED} {signal.name} : {precision};"
+                yield f"SIG_VALTYPE_ {message.can_id | EXTENDED} {signal.name} : {precision};"
 
 
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:
@@ -102,7 +102,7 @@ def _at_start(field: Field) -> Field:
 
 
 def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:
-    return CanIdentifier(kind, row_id, source, destination).pack()
+    return CanId(kind, row_id, source, destination).pack()
 
 
 def _signals(field: Field, receiver: str) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Thin transports between the sans-I/O receivers and real ports and buses, for one asyncio event loop."""
+"""Thin asyncio transports between the sans-I/O receivers and real ports and buses."""
 
 from starhil.protocol.transports.base import Statistics, Transport, TransportError
 from starhil.protocol.transports.can import CanTransport, open_can

@@ -1,4 +1,4 @@
-"""CAN transports by specification: kernel CAN, the TCP hub, and python-can's other buses."""
+"""Choice of the CAN transport by specification: kernel CAN, the TCP hub, or another bus of python-can."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FORMS: Final = "auto, a kernel interface (vcan0), socketcand:HOST:PORT/BUS, vir
 
 
 def kernel_can_is_up(name: str) -> bool:
-    """Whether the kernel has CAN and this interface is up."""
+    """Return whether the kernel has CAN and this interface is up."""
     family = getattr(socket, "AF_CAN", None)
     if family is None:
         return False
@@ -52,7 +52,7 @@ def open_can(
     hub_host: str = DEFAULT_HOST,
     hub_port: int = DEFAULT_PORT,
 ) -> CanTransport:
-    """Make the CAN transport that a specification names; it is opened by `start`.
+    """Return the CAN transport that a specification names; `start` opens it.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ def open_can(
         answers there), a kernel interface such as `vcan0` or `socketcan:can0`, `socketcand:HOST:PORT/BUS`,
         `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only), or `slcan:PORT`.
     bitrate:
-        Bit rate (bit/s) of buses whose adapter is set by us (slcan).
+        Bit rate (bit/s) of adapters that the transport configures (slcan).
 
     Raises
     ------
     TransportError
-        The specification is none of these.
+        The specification is not one of these.
     """
     if spec == "auto":
         if kernel_can_is_up(DEFAULT_BUS):
@@ -105,12 +105,12 @@ def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusA
         return can.Bus(interface=interface, channel=channel, **options)
     _check_kernel(channel)
     bus = SocketcanBus(channel)
-    _widen(bus.socket)
+    _enlarge_receive_buffer(bus.socket)
     return bus
 
 
-def _widen(kernel_socket: socket.socket) -> None:
-    """Give a socket a buffer for a burst of some thousand frames, as far as we may: the kernel drops what overflows."""
+def _enlarge_receive_buffer(kernel_socket: socket.socket) -> None:
+    """Enlarge a socket's buffer for bursts of thousands of frames, if permitted: the kernel drops the overflow."""
     try:
         kernel_socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
     except PermissionError:
@@ -118,7 +118,7 @@ def _widen(kernel_socket: socket.socket) -> None:
 
 
 def _check_kernel(channel: str) -> None:
-    """Say plainly why a kernel interface cannot be had."""
+    """Raise OSError with the reason and the remedy if a kernel interface is not available."""
     remedy = "name another, or use auto, which falls back to the TCP hub"
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()

@@ -16,13 +16,13 @@ from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Statistics, Transport
 
 BACKLOG_LIMIT: Final = 64 * 1024
-"""Bytes that wait at most, for the line or for a peer that does not read."""
+"""Most bytes that wait for the line or for a peer that does not read."""
 
 TICK_S: Final = 0.002
-"""Time between two writes of a long message: it leaves in pieces as the line would carry it."""
+"""Time between two writes of a long message, which is sent in chunks as a line would carry it."""
 
 RETRY_S: Final = 0.005
-"""Time until the next try when the port takes no more."""
+"""Time until the next attempt when the port is full."""
 
 
 class PacedWriter:
@@ -31,10 +31,10 @@ class PacedWriter:
     Parameters
     ----------
     write:
-        Takes bytes without blocking and returns how many it took (0: none now). OSError counts as a lost port; the
-        bytes are dropped, as on a line with nobody there.
+        Writes without blocking and returns how many bytes it accepted (0 if the port is full). OSError means that the
+        port is lost; the bytes are dropped, as on a line without a peer.
     schedule:
-        The line's byte times, or None for no pacing.
+        Byte times of the line, or None for no pacing.
     """
 
     def __init__(
@@ -45,18 +45,18 @@ class PacedWriter:
         self.schedule = schedule
         self._statistics = statistics
         self._queue: deque[tuple[float, bytes]] = deque()
-        """Messages with the time at which their first byte begins."""
-        self._gone = 0
+        """Messages with the time at which the first byte begins."""
+        self._written = 0
         """Bytes of the first message that have been written."""
         self._backlog = 0
         self._timer: asyncio.TimerHandle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
-        self._then: Callable[[], None] | None = None
+        self._idle_action: Callable[[], None] | None = None
 
     @property
     def backlog(self) -> int:
-        """Bytes that are waiting."""
+        """Bytes that wait."""
         return self._backlog
 
     def send(self, data: bytes) -> bool:
@@ -72,82 +72,82 @@ class PacedWriter:
             self._backlog += len(data)
             self._idle.clear()
             if self._timer is None:
-                self._work()
+                self._write_due()
         return True
 
     async def drain(self) -> None:
-        """Wait until nothing is waiting."""
+        """Wait until the queue is empty."""
         await self._idle.wait()
 
     def when_idle(self, action: Callable[[], None]) -> None:
-        """Do this as soon as nothing is waiting; what was to be done then is forgotten."""
-        self._then = action
+        """Call `action` once the queue is empty; it replaces an earlier action."""
+        self._idle_action = action
         if self._idle.is_set():
-            self._rest()
+            self._become_idle()
 
-    def _rest(self) -> None:
-        """Note that nothing is waiting."""
+    def _become_idle(self) -> None:
+        """Release `drain` and call the action of `when_idle`."""
         self._idle.set()
-        action, self._then = self._then, None
+        action, self._idle_action = self._idle_action, None
         if action is not None:
             action()
 
     def clear(self) -> None:
-        """Drop what is waiting; the line is free at once."""
+        """Drop the queue and free the line."""
         self._statistics.dropped += self._backlog
         if self.schedule is not None:
             self.schedule.release()
         self._queue.clear()
-        self._backlog = self._gone = 0
+        self._backlog = self._written = 0
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._rest()
+        self._become_idle()
 
-    def _work(self) -> None:
-        """Write what is due, and come back when more is."""
+    def _write_due(self) -> None:
+        """Write the bytes that are due and set the timer for the next ones."""
         self._timer = None
         now = self._loop.time()
-        due, next_time = self._due(now)
+        due, next_time = self._due_bytes(now)
         if due:
             try:
-                taken = self._write(due)
+                accepted = self._write(due)
             except OSError:
                 self.clear()
                 return
-            self._take_off(taken)
-            if taken < len(due):
+            self._remove_written(accepted)
+            if accepted < len(due):
                 next_time = now + RETRY_S
         if self._queue:
-            self._timer = self._loop.call_at(max(next_time, now), self._work)
+            self._timer = self._loop.call_at(max(next_time, now), self._write_due)
         else:
-            self._rest()
+            self._become_idle()
 
-    def _due(self, now: float) -> tuple[bytes, float]:
-        """Return the bytes whose stop bit has passed by `now`, and when to look again."""
+    def _due_bytes(self, now: float) -> tuple[bytes, float]:
+        """Return the bytes whose stop bit has passed at `now`, and the time of the next check."""
         if self.schedule is None:
             whole = b"".join(data for _, data in self._queue)
-            return whole[self._gone :], now
+            return whole[self._written :], now
         byte_s = self.schedule.seconds_per_byte
-        pieces: list[bytes] = []
-        gone = self._gone
+        chunks: list[bytes] = []
+        written = self._written
         for begin, data in self._queue:
             ready = min(int((now - begin) / byte_s + 1e-6), len(data))
-            if ready > gone:
-                pieces.append(data[gone:ready])
+            if ready > written:
+                chunks.append(data[written:ready])
             if ready < len(data):
                 end = begin + len(data) * byte_s
-                return b"".join(pieces), min(max(begin + (ready + 1) * byte_s, now + TICK_S), end)
-            gone = 0
-        return b"".join(pieces), now
+                return b"".join(chunks), min(max(begin + (ready + 1) * byte_s, now + TICK_S), end)
+            written = 0
+        return b"".join(chunks), now
 
-    def _take_off(self, count: int) -> None:
+    def _remove_written(self, count: int) -> None:
         self._statistics.sent += count
         self._backlog -= count
-        count += self._gone
+        count += self._written
         while self._queue and count >= len(self._queue[0][1]):
             count -= len(self._queue.popleft()[1])
-        self._gone = count
+        self._written = count
 
 
 class SerialTransport(Transport[bytes]):
@@ -155,11 +155,11 @@ class SerialTransport(Transport[bytes]):
 
     @abstractmethod
     def set_baud(self, baud: int) -> None:
-        """Go on at another bit rate as soon as all that was queued has left."""
+        """Change the bit rate as soon as the queue has been sent."""
 
 
 class PacedTransport(SerialTransport):
-    """Common part: the paced writer in front of the port."""
+    """Common base: a port behind a paced writer."""
 
     def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
         super().__init__(description)
@@ -174,7 +174,7 @@ class PacedTransport(SerialTransport):
             self._writer.when_idle(partial(self._change_rate, baud))
 
     def _change_rate(self, baud: int) -> None:
-        """Take another bit rate into use; nothing is queued."""
+        """Change the bit rate; the queue is empty."""
         if self._schedule is not None:
             self._schedule = PacingSchedule(baud)
             if self._writer is not None:
@@ -182,7 +182,7 @@ class PacedTransport(SerialTransport):
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
-        """Write without blocking; return how many bytes were taken."""
+        """Write without blocking; return how many bytes were accepted."""
 
     def _make_writer(self) -> None:
         self._writer = PacedWriter(self._write, self._schedule, self.statistics)
@@ -204,7 +204,7 @@ class PacedTransport(SerialTransport):
             self._writer.clear()
             self._writer = None
 
-    def _take(self, data: bytes) -> None:
+    def _process_received(self, data: bytes) -> None:
         self.statistics.received += len(data)
         self._receive(data)
 
@@ -219,7 +219,7 @@ def write_fd(fd: int, data: bytes) -> int:
 
 @contextlib.contextmanager
 def termios_as_os_error() -> Iterator[None]:
-    """Raise what the terminal settings refuse as the OSError that it is, which `termios.error` does not derive from."""
+    """Raise `termios.error`, which does not derive from OSError, as an OSError."""
     try:
         yield
     except termios.error as error:

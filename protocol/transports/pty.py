@@ -32,7 +32,7 @@ _EVENTS_SIZE: Final = 256 * _EVENT.size
 
 
 class PtyPeers:
-    """Watches the slave side of a pseudo-terminal that this process does not hold open itself.
+    """Watches the slave side of a pseudo-terminal, which this process must not hold open.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class PtyPeers:
     path
         Path of the slave side.
 
-    Without inotify (the system's instances are used up) only a peer that leaves and is not replaced at once is noticed.
+    Without inotify (the system has no more instances), a peer that leaves and is replaced at once goes unnoticed.
     """
 
     def __init__(self, master: int, path: str) -> None:
@@ -57,56 +57,58 @@ class PtyPeers:
         self._present = self.present
 
     def fileno(self) -> int:
-        """File descriptor that is readable when there is something to read, or peers came or left."""
+        """Return the descriptor that is readable when data wait or a peer came or left."""
         return self._wake.fileno()
 
     def acknowledge(self) -> None:
-        """Take note of the wake-up: the next one comes when there is more."""
+        """Acknowledge a wake-up, so that the next event causes another."""
         self._wake.poll(0)
 
     @property
     def present(self) -> bool:
-        """Whether anybody has the slave side open now."""
+        """Whether a peer has the slave side open now."""
         return not self._hang_up.poll(0)
 
     def all_left(self) -> bool:
-        """Whether all peers have left since the last call, if only for a moment."""
+        """Return whether all peers have left since the last call, if only for a moment."""
         before, self._present = self._present, self.present
         return _replaced(self._new_events()) or (before and not self._present)
 
     def discard_unread(self) -> None:
-        """Drop what was written to the master and not read."""
-        termios.tcflush(self._master, termios.TCOFLUSH)  # what is on its way to the line discipline
+        """Drop what was written to the master and has not been read."""
+        termios.tcflush(self._master, termios.TCOFLUSH)  # on the way to the line discipline
         with contextlib.suppress(PermissionError, BlockingIOError):
             slave = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             try:
-                termios.tcflush(slave, termios.TCIFLUSH)  # what the line discipline holds
+                termios.tcflush(slave, termios.TCIFLUSH)  # in the line discipline
             finally:
                 os.close(slave)
-        for _ in self._new_events():  # this visit, and whoever came since: nothing stale is left for them
+        for (
+            _
+        ) in self._new_events():  # of this call, and of peers that came since, for whom nothing stale is left
             pass
         self._present = self.present
 
     def close(self) -> None:
-        """Give the descriptors back."""
+        """Close the descriptors."""
         self._wake.close()
         if self._events >= 0:
             os.close(self._events)
             self._events = -1
 
     def _new_events(self) -> Iterator[int]:
-        """Masks of the events since the last call, oldest first."""
+        """Yield the masks of the events since the last call, oldest first."""
         while self._events >= 0:
             try:
                 data = os.read(self._events, _EVENTS_SIZE)
             except BlockingIOError:
                 return
-            for _, mask, _, _ in _EVENT.iter_unpack(data):  # a file by itself: events carry no names
+            for _, mask, _, _ in _EVENT.iter_unpack(data):  # events of a watched file carry no names
                 yield mask
 
 
 def _replaced(events: Iterator[int]) -> bool:
-    """Whether somebody opened the file after somebody had closed it."""
+    """Return whether the file was opened after it had been closed."""
     closed = replaced = False
     for mask in events:
         closed |= bool(mask & _IN_CLOSE)
@@ -115,7 +117,7 @@ def _replaced(events: Iterator[int]) -> bool:
 
 
 def _watch(path: str) -> int:
-    """File descriptor of the openings and closings of a file, or -1 where the system gives none."""
+    """Return an inotify descriptor for the openings and closings of a file, or -1 if the system has none left."""
     events = int(_LIBC.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC))
     if events >= 0 and _LIBC.inotify_add_watch(events, os.fsencode(path), _IN_OPEN | _IN_CLOSE) < 0:
         os.close(events)
@@ -124,9 +126,9 @@ def _watch(path: str) -> int:
 
 
 class PtyTransport(PacedTransport):
-    """An own pseudo-terminal; the peer opens its slave side like any tty, as often as it wants.
+    """A new pseudo-terminal; peers open its slave side like any tty, as often as they want.
 
-    As on a wire, what is sent while nobody has the slave side open is lost, and so is what a peer has left unread.
+    As on a wire, bytes sent while no peer has the slave side open are lost, and so are those that a peer left unread.
     """
 
     def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
@@ -141,7 +143,7 @@ class PtyTransport(PacedTransport):
             self._master, slave = os.openpty()
         except OSError as error:
             raise TransportError(
-                f"serial pty: the system gives no pseudo-terminal: {error.strerror}"
+                f"serial pty: the system has no pseudo-terminal left: {error.strerror}"
             ) from None
         try:
             with termios_as_os_error():
@@ -149,7 +151,7 @@ class PtyTransport(PacedTransport):
             os.set_blocking(self._master, False)
             self._path = os.ttyname(slave)
             if self._symlink is not None:
-                self._link(self._symlink, self._path)
+                self._make_symlink(self._symlink, self._path)
         except OSError as error:
             self._close_master()
             raise TransportError(f"serial pty: cannot be set up: {error.strerror}; try again") from None
@@ -157,19 +159,19 @@ class PtyTransport(PacedTransport):
             self._close_master()
             raise
         finally:
-            os.close(slave)  # the master hangs up while no peer has it open
+            os.close(slave)  # the master reports a hang-up while no peer has it open
         self.description = str(self._symlink) if self._symlink is not None else self._path
         self._make_writer()
         self._peers = PtyPeers(self._master, self._path)
         asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
 
-    def _link(self, link: Path, path: str) -> None:
+    def _make_symlink(self, link: Path, path: str) -> None:
         try:
             if link.exists() and not link.is_symlink():
-                raise TransportError(f"serial: {link} exists and is no symlink; choose another name")
-            fresh = link.with_name(f".{link.name}.{os.getpid()}")
-            fresh.symlink_to(path)
-            fresh.replace(link)
+                raise TransportError(f"serial: {link} exists and is not a symlink; choose another name")
+            temporary = link.with_name(f".{link.name}.{os.getpid()}")
+            temporary.symlink_to(path)
+            temporary.replace(link)
         except OSError as error:
             raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
 
@@ -177,29 +179,29 @@ class PtyTransport(PacedTransport):
         if self._peers is None:
             return
         self._peers.acknowledge()
-        self._lose_unread(self._peers)
+        self._drop_unread(self._peers)
         try:
             data = os.read(self._master, TURN)
         except BlockingIOError:
             return
         except OSError as error:
-            if error.errno != errno.EIO:  # that is: nobody has the slave side open
-                self._complain(f"serial {self.description}: {error.strerror}")
+            if error.errno != errno.EIO:  # EIO: no peer has the slave side open
+                self._report_error(f"serial {self.description}: {error.strerror}")
             return
-        asyncio.get_running_loop().call_soon(self._readable)  # the wake-up came once for all there is
-        self._take(data)
+        asyncio.get_running_loop().call_soon(self._readable)  # one wake-up stands for all waiting data
+        self._process_received(data)
 
-    def _lose_unread(self, peers: PtyPeers) -> None:
-        """Drop what a peer that left has not read, and what was still to be sent to it."""
+    def _drop_unread(self, peers: PtyPeers) -> None:
+        """Drop what a peer that left has not read, and what is queued for it."""
         if peers.all_left():
             if self._writer is not None:
                 self._writer.clear()
             peers.discard_unread()
 
     def send(self, item: bytes) -> bool:
-        """Queue a message, whole or not at all; without a peer it is lost."""
+        """Queue a message, whole or not at all; without a peer it is dropped."""
         if self._peers is not None:
-            self._lose_unread(self._peers)
+            self._drop_unread(self._peers)
             if not self._peers.present:
                 self.statistics.dropped += len(item)
                 return False
@@ -210,13 +212,13 @@ class PtyTransport(PacedTransport):
             raise OSError(errno.EBADF, "port is closed")
         if self._peers.all_left():
             self._peers.discard_unread()
-            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops what was to be sent to it
+            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops its queue
         if not self._peers.present:
             raise OSError(errno.ENOTCONN, "no peer")
         return write_fd(self._master, data)
 
     async def close(self) -> None:
-        """Give the pseudo-terminal back and take away the symlink, if it still leads here."""
+        """Close the pseudo-terminal and remove the symlink if it still points to it."""
         if self._peers is None:
             return
         asyncio.get_running_loop().remove_reader(self._peers.fileno())

@@ -1,4 +1,4 @@
-"""Serial transports: an own pseudo-terminal, a real tty, and TCP sockets in place of one."""
+"""Choice of the serial transport by specification, and the transports over a tty and over TCP."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ import serial
 from starhil.protocol.errors import reason
 from starhil.protocol.flow import TURN, TurnProtocol, detect_lost_peer
 from starhil.protocol.serial_framing import PacingSchedule
-from starhil.protocol.transports.base import ReturningTransport, TransportError
+from starhil.protocol.transports.base import ReconnectingTransport, TransportError
 from starhil.protocol.transports.paced import PacedTransport, SerialTransport, termios_as_os_error, write_fd
 from starhil.protocol.transports.pty import PtyTransport
 
 STREAM_LIMIT: Final = 65536
-"""Bytes that wait in a TCP connection for a peer that does not read, above which no more are written."""
+"""Most bytes that wait in a TCP connection for a peer that does not read."""
 DEFAULT_BAUD: Final = 115200
 RATE_RETRY_S: Final = 0.002
-"""Time until the next look whether the kernel has sent all, before the bit rate changes."""
+"""Time between checks whether the kernel has sent everything, before the bit rate changes."""
 
 
 def open_serial(
     spec: str = "auto", baud: int = DEFAULT_BAUD, *, symlink: Path | None = None, paced: bool | None = None
 ) -> SerialTransport:
-    """Make the serial transport that a specification names; it is opened by `start`.
+    """Return the serial transport that a specification names; `start` opens it.
 
     Parameters
     ----------
     spec:
-        `auto` or `pty` for an own pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
-        `listen://HOST:PORT` to wait for one peer (port 0: a free one, told by `description`).
+        `auto` or `pty` for a new pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
+        `listen://HOST:PORT` to wait for one peer (with port 0, `description` has the free port that was chosen).
     baud:
-        Bit rate, 8N1. It sets the pace of what is sent, and a real tty's hardware.
+        Bit rate, 8N1. It sets the pacing, and the hardware of a real tty.
     symlink:
-        Path that shall lead to the pseudo-terminal; made in one step, removed at close.
+        Path of a symlink to the pseudo-terminal; made atomically, removed at close.
     paced:
-        Whether bytes leave no faster than the bit rate. By default yes, except on a real tty, which does it itself.
+        Whether bytes are sent no faster than the bit rate; by default true, except on a real tty, whose hardware does it.
 
     Raises
     ------
     TransportError
-        The specification is none of these.
+        The specification is not one of these.
     """
     schedule = PacingSchedule(baud)
     pace = schedule if paced is None or paced else None
@@ -80,10 +80,10 @@ def _host_and_port(spec: str) -> tuple[str, int]:
     return host, port
 
 
-class _ReturningSerial(PacedTransport, ReturningTransport[bytes]):
-    """A serial port that may vanish."""
+class _ReconnectingSerial(PacedTransport, ReconnectingTransport[bytes]):
+    """A serial port that may disappear."""
 
-    what = "serial"
+    kind = "serial"
 
     async def _connect(self) -> None:
         await self._attach()
@@ -99,10 +99,10 @@ class _ReturningSerial(PacedTransport, ReturningTransport[bytes]):
 
     @abstractmethod
     def _detach(self) -> None:
-        """Let go of the port, whatever its state."""
+        """Release the port, in any state."""
 
 
-class TtyTransport(_ReturningSerial):
+class TtyTransport(_ReconnectingSerial):
     """A tty opened by its path, through pyserial."""
 
     def __init__(self, path: str, baud: int, schedule: PacingSchedule | None) -> None:
@@ -115,7 +115,7 @@ class TtyTransport(_ReturningSerial):
         path = Path(self._path)
         if path.exists() and not path.is_char_device():
             raise TransportError(
-                f"serial {self._path}: is no tty; name a serial port such as /dev/ttyUSB0, or auto for a pseudo-terminal"
+                f"serial {self._path}: is not a tty; name a serial port such as /dev/ttyUSB0, or auto for a pseudo-terminal"
             )
         try:
             with termios_as_os_error():
@@ -136,7 +136,7 @@ class TtyTransport(_ReturningSerial):
             self._lost(error.strerror or str(error))
             return
         if data:
-            self._take(data)
+            self._process_received(data)
         elif _hung_up(self._port.fileno()):
             self._lost("hung up")
 
@@ -145,20 +145,20 @@ class TtyTransport(_ReturningSerial):
         if self._port is not None:
             try:
                 with termios_as_os_error():
-                    if self._port.out_waiting:  # the kernel's buffer still leaves at the old rate
+                    if self._port.out_waiting:  # the kernel still sends its buffer at the old rate
                         asyncio.get_running_loop().call_later(RATE_RETRY_S, self.set_baud, baud)
                         return
                     self._port.baudrate = baud
             except (OSError, ValueError) as error:
                 if isinstance(error, ValueError) or error.errno == errno.EINVAL:
-                    self._complain(
-                        f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} is kept"
+                    self._report_error(
+                        f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} stays in use"
                     )
                     return
                 lost = error.strerror or str(error)
         self._baud = baud
         super()._change_rate(baud)
-        if lost:  # the port comes back at the new rate
+        if lost:  # it reopens at the new rate
             self._lost(lost)
 
     def _write(self, data: bytes) -> int:
@@ -189,7 +189,7 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
     if isinstance(error, ValueError):
         return f"serial {path}: bit rate {baud} is not possible here"
     if number in (errno.EBUSY, errno.EAGAIN):
-        return f"serial {path}: busy, another program holds it; close that one"
+        return f"serial {path}: busy: another program has it open; close that program"
     if number == errno.ENOENT:
         return f"serial {path}: no such port; plug the adapter in, or name another (auto makes a pseudo-terminal)"
     if number == errno.EACCES:
@@ -198,7 +198,7 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
 
 
 class _StreamProtocol(TurnProtocol):
-    """Hands what a TCP connection brings to its transport."""
+    """Passes the data of a TCP connection to its transport."""
 
     def __init__(self, owner: _TcpTransport) -> None:
         super().__init__()
@@ -210,14 +210,14 @@ class _StreamProtocol(TurnProtocol):
             self._owner.attach(self, transport)
 
     def data_received(self, data: bytes) -> None:
-        self._owner.take(self, data)
+        self._owner.process(self, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._owner.ended(self, exc)
+        self._owner.on_lost(self, exc)
 
 
-class _TcpTransport(_ReturningSerial):
-    """Common part of both TCP forms."""
+class _TcpTransport(_ReconnectingSerial):
+    """Common base of both TCP transports."""
 
     def __init__(self, scheme: str, host: str, port: int, schedule: PacingSchedule | None) -> None:
         super().__init__(f"{scheme}://{host}:{port}", schedule)
@@ -227,19 +227,19 @@ class _TcpTransport(_ReturningSerial):
         self._protocol: _StreamProtocol | None = None
 
     def attach(self, protocol: _StreamProtocol, stream: asyncio.Transport) -> None:
-        """Take a connection into use; a second one beside it is refused."""
+        """Use a connection; a second one at the same time is rejected."""
         if self._stream is not None:
             stream.abort()
             return
         self._stream, self._protocol = stream, protocol
 
-    def take(self, protocol: _StreamProtocol, data: bytes) -> None:
-        """Take bytes of the connection in use."""
+    def process(self, protocol: _StreamProtocol, data: bytes) -> None:
+        """Process bytes of the connection in use."""
         if protocol is self._protocol:
-            self._take(data)
+            self._process_received(data)
 
-    def ended(self, protocol: _StreamProtocol, error: Exception | None) -> None:
-        """Note that a connection has ended."""
+    def on_lost(self, protocol: _StreamProtocol, error: Exception | None) -> None:
+        """Handle the end of a connection."""
         if protocol is self._protocol:
             self._stream = self._protocol = None
             self._peer_gone(str(error) if error else "closed by the peer")
@@ -272,7 +272,7 @@ class _ConnectTransport(_TcpTransport):
         loop = asyncio.get_running_loop()
         try:
             await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
-        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+        except (OSError, ValueError) as error:  # an invalid host name raises ValueError
             raise TransportError(
                 f"serial {self.description}: cannot connect: {reason(error)}; start the peer first"
             ) from None
@@ -282,7 +282,7 @@ class _ConnectTransport(_TcpTransport):
 
 
 class _ListenTransport(_TcpTransport):
-    """A TCP port that one peer at a time may connect to; without a peer, bytes vanish as on an open line."""
+    """A TCP port for one peer at a time; without a peer, bytes are lost as on an open line."""
 
     def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
         super().__init__("listen", host, port, schedule)

@@ -192,7 +192,7 @@ def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
     ("spec", "message"),
     [
         ("/dev/does-not-exist", "no such port"),
-        ("/etc/passwd", "is no tty"),
+        ("/etc/passwd", "is not a tty"),
         ("/dev/null", "cannot open"),
         ("socket://127.0.0.1:1", "cannot connect"),
         ("socket://127.0.0.1", "must be socket://HOST:PORT"),
