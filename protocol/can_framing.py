@@ -384,7 +384,7 @@ class CanHostReceiver(_Receiver[Reply]):
 
     def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Reply | LinkFault]:
         match can_id.type:
-            case kind if kind in _REPLY_TYPES:
+            case number if number in _REPLY_TYPES:
                 yield self._single(can_id, frame)
             case MessageType.TELEMETRY_EXTENDED:
                 kind = ReplyKind.BURST if can_id.id == BURST_ID else ReplyKind.TELEMETRY

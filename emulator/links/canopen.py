@@ -21,7 +21,7 @@ from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.wire_faults import WireFaults
 from starhil.protocol.can_framing import MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Picture, abort_of, check_status
+from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -104,7 +104,7 @@ class DeviceApplication:
     def __init__(self, device: Device, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
         self._device = device
         self._finish = finish
-        self._frame: Picture | None = None
+        self._frame: GreyImage | None = None
 
     def forget(self) -> None:
         """Forget the frame that was taken: the device has restarted."""
@@ -148,12 +148,12 @@ class DeviceApplication:
         except MessageError as error:
             raise abort_of(error) from None
 
-    def image(self, name: str) -> Picture:
+    def image(self, name: str) -> GreyImage:
         """Return the frame that was taken, or the image that save_image stored."""
         if name == "stored":
             stored = self._device.images.stored
             if stored is not None:
-                return Picture(stored.edge, stored.edge, stored.frame, stored.pixels)
+                return GreyImage(stored.edge, stored.edge, stored.frame, stored.pixels)
         elif self._frame is not None:
             return self._frame
         raise SdoAbortError(AbortCode.NO_DATA, f"{name} image")
@@ -164,7 +164,7 @@ class DeviceApplication:
             raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being taken")
         deferred = Deferred()
 
-        def done(picture: Picture | None) -> None:
+        def done(picture: GreyImage | None) -> None:
             if picture is None:
                 self._finish(deferred, SdoAbortError(AbortCode.HARDWARE, "no frame"))
             else:
@@ -173,7 +173,7 @@ class DeviceApplication:
 
         self._device.images.take_full(
             lambda full: done(
-                None if full is None else Picture(full.width, full.height, full.frame, full.pixels)
+                None if full is None else GreyImage(full.width, full.height, full.frame, full.pixels)
             )
         )
         return deferred

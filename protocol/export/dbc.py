@@ -1,8 +1,8 @@
 """The interface definition as a CAN database (DBC).
 
-Each row gives its frames on the bus between the default addresses: request, telemetry and refusal, or telecommand,
-acknowledge and refusal. A message longer than 8 bytes describes the data after its segments have been joined (7 bytes
-and a counter each), as DBC files do for other transport protocols.
+Each row yields its messages between the default addresses: request, telemetry and NACK, or telecommand, ACK and NACK.
+A message longer than 8 bytes describes the data after its segments (7 bytes and a counter each) have been joined, as is
+usual in DBC files for transport protocols.
 """
 
 from __future__ import annotations
@@ -78,25 +78,27 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     code = tuple(_at_start(field) for field in error)
     long = row.size > MAX_FRAME_DATA
     if row.kind == "telemetry":
-        asked, answered = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
+        request_type, reply_type = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
         if long:
-            answered = MessageType.TELEMETRY_EXTENDED
-        yield _Message(_id(asked, *to_device), f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
-        yield _Message(_id(answered, *to_host), f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
-        refused = MessageType.TELEMETRY_NACK
-    else:
-        asked = MessageType.TELECOMMAND_EXTENDED if long else MessageType.TELECOMMAND
-        yield _Message(_id(asked, *to_device), f"TC_{row.name}", row.size, "OBC", signals, row.doc)
-        answered = MessageType.TELECOMMAND_ACK
+            reply_type = MessageType.TELEMETRY_EXTENDED
         yield _Message(
-            _id(answered, *to_host), f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}."
+            _id(request_type, *to_device), f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}"
         )
-        refused = MessageType.TELECOMMAND_NACK
-    yield _Message(_id(refused, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
+        yield _Message(_id(reply_type, *to_host), f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
+        nack_type = MessageType.TELEMETRY_NACK
+    else:
+        request_type = MessageType.TELECOMMAND_EXTENDED if long else MessageType.TELECOMMAND
+        yield _Message(_id(request_type, *to_device), f"TC_{row.name}", row.size, "OBC", signals, row.doc)
+        reply_type = MessageType.TELECOMMAND_ACK
+        yield _Message(
+            _id(reply_type, *to_host), f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}."
+        )
+        nack_type = MessageType.TELECOMMAND_NACK
+    yield _Message(_id(nack_type, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
 
 
 def _at_start(field: Field) -> Field:
-    """Return the field as the first byte of a message of its own."""
+    """Return the field as the first byte of a separate message."""
     slot = type(field.slot)(0, field.slot.type, 0, field.slot.size)
     return Field(field.name, field.kind, slot, enum=field.enum, provenance=field.provenance, doc=field.doc)
 
@@ -129,5 +131,5 @@ def _limits(field: Field) -> tuple[float, float]:
 
 
 def _text(text: str) -> str:
-    """Text without the quotes that would end it."""
+    """Return text with its double quotes replaced."""
     return text.replace('"', "'")

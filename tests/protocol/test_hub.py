@@ -354,7 +354,7 @@ def test_a_full_disk_ends_the_log_and_nothing_else(
 
     run(scenario, log=Path("/dev/full"))
     assert [record.getMessage() for record in caplog.records] == [
-        "CAN hub: log /dev/full ends here: No space left on device; the bus goes on"
+        "CAN hub: log /dev/full ends here: No space left on device; the bus continues"
     ]
 
 

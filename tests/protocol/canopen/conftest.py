@@ -21,7 +21,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import (
     CanopenSlave,
     DeviceDictionary,
-    Picture,
+    GreyImage,
     StandInApplication,
     build_dictionary,
 )
@@ -120,7 +120,7 @@ class Bench:
 
     def show(self, pixels: bytes) -> bytes:
         """Give the application a frame of these pixels, in one row."""
-        self.application.images["frame"] = Picture(len(pixels), 1, 7, pixels)
+        self.application.images["frame"] = GreyImage(len(pixels), 1, 7, pixels)
         return pixels
 
     def events(self) -> list[tuple[str, float]]:
