@@ -1,1 +1,1 @@
-"""Wire protocols: interface definitions, codecs, framing, segmentation, CANopen, transports and exports."""
+"""Wire protocols: interface definitions, codecs, framing, CANopen, transports and exports."""

@@ -301,7 +301,10 @@ class _Receiver(ABC, Generic[_Event]):
         return self._assembler.flush(now)
 
     def feed(self, frame: CanFrame, now: float) -> list[_Event | LinkFault]:
-        """Return the messages and faults that a frame completes; `now` is its arrival (s, any origin)."""
+        """Return the messages and faults that a frame completes.
+
+        `now` is its arrival (s, any origin).
+        """
         events: list[_Event | LinkFault] = list(self.flush(now))
         if frame.extended and not frame.remote:
             can_id = CanId.unpack(frame.id)
@@ -318,7 +321,10 @@ class _Receiver(ABC, Generic[_Event]):
 
 
 class CanDeviceReceiver(_Receiver[Request]):
-    """The device's end: frames in, requests and faults out. Frames to other addresses are ignored."""
+    """The device's end: frames in, requests and faults out.
+
+    Frames to other addresses are ignored.
+    """
 
     def __init__(
         self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S

@@ -24,7 +24,10 @@ def format_candump(frame: CanFrame, channel: str) -> str:
 
 
 def parse_candump(line: str) -> tuple[str, CanFrame]:
-    """Parse a line of a candump log; return the channel and the frame. Raises ProtocolError for any other line."""
+    """Parse a line of a candump log; return the channel and the frame.
+
+    Raises ProtocolError for any other line.
+    """
     match = _LINE.match(line.strip())
     if match is None:
         raise ProtocolError(f"not a line of a candump log: {line.strip()[:60]!r}")
@@ -39,7 +42,10 @@ def parse_candump(line: str) -> tuple[str, CanFrame]:
 
 
 def read_candump(path: Path) -> Iterator[tuple[str, CanFrame]]:
-    """Yield channel and frame of each line of a candump log; skip empty lines. An error names file and line."""
+    """Yield channel and frame of each line of a candump log; skip empty lines.
+
+    An error names file and line.
+    """
     try:
         with path.open(encoding="ascii", errors="replace") as stream:
             for number, line in enumerate(stream, 1):

@@ -91,7 +91,8 @@ class Field:
     provenance: str = "ours"
     doc: str = ""
     wrap: bool = False
-    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the nearest limit."""
+    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
+    nearest limit."""
 
     @property
     def type(self) -> str:
@@ -135,13 +136,13 @@ class Field:
 
     @cached_property
     def _divisor(self) -> int | None:
-        """1/scale if that is an integer: division by it is exact to the nearest decimal, multiplication is not."""
+        """1/scale if that is an integer: division by it gives the nearest decimal."""
         inverse = round(1.0 / self.scale)
         return inverse if inverse and abs(inverse * self.scale - 1.0) < 1e-12 else None
 
     @cached_property
     def empty(self) -> bool | int | float | str | bytes:
-        """The value that telemetry sends if none is given: the default, else the value nearest zero within the limits."""
+        """The value if none is given: the default, else the value nearest zero within the limits."""
         if self.default is not None:
             return self.default
         match self.kind:
@@ -171,7 +172,10 @@ class Field:
     def to_raw(
         self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
     ) -> int | float | bytes:
-        """Convert a physical value to the raw value of its slot or bits; raise FieldError if it does not fit."""
+        """Convert a physical value to the raw value of its slot or bits.
+
+        Raise FieldError if it does not fit.
+        """
         match self.kind:
             case "bytes":
                 return self._bytes_to_raw(value, where, index)
@@ -189,7 +193,10 @@ class Field:
                 return self._integer_to_raw(value, where, check=check, saturate=saturate, index=index)
 
     def to_physical(self, raw: Any) -> Value:
-        """Convert a raw value to the physical one; a number that is not in the enumeration stays a number."""
+        """Convert a raw value to the physical one.
+
+        A number that is not in the enumeration stays a number.
+        """
         match self.kind:
             case "flag":
                 return bool(raw)
@@ -312,7 +319,7 @@ def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
 
 @dataclass(frozen=True, repr=False)
 class Row:
-    """A telecommand or telemetry row: id and name, layout, and the codec between values and bytes."""
+    """A telecommand or telemetry row: id, name, layout, and the codec of its values."""
 
     kind: RowKind
     id: int
@@ -411,5 +418,5 @@ class Row:
         ]
 
     def example(self) -> dict[str, Value]:
-        """Return values that the row accepts: defaults, else the values nearest zero within the limits."""
+        """Return accepted values: defaults, else the values nearest zero within the limits."""
         return {name: item.empty for name, item in self.named_fields.items()}

@@ -6,7 +6,10 @@ import os
 
 
 class ProtocolError(Exception):
-    """Invalid bytes, frames, values or definitions; the text is one line that names what and where."""
+    """Invalid bytes, frames, values or definitions.
+
+    The text is one line that names what and where.
+    """
 
 
 def reason(error: Exception) -> str:

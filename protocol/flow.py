@@ -13,14 +13,16 @@ from collections.abc import Hashable, Sequence
 from typing import Final
 
 TURN: Final = 4 * 1024
-"""Most bytes that one connection reads per turn of the loop: about 100 CAN frames as text, 10 ms of work for a device."""
+"""Most bytes that one connection reads per turn of the loop: about 100 CAN frames as text, 10 ms of
+work for a device."""
 
 WINDOW: Final = 16 * 1024
 """Size of each buffer along a connection, bytes: what waits there delays what follows."""
 
 
 KEEPALIVE: Final = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 3}
-"""Probe a connection after 5 s of silence, then every 2 s; it is lost after 3 probes without an answer."""
+"""Probe a connection after 5 s of silence, then every 2 s; it is lost after 3 probes without an
+answer."""
 
 UNREAD_LIMIT_MS: Final = 10_000
 """A server is lost when it has not acknowledged sent data for this time."""
@@ -47,7 +49,7 @@ class TurnProtocol(asyncio.BufferedProtocol):
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
-    """Limit the kernel's buffers of a TCP connection: by default they hold megabytes, seconds of work."""
+    """Limit the kernel's buffers of a TCP connection, which hold megabytes by default."""
     connection = _tcp_socket(transport)
     if connection is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WINDOW)

@@ -125,7 +125,10 @@ class _Client(TurnProtocol):
             self._transport.abort()
 
     def deliver(self, sender: _Client, lines: list[bytes]) -> int:
-        """Send frames of another client, at once or when there is room; return how many were dropped."""
+        """Send frames of another client, at once or when there is room.
+
+        Return how many were dropped.
+        """
         if self._transport is None:
             return len(lines)
         if self._waiting.size or self._full or self._settle is not None:

@@ -1,4 +1,4 @@
-"""The interface definition: loaded from `configs/icd/*.toml`, validated as a whole, indexed by name and id."""
+"""The interface definition: loaded from `configs/icd/*.toml`, validated, indexed by name and id."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def _read(file: Path) -> FileModel:
 
 
 def _key_path(document: object, location: tuple[int | str, ...]) -> str:
-    """Return the dotted path of a key, with the names of rows and fields instead of their positions."""
+    """Return a key's dotted path, with names of rows and fields instead of positions."""
     steps: list[str] = []
     here = document
     for step in location:

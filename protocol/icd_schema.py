@@ -1,4 +1,4 @@
-"""Schema of interface definition files: pydantic models that reject unknown keys and wrong types."""
+"""Schema of interface definition files; it rejects unknown keys and wrong types."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ class FieldModel(_Model):
     parameter: str | None = None
     """Name of the parameter that the field sets or reports."""
     wrap: bool = False
-    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the nearest limit."""
+    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
+    nearest limit."""
     provenance: Provenance | None = None
     doc: str = ""
 

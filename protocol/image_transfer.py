@@ -39,7 +39,10 @@ def frame_checksum(frame: bytes) -> int:
 
 
 def block_checksum(block: bytes) -> int:
-    """Return the CRC-16/CCITT-FALSE of a block: polynomial 0x1021, initial value 0xFFFF ("123456789" gives 0x29B1)."""
+    """Return the CRC-16/CCITT-FALSE of a block.
+
+    Polynomial 0x1021, initial value 0xFFFF; "123456789" gives 0x29B1.
+    """
     return binascii.crc_hqx(block, 0xFFFF)
 
 
@@ -62,7 +65,7 @@ def parse_burst_packet(packet: bytes) -> tuple[int, bytes]:
 
 
 class HoleMap:
-    """The packets of a block that have arrived: bit n of part k (from 1) is packet 128 (k - 1) + n."""
+    """The arrived packets of a block: bit n of part k (from 1) is packet 128 (k - 1) + n."""
 
     def __init__(self, arrived: Iterable[int] = ()) -> None:
         self._bits = bytearray(MAP_PARTS * MAP_PART_SIZE)

@@ -100,7 +100,8 @@ class Reply:
 
     kind: ReplyKind
     id: int | None
-    """Id of the answered request or of the message; None if the serial dialect does not carry it."""
+    """Id of the answered request or of the message; None if the serial dialect does not carry it.
+    """
     data: bytes = b""
     code: ErrorCode | int = ErrorCode.OK
     """Error code of a NACK; an unpublished code is a plain number."""

@@ -414,7 +414,10 @@ class PacingSchedule:
         self._free_at = float("-inf")
 
     def reserve(self, now: float, size: int) -> tuple[float, float]:
-        """Reserve the line for `size` bytes; return when the first begins and when the last has left."""
+        """Reserve the line for `size` bytes.
+
+        Return when the first begins and when the last has left.
+        """
         begin = max(now, self._free_at)
         self._free_at = begin + size * self.seconds_per_byte
         return begin, self._free_at

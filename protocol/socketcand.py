@@ -28,13 +28,16 @@ class CommandError(ProtocolError):
 
 
 class CommandSplitter:
-    """Split a stream of bytes into commands; text outside `< >` and overlong commands yield None."""
+    """Split a stream of bytes into commands.
+
+    Text outside `< >` and overlong commands yield None.
+    """
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes | None]:
-        """Return the commands that these bytes complete, without brackets and surrounding spaces."""
+        """Return the commands that these bytes complete, without brackets and outer spaces."""
         pieces = (self._rest + data).split(b">")
         self._rest = pieces.pop()
         commands: list[bytes | None] = []
@@ -66,7 +69,10 @@ def parse_send(command: bytes) -> CanFrame:
 
 
 def parse_can_id(digits: bytes) -> tuple[bool, bool, int]:
-    """Parse a CAN ID of up to three digits (11-bit) or eight (29-bit); return extended, remote, number."""
+    """Parse a CAN ID of up to three digits (11-bit) or eight (29-bit).
+
+    Return extended, remote, number.
+    """
     number = int(digits, 16)
     extended, remote = len(digits) == 8, False
     if extended and number > MAX_EXTENDED_ID:
@@ -92,7 +98,10 @@ def format_send(frame: CanFrame) -> bytes:
 
 
 def format_frame(frame: CanFrame, stamp: bytes) -> bytes:
-    """Format a frame as a server sends it to clients; `stamp` is the time as `seconds.microseconds`."""
+    """Format a frame as a server sends it to clients.
+
+    `stamp` is the time as `seconds.microseconds`.
+    """
     return b"< frame %b %b %b >" % (format_can_id(frame), stamp, frame.data.hex().upper().encode())
 
 

@@ -1,4 +1,4 @@
-"""Read files that a user names: regular files up to a size limit, so that no read blocks or exhausts the memory."""
+"""Read files that a user names: regular files only, up to a size limit."""
 
 from __future__ import annotations
 
@@ -40,5 +40,8 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
 
 
 def read_user_text(path: Path, limit: int = MAX_BYTES) -> str:
-    """Return the text of a regular UTF-8 file, without a byte order mark. Raises UnicodeDecodeError as well."""
+    """Return the text of a regular UTF-8 file, without a byte order mark.
+
+    Raises UnicodeDecodeError as well.
+    """
     return read_user_file(path, limit).decode("utf-8-sig")

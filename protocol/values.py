@@ -1,4 +1,4 @@
-"""Values of the interface definition: enumerations, limits and device parameters, with their checks."""
+"""Values of the interface definition: enumerations, limits and device parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 
 Value = bool | int | float | str | bytes
-"""A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw bytes."""
+"""A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw
+bytes."""
 
 INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {
@@ -34,7 +35,10 @@ class IcdError(ProtocolError):
 
 
 class MessageError(ProtocolError):
-    """A message or value that violates the interface definition; `code` is the published error code."""
+    """A message or value that violates the interface definition.
+
+    `code` is the published error code.
+    """
 
     code: ErrorCode = ErrorCode.INVALID_PARAMETER
 
@@ -69,7 +73,10 @@ class EnumDefinition:
         return MappingProxyType({number: name for name, number in self.values.items()})
 
     def number(self, value: Value, where: str, *, index: int = 0) -> int:
-        """Return the number of a name, or of a number that has a name; raise FieldError otherwise."""
+        """Return the number of a name, or of a number that has a name.
+
+        Raise FieldError otherwise.
+        """
         if isinstance(value, str):
             if value in self.values:
                 return self.values[value]
@@ -154,7 +161,7 @@ class Parameter:
         return number
 
     def to_number(self, value: Value) -> float:
-        """Return the checked value as the number that set_parameter and the telemetry `parameter` carry."""
+        """Return the checked value as set_parameter and the telemetry `parameter` carry it."""
         checked = self.check(value)
         if isinstance(checked, str):
             return float(self.enum.values[checked]) if self.enum is not None else math.nan

@@ -1,4 +1,4 @@
-"""The interface between the object dictionary and the device, and a stand-in for tests and exports."""
+"""Interface of the object dictionary to the device, and a stand-in for tests and exports."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Application(Protocol):
         """Set a parameter; the value is within the limits of the interface definition."""
 
     def image(self, name: str) -> GreyImage:
-        """Return the image `frame`, the last one that `take_image` took, or `stored`, that of save_image."""
+        """Return the image `frame` (the last of `take_image`) or `stored` (that of save_image)."""
 
     def take_image(self, name: str) -> Deferred | None:
         """Take an image for reading."""

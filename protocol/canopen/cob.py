@@ -32,7 +32,8 @@ RESTRICTED: Final = (
     (0x6E0, 0x6FF),
     (0x701, 0x7FF),
 )
-"""CAN IDs, first and last, that no configurable communication object may use (CiA 301, restricted CAN-IDs)."""
+"""CAN IDs, first and last, that no configurable communication object may use (CiA 301, restricted
+CAN-IDs)."""
 
 
 def check_can_id(cob_id: int) -> None:

@@ -1,4 +1,4 @@
-"""The objects of the communication profile (1000h to 1FFFh), built with the classes of `canopen`."""
+"""Objects of the communication profile (1000h to 1FFFh), built with `canopen`."""
 
 from __future__ import annotations
 
@@ -102,7 +102,10 @@ def add_record(
     array: bool = False,
     count: tuple[str, int] | None = None,
 ) -> None:
-    """Add a record or array; sub-index 0 is the highest sub-index, or a writable `count` (name, default)."""
+    """Add a record or array.
+
+    Sub-index 0 is the highest sub-index, or a writable `count` (name, default).
+    """
     index = members[0].index
     group = ODArray(name, index) if array else ODRecord(name, index)
     if count is None:

@@ -1,4 +1,4 @@
-"""The object dictionary of a device: the communication profile, and the interface definition placed by the layout."""
+"""The object dictionary of a device, from communication profile and interface definition."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ DATA_TYPES: Final[dict[str, int]] = {
     "enum8": datatypes.UNSIGNED8,
     "bytes": datatypes.OCTET_STRING,
 }
-"""Types of the interface definition → CANopen. A bool is a byte, because a BOOLEAN is one bit in a PDO."""
+"""Types of the interface definition → CANopen. A bool is a byte, because a BOOLEAN is one bit in a
+PDO."""
 
 Key = tuple[int, int]
 
@@ -101,7 +102,7 @@ class DeviceDictionary(Dictionary):
             self.entries[key].maximum_size = size
 
     def row_bytes(self, row: Row) -> bytes:
-        """Return the bytes of a telemetry row, read from the application once per sampling instant."""
+        """Return a telemetry row's bytes, read from the application once per sampling instant."""
         if self._cached_at != self.instant:
             self._cache.clear()
             self._cached_at = self.instant
@@ -250,7 +251,10 @@ class DeviceDictionary(Dictionary):
         add_record(objects, placed.name, members)
 
     def _telecommand_variable(self, name: str, key: Key, row: Row) -> ODVariable:
-        """Return the variable whose write executes a telecommand: its one value, all its bytes, or 1 if it has no data."""
+        """Return the variable whose write executes a telecommand.
+
+        The client writes the only value, all bytes, or 1 if the telecommand has no data.
+        """
         if row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
             self._writers[key] = partial(self._execute_without_data, row)
@@ -369,7 +373,10 @@ def build_dictionary(
     serial_number: int = 1,
     software_version: str = "1",
 ) -> DeviceDictionary:
-    """Build the object dictionary of the device ; by default from the definition that ships with the package."""
+    """Build the object dictionary of the device .
+
+    By default from the definition that ships with the package.
+    """
     layout = load_layout() if layout is None else layout
     identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
     return DeviceDictionary(load_icd() if icd is None else icd, layout, identity)
@@ -390,7 +397,10 @@ def _span(slot: Slot) -> slice:
 
 
 def _describe(member: ODVariable, fields: list[Field]) -> None:
-    """Copy unit, scale, limits, names and text of a field to its variable; name the bits of a bit field."""
+    """Copy unit, scale, limits, names and text of a field to its variable.
+
+    Name the bits of a bit field.
+    """
     first = fields[0]
     if first.width:
         for field in fields:

@@ -30,7 +30,8 @@ class Deferred:
 
 
 Writer = Callable[[bytes], Deferred | None]
-"""Writes a value that passed all checks; raises `SdoAbortError`, or returns a token if the result follows later."""
+"""Writes a value that passed all checks; raises `SdoAbortError`, or returns a token if the result
+follows later."""
 
 
 @dataclass(slots=True)
@@ -168,7 +169,10 @@ class Dictionary:
         raise SdoAbortError(AbortCode.NO_OBJECT, f"{index:04X}h")
 
     def load_defaults(self, indices: range, node_id: int) -> None:
-        """Set the entries of a range of indices to their defaults; relative defaults include the node-ID."""
+        """Set the entries of a range of indices to their defaults.
+
+        Relative defaults include the node-ID.
+        """
         for (index, _), entry in self.entries.items():
             if index in indices and entry.reader is None:
                 entry.value = default_bytes(entry.variable, node_id)
@@ -178,7 +182,10 @@ class Dictionary:
         self.instant += 1
 
     def read(self, index: int, subindex: int) -> bytes:
-        """Read as an SDO client. Raises `SdoAbortError` if there is no such entry or it is write-only."""
+        """Read as an SDO client.
+
+        Raises `SdoAbortError` if there is no such entry or it is write-only.
+        """
         entry = self.find(index, subindex)
         if not entry.variable.readable:
             raise SdoAbortError(AbortCode.WRITE_ONLY, f"{index:04X}h:{subindex:02X}h")

@@ -1,4 +1,4 @@
-"""Emergency producer: error register, error history, EMCY messages with inhibit time (CiA 301, EMCY)."""
+"""Emergency producer: error register, error history, EMCY messages (CiA 301, EMCY)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ COB_ID: Final = (0x1014, 0)
 INHIBIT: Final = (0x1015, 0)
 INHIBIT_UNIT_S: Final = 1e-4
 LONGEST_QUEUE: Final = 32
-"""Most messages that wait for the inhibit time; beyond it the oldest is dropped (its error stays in the history)."""
+"""Most messages that wait for the inhibit time; beyond it the oldest is dropped (its error stays in
+the history)."""
 
 
 MESSAGE: Final = construct.Struct(
-    "code" / construct.Int16ul, "register" / construct.Int8ul, "data" / construct.Bytes(5)
+    "code" / construct.Int16ul,
+    "register" / construct.Int8ul,
+    "data" / construct.Padded(5, construct.GreedyBytes),
 )
 """The 8 bytes of an EMCY message: error code, error register, manufacturer-specific bytes."""
 
@@ -80,7 +83,10 @@ class EmergencyProducer:
         self._register.reader = lambda: bytes([self._register_bits()])
 
     def reset(self, *, application: bool) -> None:
-        """Clear the queue and the communication errors; with `application`, all errors and the history."""
+        """Clear the queue and the communication errors.
+
+        With `application`, all errors and the history.
+        """
         self._queue.clear()
         self._free_at = 0.0
         for error, bits in list(self._active.items()):
@@ -118,7 +124,7 @@ class EmergencyProducer:
         return True
 
     def clear_error(self, code: int, *, key: bytes = b"") -> bool:
-        """Report that an error is cleared: code 0, with the error's code in the manufacturer-specific bytes."""
+        """Report a cleared error: code 0, and its code in the manufacturer-specific bytes."""
         if self._active.pop((code, key), None) is None:
             return False
         self._context.report(EventKind.EMERGENCY, 0, f"error 0x{code:04X} gone")
@@ -145,7 +151,7 @@ class EmergencyProducer:
         return register
 
     def _enqueue(self, code: int, data: bytes) -> None:
-        fields = {"code": code, "register": self._register_bits(), "data": data[:5].ljust(5, b"\0")}
+        fields = {"code": code, "register": self._register_bits(), "data": data[:5]}
         self._queue.append(MESSAGE.build(fields))
         self.flush()
 

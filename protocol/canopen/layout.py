@@ -1,4 +1,4 @@
-"""`configs/icd/canopen.toml`: the layout of the interface definition in the object dictionary, loaded and validated."""
+"""The layout of the interface definition in the object dictionary: `configs/icd/canopen.toml`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LSS slave: configuration of node-ID and bit rate, inquiry and search of the identity (CiA 305)."""
+"""LSS slave: sets node-ID and bit rate, answers inquiries and identity scans (CiA 305)."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class LssSlave:
             self._host.activate_node_id(self.pending_node_id)
 
     def _switch_selective(self, command: int, number: int) -> None:
-        """Count matching frames: four in order, each with one number of the identity, select this node."""
+        """Select this node after four frames in order, each with one number of its identity."""
         step = command - Command.SWITCH_VENDOR
         if step == 0:
             self._selected = 0
@@ -160,7 +160,7 @@ class LssSlave:
             self._send(Command.SWITCHED)
 
     def _identify(self, command: int, number: int) -> None:
-        """Count matching frames: six in order, with vendor, product, and ranges of revision and serial number."""
+        """Identify after six frames in order: vendor, product, ranges of revision and serial."""
         step = command - Command.IDENTIFY_VENDOR
         if step == 0:
             self._identified = 0
@@ -175,7 +175,10 @@ class LssSlave:
             self._send(Command.IDENTIFIED)
 
     def _fastscan(self, number: int, bit: int, part: int, following: int) -> None:
-        """Compare the upper bits of one number of the identity; a complete match leads to the next number."""
+        """Compare the upper bits of one number of the identity.
+
+        A complete match leads to the next number.
+        """
         if not self._unconfigured or self.configuring:
             return
         if bit == 0x80:

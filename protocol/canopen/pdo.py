@@ -1,4 +1,4 @@
-"""Transmission and reception of PDOs: synchronous and event-driven transmission, timers, length checks (CiA 301, PDO)."""
+"""Transmission and reception of PDOs, synchronous and event-driven (CiA 301, PDO)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedO
 
 
 class ReceivePdo:
-    """Writes the mapped objects when its message arrives (event-driven) or at the next SYNC (synchronous)."""
+    """Writes the mapped objects when its message arrives, or at the next SYNC if synchronous."""
 
     def __init__(self, context: Context, emergency: EmergencyProducer, number: int) -> None:
         self._context = context
@@ -38,7 +38,7 @@ class ReceivePdo:
         return self.records.can_id if self.records.valid and self._objects else None
 
     def receive(self, data: bytes) -> None:
-        """Process a message: one that is too short is reported and dropped, one too long is reported and used."""
+        """Process a message; report a wrong length, and drop a message that is too short."""
         if len(data) < self._size:
             detail = bytes([*self._key, len(data)])
             self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
@@ -76,7 +76,10 @@ class ReceivePdo:
             )
 
     def _apply(self, data: bytes) -> None:
-        """Write all objects, or none if one value is outside its limits; report a refusal by EMCY 8200h."""
+        """Write all objects, or none if one value is outside its limits.
+
+        Report a refusal by EMCY 8200h.
+        """
         writes: list[tuple[int, int, bytes]] = []
         position = 0
         try:
@@ -258,7 +261,7 @@ class PdoService:
                 pdo.trigger()
 
     def synchronise(self, counter: int) -> None:
-        """Act on a SYNC: first send (all samples are of this instant), then apply received messages."""
+        """Act on a SYNC: first send samples of this instant, then apply received messages."""
         for transmitting in self.transmitting:
             transmitting.synchronise(counter)
         for receiving in self.receiving:

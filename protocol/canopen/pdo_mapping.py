@@ -150,7 +150,10 @@ class PdoRecords:
 
     @property
     def event_s(self) -> float:
-        """TPDO: longest time between two transmissions; RPDO: deadline of the next message; s, 0 for none."""
+        """TPDO: longest time between two transmissions.
+
+        RPDO: deadline of the next message; s, 0 for none.
+        """
         return 0.0 if self._event_timer is None else self._event_timer.number() * 1e-3
 
     @property

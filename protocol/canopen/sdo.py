@@ -1,4 +1,4 @@
-"""SDO server: initiates transfers and passes further requests to the active transfer (CiA 301, SDO)."""
+"""SDO server: initiates transfers, passes further requests to the active one (CiA 301, SDO)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ LENGTH: Final = 8
 """Data bytes of every SDO frame."""
 ABORT: Final = 0x80
 RESULT_TIMEOUT_S: Final = 30.0
-"""Longer than any result takes: an exposure, after the processing of the image before it, takes seconds."""
+"""Longer than any result takes: an exposure, after the processing of the image before it, takes
+seconds."""
 
 
 @dataclass
@@ -61,7 +62,8 @@ class SdoServer:
         self._waiting: _Waiting | None = None
         self.deadline: float | None = None
         self.faults: list[str] = []
-        """Texts of other errors than `SdoAbortError` that the application raised; the node reports them as events."""
+        """Texts of other errors than `SdoAbortError` that the application raised; the node reports
+        them as events."""
 
     @property
     def busy(self) -> bool:
@@ -75,7 +77,10 @@ class SdoServer:
         self.deadline = None
 
     def finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> list[bytes]:
-        """Answer a download whose result is known; return nothing if the client no longer waits for it."""
+        """Answer a download whose result is known.
+
+        Return nothing if the client no longer waits for it.
+        """
         waiting = self._waiting
         if waiting is None or waiting.deferred is not deferred:
             return []

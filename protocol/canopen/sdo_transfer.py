@@ -19,7 +19,8 @@ MAXIMUM_BLOCK: Final = 127
 """Most segments in a block."""
 
 Commit = Callable[[bytes], Deferred | None]
-"""Writes the complete data to the object; raises `SdoAbortError`, or returns a token if the result follows later."""
+"""Writes the complete data to the object; raises `SdoAbortError`, or returns a token if the result
+follows later."""
 
 
 class Transfer:
@@ -179,7 +180,10 @@ class BlockDownload(Transfer):
 
 
 class BlockUpload(Transfer):
-    """The client reads blocks of up to 127 segments; it confirms each block and may request the rest of it again."""
+    """The client reads blocks of up to 127 segments.
+
+    It confirms each block and may request the rest of it again.
+    """
 
     def __init__(self, index: int, subindex: int, data: bytes, block_size: int, *, crc: bool) -> None:
         super().__init__(index, subindex)
@@ -192,7 +196,7 @@ class BlockUpload(Transfer):
         self._ending = False
 
     def request(self, data: bytes) -> list[bytes]:
-        """Answer the start, the confirmation of a block or the end (command specifier 5, subcommands 3, 2 and 1)."""
+        """Answer start, confirmation of a block or end (specifier 5, subcommands 3, 2 and 1)."""
         command = data[0]
         if command >> 5 != 5:
             return super().request(data)
@@ -233,7 +237,10 @@ class BlockUpload(Transfer):
 
 
 def valid_block_size(size: int) -> int:
-    """Return a number of segments per block if it is 1 to 127; raise `SdoAbortError` BLOCK_SIZE otherwise."""
+    """Return a number of segments per block if it is 1 to 127.
+
+    Raise `SdoAbortError` BLOCK_SIZE otherwise.
+    """
     if not 1 <= size <= MAXIMUM_BLOCK:
         raise SdoAbortError(AbortCode.BLOCK_SIZE, f"{size} segments per block")
     return size

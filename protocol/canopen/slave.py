@@ -89,7 +89,8 @@ class CanopenSlave:
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
         self.pdos = PdoService(context, self.emergency)
         self.on_reset: Callable[[], int | None] | None = None
-        """Resets the application when NMT resets the node; a returned node-ID applies unless LSS has stored one."""
+        """Resets the application when NMT resets the node; a returned node-ID applies unless LSS
+        has stored one."""
         self._clock_offset_us = 0
         self._silence: tuple[float, float] | None = None
         self._pending_bit_rate = bit_rate
@@ -204,7 +205,7 @@ class CanopenSlave:
         self._initialise(application=False)
 
     def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
-        """Stop sending, switch the bit rate after `delay_s`, and resume after another `delay_s` (LSS)."""
+        """Stop sending, switch the bit rate after `delay_s`, resume after another (LSS)."""
         now = self._context.now
         self._pending_bit_rate = bit_rate
         self._silence = (now + delay_s, now + 2 * delay_s)
@@ -359,7 +360,7 @@ class CanopenSlave:
             self.lss.pending_node_id = node_id
 
     def _initialise(self, *, application: bool) -> None:
-        """Pass through INITIALISING: load the stored parameters, send the boot-up message, enter PRE-OPERATIONAL."""
+        """Load the stored parameters, send the boot-up message, enter PRE-OPERATIONAL."""
         context = self._context
         context.state = NmtState.INITIALISING
         context.node_id = self.lss.pending_node_id
@@ -377,7 +378,10 @@ class CanopenSlave:
         context.report(EventKind.STATE, context.state)
 
     def _configure(self) -> None:
-        """Apply the parameters of the communication profile; replace an invalid stored PDO mapping by the defaults."""
+        """Apply the parameters of the communication profile.
+
+        Replace an invalid stored PDO mapping by the defaults.
+        """
         try:
             self.pdos.configure(everything=True)
         except SdoAbortError as refusal:

@@ -26,10 +26,16 @@ class ParameterStorage(Protocol):
     """Keeps groups of named values across a restart."""
 
     def load(self, group: str) -> dict[str, bytes]:
-        """Return a group's values, empty if none are stored. Raises `StorageError` if they are damaged."""
+        """Return a group's values, empty if none are stored.
+
+        Raises `StorageError` if they are damaged.
+        """
 
     def save(self, group: str, values: Mapping[str, bytes]) -> None:
-        """Replace all values of a group. Raises `StorageError` if that fails; the old values then remain."""
+        """Replace all values of a group.
+
+        Raises `StorageError` if that fails; the old values then remain.
+        """
 
     def clear(self, group: str) -> None:
         """Delete a group's values."""
@@ -68,7 +74,10 @@ class FileStorage:
         self._path = path
 
     def load(self, group: str) -> dict[str, bytes]:
-        """Return a group's values. Raises `StorageError` if the file cannot be read or its checksum is wrong."""
+        """Return a group's values.
+
+        Raises `StorageError` if the file cannot be read or its checksum is wrong.
+        """
         values = self._read().get(group, {})
         return {name: bytes.fromhex(value) for name, value in values.items()}
 

@@ -116,7 +116,10 @@ class ParameterStore:
             self._abort_on_storage_error(error)
 
     def _differs(self, entry: Entry) -> bool:
-        """Return whether a value differs from its default; a default relative to the node-ID stays relative."""
+        """Return whether a value differs from its default.
+
+        A default relative to the node-ID stays relative.
+        """
         return entry.value != default_bytes(entry.variable, self._context.node_id)
 
     def _restore(self, subindex: int, data: bytes) -> Deferred | None:

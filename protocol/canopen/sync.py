@@ -35,12 +35,15 @@ class SyncService:
         return self._cob_id.number() & ID_MASK
 
     def configure(self) -> None:
-        """Restart with the current parameters: reset the counter, produce the first SYNC after one period."""
+        """Reset the counter, and produce the first SYNC after one period."""
         self._counter = 0
         self._schedule(self._cob_id.number(), self._period.number())
 
     def receive(self, data: bytes) -> int | None:
-        """Return the counter of a valid SYNC (0 if it carries none), or None; report a wrong length."""
+        """Return the counter of a valid SYNC (0 if it carries none), or None.
+
+        Report a wrong length.
+        """
         if not self._context.communicates:
             return None
         if len(data) != (1 if self._overflow.number() else 0):

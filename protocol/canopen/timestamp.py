@@ -17,7 +17,7 @@ DAY_MS: Final = 86_400_000
 
 
 def decode_time_of_day(data: bytes) -> float | None:
-    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of milliseconds, 16 of days), or None if it is invalid."""
+    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of ms, 16 of days), or None."""
     if len(data) != 6:
         return None
     milliseconds = int.from_bytes(data[:4], "little") & 0x0FFFFFFF

@@ -24,7 +24,10 @@ FORMATS: Final[Mapping[str, str]] = MappingProxyType(
 
 
 def export(icd: InterfaceDefinition, name: str) -> str:
-    """Return the interface definition in the named format. Raises ProtocolError for an unknown name."""
+    """Return the interface definition in the named format.
+
+    Raises ProtocolError for an unknown name.
+    """
     if name not in FORMATS:
         raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(FORMATS)}")
     module = import_module(f"starhil.protocol.export.{name}")

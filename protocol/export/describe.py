@@ -62,7 +62,7 @@ def beyond(row: Row, field: Field) -> str:
 
 
 def meaning(row: Row, field: Field) -> str:
-    """Return the text of a field and its behaviour beyond the range, for formats without a range column."""
+    """Return text and behaviour beyond the range, for formats without a range column."""
     low, high = (number(limit) for limit in field.physical_limits) if beyond(row, field) else ("", "")
     match beyond(row, field):
         case "wraps":

@@ -21,7 +21,10 @@ ReportError = Callable[[ProtocolError], None]
 
 
 class TransportError(ProtocolError):
-    """A port or bus that is not available or was lost; the text names it, the reason and the remedy."""
+    """A port or bus that is not available or was lost.
+
+    The text names it, the reason and the remedy.
+    """
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""Choice of the CAN transport by specification: kernel CAN, the TCP hub, or another bus of python-can."""
+"""Choice of the CAN transport: kernel CAN, the TCP hub, or another bus of python-can."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusA
 
 
 def _enlarge_receive_buffer(kernel_socket: socket.socket) -> None:
-    """Enlarge a socket's buffer for bursts of thousands of frames, if permitted: the kernel drops the overflow."""
+    """Enlarge a socket's buffer, if permitted: the kernel drops what overflows."""
     try:
         kernel_socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
     except PermissionError:

@@ -1,4 +1,4 @@
-"""A CAN bus over TCP: client of `CanHub` or any socketcand server, which reconnects when the server returns."""
+"""A CAN bus over TCP: client of `CanHub` or any socketcand server, with reconnection."""
 
 from __future__ import annotations
 

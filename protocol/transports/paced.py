@@ -1,4 +1,4 @@
-"""Serial transports that send at the bit rate of a line, never block, and keep a bounded backlog."""
+"""Serial transports that send at the line's bit rate and never block."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def _replaced(events: Iterator[int]) -> bool:
 
 
 def _watch(path: str) -> int:
-    """Return an inotify descriptor for the openings and closings of a file, or -1 if the system has none left."""
+    """Return an inotify descriptor for a file's openings and closings, or -1 if none is left."""
     events = int(_LIBC.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC))
     if events >= 0 and _LIBC.inotify_add_watch(events, os.fsencode(path), _IN_OPEN | _IN_CLOSE) < 0:
         os.close(events)

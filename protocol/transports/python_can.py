@@ -1,4 +1,4 @@
-"""CAN buses of python-can as transports: socketcan, virtual, udp_multicast, slcan and its other interfaces."""
+"""CAN buses of python-can as transports: socketcan, virtual, udp_multicast, slcan and others."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         return True
 
     def _send_queued(self) -> None:
-        """Send a few frames per turn, as the bus accepts them: the kernel drops what is not read in between."""
+        """Send a few frames per turn; the kernel drops what is not read in between."""
         self._timer = None
         loop = asyncio.get_running_loop()
         for _ in range(SENDS_PER_TURN):
@@ -243,7 +243,7 @@ def _close_unused_bus(opening: asyncio.Future[can.BusABC]) -> None:
 
 
 def _descriptor(bus: can.BusABC) -> int:
-    """Return the descriptor that is readable when the bus has frames, or -1 (some interfaces, slcan on a network port)."""
+    """Return the descriptor that is readable when the bus has frames, or -1 if it has none."""
     try:
         return bus.fileno()
     except (NotImplementedError, OSError):

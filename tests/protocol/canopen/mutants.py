@@ -118,7 +118,7 @@ MUTANTS = (
     Mutant("TIME moved while it is consumed", "time", "timestamp", "lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES)", "lives_before=False, lives_after=False"),
     Mutant("EMCY without the generic bit", "emcy", "emergency", "= bits | ErrorRegister.GENERIC", "= bits & ~ErrorRegister.GENERIC"),
     Mutant("EMCY repeated", "emcy", "emergency", "        if (code, key) in self._active:\n            return False\n", ""),
-    Mutant("EMCY of 7 bytes", "emcy", "emergency", 'data[:5].ljust(5, b"\\0")', 'data[:4].ljust(4, b"\\0")'),
+    Mutant("EMCY of 7 bytes", "emcy", "emergency", "construct.Padded(5, construct.GreedyBytes)", "construct.Padded(4, construct.GreedyBytes)"),
     Mutant("error register stays", "emcy", "emergency", "if self._active.pop((code, key), None) is None:", "if (code, key) not in self._active:"),
     Mutant("history oldest first", "emcy", "emergency", "self._history.insert(0, code |", "self._history.append(code |"),
     Mutant("history without end", "emcy", "emergency", "        del self._history[self._capacity :]\n", ""),
