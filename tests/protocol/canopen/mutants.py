@@ -1,7 +1,7 @@
-"""Mutants of the CANopen slave: one defect each, as a change of one place in one module.
+"""Mutants of the CANopen slave: one defect each, as one change in one module.
 
-A mutant is the whole package loaded anew under another name with that place changed; the text to be changed must stand in
-the module exactly once, so that a mutant cannot silently become the original.
+A mutant is the whole package loaded under another name with that text replaced. The text must occur in the module exactly
+once, so that a mutant cannot silently become the original.
 """
 
 from __future__ import annotations
