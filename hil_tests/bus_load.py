@@ -21,7 +21,7 @@ from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.protocol.can_framing import (
     CanFrame,
     CanHostReceiver,
-    CanIdentifier,
+    CanId,
     MessageType,
     encode_request_frames,
 )
@@ -71,9 +71,9 @@ def _talk(spec: str, rate: float, pipe: Connection) -> None:
 
 
 async def _talk_until_stopped(spec: str, rate: float, pipe: Connection) -> None:
-    identifier = CanIdentifier(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
-    ping = CanIdentifier(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
-    pong = CanIdentifier(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
+    identifier = CanId(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
+    ping = CanId(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
+    pong = CanId(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
     seen: list[int] = []
 
     def count(frame: CanFrame) -> None:

@@ -1,1 +1,1 @@
-"""The wire: interface definition, framing, segmentation and transports (sans-I/O codecs first)."""
+"""Wire protocols: interface definitions, codecs, framing, CANopen, transports and exports."""

@@ -1,4 +1,4 @@
-"""CAN frames as text: the log format of `candump -L`, read and written."""
+"""Read and write CAN logs in the format of `candump -L`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ _LINE: Final = re.compile(
 
 
 def format_candump(frame: CanFrame, channel: str) -> str:
-    """Write a frame as a line of a candump log; a frame without a time gets 0."""
-    identifier = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    """Format a frame as a line of a candump log; a frame without a timestamp gets 0."""
+    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
     data = "R" if frame.remote else frame.data.hex().upper()
-    return f"({frame.timestamp or 0.0:017.6f}) {channel} {identifier}#{data}"
+    return f"({frame.timestamp or 0.0:017.6f}) {channel} {can_id}#{data}"
 
 
 def parse_candump(line: str) -> tuple[str, CanFrame]:
-    """Read a line of a candump log; return the channel and the frame. Raises ProtocolError on any other line."""
+    """Parse a line of a candump log; return the channel and the frame.
+
+    Raises ProtocolError for any other line.
+    """
     match = _LINE.match(line.strip())
     if match is None:
         raise ProtocolError(f"not a line of a candump log: {line.strip()[:60]!r}")
@@ -39,7 +42,10 @@ def parse_candump(line: str) -> tuple[str, CanFrame]:
 
 
 def read_candump(path: Path) -> Iterator[tuple[str, CanFrame]]:
-    """Read a candump log line by line; empty lines are passed over. An error names file and line."""
+    """Yield channel and frame of each line of a candump log; skip empty lines.
+
+    An error names file and line.
+    """
     try:
         with path.open(encoding="ascii", errors="replace") as stream:
             for number, line in enumerate(stream, 1):

@@ -1,4 +1,11 @@
-"""Rows of the interface definition as codecs: physical values to wire bytes and back, over construct."""
+"""Codecs of the rows of an interface definition: physical values to wire bytes and back.
+
+construct declares and packs the layout of a row; `Field` converts between raw and physical values, with limits and
+error texts that name row and field. Against scalars in construct and shifts of our own, the declaration of bit fields
+in construct costs nothing to encode and 1.4 times the time to decode, at most: 146 and 110 µs for the 39 fields of
+`star_tracker`, 21 and 15 µs for the 3 of `quaternion`. `Struct.compile` would save up to half of that, but takes
+1.3 ms per row at first use.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +32,7 @@ from starhil.protocol.values import (
 RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
-_CONSTRUCTS: Final[dict[str, Any]] = {
+_SCALARS: Final[dict[str, Any]] = {
     "u8": construct.Int8ul,
     "i8": construct.Int8sl,
     "u16": construct.Int16ul,
@@ -41,7 +48,7 @@ _CONSTRUCTS: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Slot:
-    """A run of bytes in a row: one scalar, or the raw bytes of a field."""
+    """Consecutive bytes of a row: one scalar, or the raw bytes of a field."""
 
     index: int
     """Position among the row's slots."""
@@ -52,30 +59,30 @@ class Slot:
     size: int
     """Number of bytes."""
 
-    @property
-    def key(self) -> str:
-        """Name of the slot in the construct layout."""
-        return f"slot_{self.index}"
+    @cached_property
+    def bits_key(self) -> str:
+        """Name of the slot's group of bits in the construct; no field can have this name."""
+        return f"bits of slot {self.index}"
 
 
 @dataclass(frozen=True)
 class Field:
-    """One value of a row: a slot of its own, or some bits of one."""
+    """One value of a row: a whole slot, or some bits of one."""
 
     name: str
-    """Key in the row's values; empty for unused bytes."""
+    """Key in the row's values; empty for unused bytes or bits."""
     kind: FieldKind
     slot: Slot
     shift: int = 0
     """Lowest bit in the slot (flags and bit groups)."""
     width: int = 0
-    """Bits in the slot; 0 where the field has the slot to itself."""
+    """Bits in the slot; 0 if the field is the whole slot."""
     unit: str = ""
     scale: float = 1.0
     """Physical = raw * scale + bias."""
     bias: float = 0.0
     minimum: float | None = None
-    """Least physical value; None if only the type limits it."""
+    """Lowest physical value; None if only the type limits it."""
     maximum: float | None = None
     enum: EnumDefinition | None = None
     default: bool | int | float | str | None = None
@@ -84,7 +91,8 @@ class Field:
     provenance: str = "ours"
     doc: str = ""
     wrap: bool = False
-    """Beyond its range telemetry carries the lowest bits (a counter) instead of the nearest limit."""
+    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
+    nearest limit."""
 
     @property
     def type(self) -> str:
@@ -108,7 +116,7 @@ class Field:
 
     @cached_property
     def raw_limits(self) -> tuple[int, int]:
-        """Least and greatest raw value of an integer, flag, bit group or enumeration."""
+        """Lowest and highest raw value of an integer, flag, bit group or enumeration."""
         low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
         if self.minimum is not None:
             low = max(low, round((self.minimum - self.bias) / self.scale))
@@ -118,7 +126,7 @@ class Field:
 
     @cached_property
     def physical_limits(self) -> tuple[float, float]:
-        """Least and greatest physical value of a number."""
+        """Lowest and highest physical value of a number."""
         if self.kind == "float":
             widest = F32_MAX if self.slot.type == "f32" else math.inf
             low = -widest if self.minimum is None else self.minimum
@@ -128,13 +136,13 @@ class Field:
 
     @cached_property
     def _divisor(self) -> int | None:
-        """1/scale where that is a whole number: dividing by it gives the nearest decimal."""
+        """1/scale if that is an integer: division by it gives the nearest decimal."""
         inverse = round(1.0 / self.scale)
         return inverse if inverse and abs(inverse * self.scale - 1.0) < 1e-12 else None
 
     @cached_property
     def empty(self) -> bool | int | float | str | bytes:
-        """The value that telemetry carries where none is given: the default, else zero moved into the limits."""
+        """The value if none is given: the default, else the value nearest zero within the limits."""
         if self.default is not None:
             return self.default
         match self.kind:
@@ -154,17 +162,20 @@ class Field:
                 return min(max(0, self.raw_limits[0]), self.raw_limits[1]) * self.scale + self.bias
 
     def clips(self, value: float) -> bool:
-        """Whether telemetry would carry the nearest limit in place of a number."""
+        """Return whether telemetry would send the nearest limit instead of this number."""
         if self.wrap:
             return False
         low, high = self.physical_limits
-        slack = self.scale / 2.0 if self.kind == "integer" else 0.0
-        return not low - slack <= value <= high + slack
+        margin = self.scale / 2.0 if self.kind == "integer" else 0.0
+        return not low - margin <= value <= high + margin
 
     def to_raw(
         self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
     ) -> int | float | bytes:
-        """Turn a physical value into the raw value of its slot or bits; raise FieldError if it cannot be."""
+        """Convert a physical value to the raw value of its slot or bits.
+
+        Raise FieldError if it does not fit.
+        """
         match self.kind:
             case "bytes":
                 return self._bytes_to_raw(value, where, index)
@@ -182,7 +193,10 @@ class Field:
                 return self._integer_to_raw(value, where, check=check, saturate=saturate, index=index)
 
     def to_physical(self, raw: Any) -> Value:
-        """Turn a raw value into the physical one; an enumeration's unknown number stays a number."""
+        """Convert a raw value to the physical one.
+
+        A number that is not in the enumeration stays a number.
+        """
         match self.kind:
             case "flag":
                 return bool(raw)
@@ -286,9 +300,26 @@ class Field:
         return whole
 
 
+def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
+    """Return the construct of one slot: a scalar, raw bytes, a bit field or padding."""
+    if fields[0].width:
+        bits = construct.BitStruct(
+            *(
+                field.name / construct.BitsInteger(field.width)
+                if field.name
+                else construct.Padding(field.width)
+                for field in reversed(fields)  # construct declares the most significant bit first
+            )
+        )
+        return slot.bits_key / construct.ByteSwapped(bits)
+    if not fields[0].name:
+        return construct.Padding(slot.size)
+    return fields[0].name / (construct.Bytes(slot.size) if slot.type == "bytes" else _SCALARS[slot.type])
+
+
 @dataclass(frozen=True, repr=False)
 class Row:
-    """A telecommand or telemetry row: its identity, its layout, and the codec between values and bytes."""
+    """A telecommand or telemetry row: id, name, layout, and the codec of its values."""
 
     kind: RowKind
     id: int
@@ -304,7 +335,7 @@ class Row:
     source: str = ""
 
     def __repr__(self) -> str:
-        """Return what tells the row apart."""
+        """Return kind, id and name."""
         return f"Row({self.kind} {self.id} {self.name})"
 
     @cached_property
@@ -314,42 +345,41 @@ class Row:
 
     @cached_property
     def layout(self) -> Any:
-        """The construct declaration of the row's bytes, slot by slot."""
-        members = [
-            slot.key / (construct.Bytes(slot.size) if slot.type == "bytes" else _CONSTRUCTS[slot.type])
-            for slot in self.slots
-        ]
-        return construct.Struct(*members)
+        """The construct of the row's bytes: raw values by field name, bits in a group per slot."""
+        return construct.Struct(
+            *(
+                _slot_layout(slot, [field for field in self.fields if field.slot is slot])
+                for slot in self.slots
+            )
+        )
 
     def encode(
         self, values: Mapping[str, Value] | None = None, *, check: bool = True, saturate: bool = False
     ) -> bytes:
-        """Turn physical values into the row's bytes.
+        """Encode physical values as the row's bytes.
 
         Parameters
         ----------
         values:
-            Value of each field by name. Telemetry fills what is missing with the default or zero; a telecommand
-            needs every field that has no default.
+            Values by field name. In telemetry a missing value becomes the default or zero; a telecommand needs every
+            field that has no default.
         check:
-            Refuse what is outside the limits. Without it only what the type cannot hold is refused (for tests
-            that send bad values on purpose).
+            Reject values outside the limits. If false, reject only what the type cannot hold (for tests that send
+            invalid values on purpose).
         saturate:
-            Clip numbers to the limits, or wrap counters, instead of refusing them, as the unit does with telemetry.
+            Clip numbers to the limits, or wrap counters, instead of rejecting them, as the unit does with telemetry.
 
         Raises
         ------
         FieldError
-            Names row.field, the value and what is allowed.
+            The text names row.field, the value and what is allowed.
         """
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()
         if unknown:
             known = ", ".join(self.named_fields) or "none"
             raise FieldError(f"{self.name}.{min(unknown)}: no such field (fields: {known})")
-        raw: dict[str, Any] = {
-            slot.key: bytes(slot.size) if slot.type == "bytes" else 0 for slot in self.slots
-        }
+        raw: dict[str, Any] = {slot.bits_key: {} for slot in self.slots}
         for index, (name, item) in enumerate(self.named_fields.items()):
             where = f"{self.name}.{name}"
             value = given.get(name)
@@ -357,19 +387,15 @@ class Row:
                 if self.kind == "telecommand" and item.default is None:
                     raise FieldError(f"{where}: no value given", index=index)
                 value = item.empty
-            number = item.to_raw(value, where, check=check, saturate=saturate, index=index)
-            if item.width:
-                raw[item.slot.key] |= int(number) << item.shift
-            else:
-                raw[item.slot.key] = number
+            group = raw[item.slot.bits_key] if item.width else raw
+            group[name] = item.to_raw(value, where, check=check, saturate=saturate, index=index)
         return bytes(self.layout.build(raw))
 
     def decode(self, data: bytes, *, check: bool | None = None) -> dict[str, Value]:
-        """Turn the row's bytes into physical values by name.
+        """Decode the row's bytes to physical values by name.
 
-        `check` refuses values outside the limits with FieldError; by default that is done for telecommands (the
-        device guards itself) and not for telemetry (the OBC wants to see what came). A wrong length always
-        raises LengthError.
+        With `check`, a value outside the limits raises FieldError. By default telecommands are checked (the device
+        protects itself) and telemetry is not (the OBC sees what arrived). A wrong length always raises LengthError.
         """
         if len(data) != self.size:
             raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {self.size}")
@@ -377,16 +403,14 @@ class Row:
         raw = self.layout.parse(data)
         values: dict[str, Value] = {}
         for index, (name, item) in enumerate(self.named_fields.items()):
-            number = raw[item.slot.key]
-            if item.width:
-                number = (number >> item.shift) & (2**item.width - 1)
+            number = (raw[item.slot.bits_key] if item.width else raw)[name]
             if strict:
                 item.check_raw(number, f"{self.name}.{name}", index)
             values[name] = item.to_physical(number)
         return values
 
     def clipped(self, values: Mapping[str, Value]) -> list[str]:
-        """Names of the numbers among the values that telemetry carries as the nearest limit."""
+        """Return the names of the numbers that telemetry would send as the nearest limit."""
         return [
             name
             for name, item in self.named_fields.items()
@@ -394,5 +418,5 @@ class Row:
         ]
 
     def example(self) -> dict[str, Value]:
-        """Return values that the row accepts: defaults, else zeros moved into the limits."""
+        """Return accepted values: defaults, else the values nearest zero within the limits."""
         return {name: item.empty for name, item in self.named_fields.items()}

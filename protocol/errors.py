@@ -1,4 +1,4 @@
-"""The error that every user-visible failure of this package derives from, and the words of what the system refuses."""
+"""The base class of this package's errors, and the reason of a failed system call as text."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import os
 
 
 class ProtocolError(Exception):
-    """Bytes, frames, values or definitions that the protocol refuses; one line says what and where."""
+    """Invalid bytes, frames, values or definitions.
+
+    The text is one line that names what and where.
+    """
 
 
 def reason(error: Exception) -> str:
-    """Why something was refused, in the system's words where it has some for the error.
+    """Return the reason of a failure: the system's text for the error number, else the error's own text.
 
-    Event loops put addresses into theirs; a name that is no host's has a number of its own, or is a ValueError.
+    The texts of an event loop repeat the address. An invalid host name has a negative error number or is a ValueError.
     """
     number = getattr(error, "errno", None)
     if isinstance(number, int) and number > 0:

@@ -1,4 +1,7 @@
-"""How connections share one event loop: each reads little a turn, and nobody's traffic waits behind another's backlog."""
+"""Fair use of one event loop by many connections, and the socket options of TCP connections.
+
+Each connection reads a limited amount per turn of the loop, and no traffic waits behind the backlog of another sender.
+"""
 
 from __future__ import annotations
 
@@ -10,49 +13,80 @@ from collections.abc import Hashable, Sequence
 from typing import Final
 
 TURN: Final = 4 * 1024
-"""Bytes that one connection reads in a turn of the loop at most: some 100 CAN frames in text, 10 ms of a device's work."""
+"""Most bytes that one connection reads per turn of the loop: about 100 CAN frames as text, 10 ms of
+work for a device."""
 
 WINDOW: Final = 16 * 1024
-"""Bytes that each buffer on the way of a connection holds at most: what lies there delays what comes after it."""
+"""Size of each buffer along a connection, bytes: what waits there delays what follows."""
+
+
+KEEPALIVE: Final = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 3}
+"""Probe a connection after 5 s of silence, then every 2 s; it is lost after 3 probes without an
+answer."""
+
+UNREAD_LIMIT_MS: Final = 10_000
+"""A server is lost when it has not acknowledged sent data for this time."""
 
 
 class TurnProtocol(asyncio.BufferedProtocol):
-    """A connection that reads at most `TURN` bytes before the loop serves the others."""
+    """A connection that reads at most `TURN` bytes before the loop serves other connections."""
 
     def __init__(self) -> None:
         self._buffer = bytearray(TURN)
 
     def get_buffer(self, sizehint: int) -> bytearray:
-        """Return where the next bytes go."""
+        """Return the buffer for the next bytes."""
         _ = sizehint
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Hand over the bytes that came."""
+        """Pass the bytes that were read to `data_received`."""
         self.data_received(bytes(self._buffer[:nbytes]))
 
     @abstractmethod
     def data_received(self, data: bytes) -> None:
-        """Take the bytes that came."""
+        """Process bytes that were read."""
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
-    """Let the kernel hold little of a TCP connection: by itself it takes megabytes, which are seconds of work."""
-    connection: socket.socket | None = transport.get_extra_info("socket")
-    if connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6):
+    """Limit the kernel's buffers of a TCP connection, which hold megabytes by default."""
+    connection = _tcp_socket(transport)
+    if connection is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WINDOW)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
 
 
-class FairQueue:
-    """Lines that wait for one receiver; their senders take turns, a line each.
+def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
+    """Close a silent TCP connection within about ten seconds of the other machine's disappearance.
 
-    Lines of one sender keep their order. Where there is no more room, the sender that has most waiting loses its newest.
+    With `must_read` a peer that is alive but reads nothing for that long is lost too. That is right for a server, but
+    not for a client program that is halted in a debugger.
+    """
+    connection = _tcp_socket(transport)
+    if connection is None:
+        return
+    options = KEEPALIVE | {socket.TCP_USER_TIMEOUT: UNREAD_LIMIT_MS} if must_read else KEEPALIVE
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in options.items():
+        connection.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
+def _tcp_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
+    connection: socket.socket | None = transport.get_extra_info("socket")
+    is_tcp = connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6)
+    return connection if is_tcp else None
+
+
+class FairQueue:
+    """Lines that wait for one receiver; their senders take turns, one line each.
+
+    Lines of one sender keep their order. When the queue is full, the sender with the most waiting bytes loses its newest
+    line.
 
     Parameters
     ----------
     limit
-        Bytes that wait at most.
+        Most bytes that may wait.
     """
 
     def __init__(self, limit: int) -> None:
@@ -63,7 +97,7 @@ class FairQueue:
         """Bytes that wait."""
 
     def put(self, sender: Hashable, lines: Sequence[bytes]) -> int:
-        """Add lines of a sender; return how many lines, of whatever sender, had to be dropped."""
+        """Add lines of a sender; return how many lines of any sender were dropped."""
         if not lines:
             return 0
         added = sum(map(len, lines))
@@ -78,7 +112,7 @@ class FairQueue:
         return dropped
 
     def take(self, size: int) -> list[bytes]:
-        """Remove and return the next lines: at least `size` bytes, or all."""
+        """Remove and return the next lines: at least `size` bytes, or everything."""
         taken: list[bytes] = []
         rest = size
         while self._lines and rest > 0:

@@ -1,9 +1,9 @@
-"""A CAN bus over TCP for machines whose kernel has none: an asyncio server of the socketcand text protocol.
+"""A CAN bus over TCP for machines without kernel CAN: an asyncio server of the socketcand text protocol.
 
-Each client opens a bus by name and sees every frame that the other clients of that bus send, the frames of each sender in
-order and without loss. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all, the senders take
-turns in what it gets, and what is too much is dropped for that client alone, of the sender that has most waiting, and
-counted: a flood delays and loses its own frames only. Malformed commands are answered by an error and change nothing.
+Each client opens a bus by name and receives every frame that the other clients of that bus send, in the order of each
+sender. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all. Senders take turns in that queue.
+When it is full, frames of the sender with the most waiting bytes are dropped for that client and counted, so a flood
+delays and loses only its own frames. A malformed command is answered by an error and changes nothing.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from typing import Final, TextIO, cast
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import format_candump
 from starhil.protocol.errors import ProtocolError, reason
-from starhil.protocol.flow import WINDOW, FairQueue, TurnProtocol, limit_buffers
-from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.flow import WINDOW, FairQueue, TurnProtocol, detect_lost_peer, limit_buffers
 from starhil.protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
 _LOGGER: Final = logging.getLogger("starhil.hub")
@@ -32,20 +31,20 @@ DEFAULT_PORT: Final = 29536
 DEFAULT_BUS: Final = "vcan0"
 
 BACKLOG_LIMIT: Final = 256 * 1024
-"""Bytes that wait for one slow client at most: some 4500 frames, half a second of a bus at 1 Mbit/s.
+"""Most bytes that wait for one slow client: about 4500 frames, half a second of a bus at 1 Mbit/s.
 
-A kernel CAN socket holds fewer than 300 by default. What waits is stale when it is read, and delays what comes after it.
+A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read and delay later ones.
 """
 
 SETTLE_S: Final = 1.0
-"""Longest time that frames are held back from a client that has just entered raw mode.
+"""Longest time that frames are withheld from a client that has just entered raw mode.
 
-python-can's client takes the answer to `< rawmode >` for broken if a frame follows it in the same read. What the client
-sends itself shows that it has read the answer, and ends the wait.
+python-can's client rejects the answer to `< rawmode >` if a frame follows it in the same read. Anything that the client
+sends shows that it has read the answer, and ends the wait.
 """
 
 FLUSH_LOG_S: Final = 0.5
-"""Longest time that a logged frame stays in memory."""
+"""Longest time that a logged frame stays in the buffer."""
 
 
 @dataclass(slots=True)
@@ -57,9 +56,9 @@ class HubStatistics:
     frames: int = 0
     """Frames received from clients."""
     delivered: int = 0
-    """Frames handed to clients."""
+    """Frames delivered to clients."""
     dropped: int = 0
-    """Frames not handed to a client because it does not read."""
+    """Frames dropped because a client does not read."""
     errors: int = 0
     """Malformed or unknown commands."""
 
@@ -81,13 +80,13 @@ class _Client(TurnProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        notice_a_lost_peer(transport)
+        detect_lost_peer(transport)
         limit_buffers(transport)
         self._transport.set_write_buffer_limits(high=WINDOW)
         self._transport.write(b"< hi >")
         self._hub.join(self)
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (given by asyncio)
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (asyncio's signature)
         self._transport = None
         if self._settle is not None:
             self._settle.cancel()
@@ -101,32 +100,35 @@ class _Client(TurnProtocol):
         self._write_waiting()
 
     def data_received(self, data: bytes) -> None:
-        """Execute the commands that came."""
+        """Execute the received commands."""
         if self._settle is not None:
-            self._release()
+            self._end_settling()
         frames: list[CanFrame] = []
         for command in self._splitter.feed(data):
             if command is not None and command.startswith(b"send "):
                 try:
-                    self._need_bus()
+                    self._require_bus()
                     frames.append(parse_send(command))
                 except ProtocolError as error:
-                    self._refuse(str(error))
+                    self._answer_error(str(error))
             else:
                 if frames:
                     self._hub.distribute(self, frames)
                     frames = []
-                self._command(command)
+                self._execute(command)
         if frames:
             self._hub.distribute(self, frames)
 
     def close(self) -> None:
-        """Drop the connection, whatever is still waiting."""
+        """Drop the connection and all that waits for it."""
         if self._transport is not None:
             self._transport.abort()
 
     def deliver(self, sender: _Client, lines: list[bytes]) -> int:
-        """Hand over frames of another client, at once or when there is room; return how many were dropped."""
+        """Send frames of another client, at once or when there is room.
+
+        Return how many were dropped.
+        """
         if self._transport is None:
             return len(lines)
         if self._waiting.size or self._full or self._settle is not None:
@@ -149,15 +151,15 @@ class _Client(TurnProtocol):
         if self._transport is not None and self.backlog <= BACKLOG_LIMIT:
             self._transport.write(f"< {text} >".encode())
 
-    def _refuse(self, text: str) -> None:
+    def _answer_error(self, text: str) -> None:
         self._hub.statistics.errors += 1
         self._answer(f"error {text}")
 
-    def _need_bus(self) -> None:
+    def _require_bus(self) -> None:
         if self.bus is None:
             raise CommandError("no bus is open; send open NAME first")
 
-    def _command(self, command: bytes | None) -> None:
+    def _execute(self, command: bytes | None) -> None:
         match command.split() if command is not None else []:
             case [b"open", name] if self.bus is None and name.isascii():
                 self.bus = name.decode()
@@ -166,26 +168,26 @@ class _Client(TurnProtocol):
                 self._answer("ok")
                 if not self.raw:
                     self.raw = True
-                    self._hold()
+                    self._withhold_frames()
             case [b"remote"] if self.bus is not None:
                 self.remote = True
                 self._answer("ok")
             case [b"echo"]:
                 self._answer("echo")
             case [b"open", _]:
-                self._refuse("a bus is open already")
+                self._answer_error("a bus is open already")
             case [b"rawmode"] | [b"remote"]:
-                self._refuse("no bus is open; send open NAME first")
+                self._answer_error("no bus is open; send open NAME first")
             case []:
-                self._refuse("malformed command")
+                self._answer_error("malformed command")
             case _:
-                self._refuse("unknown command")
+                self._answer_error("unknown command")
 
-    def _hold(self) -> None:
+    def _withhold_frames(self) -> None:
         if not self.remote:
-            self._settle = asyncio.get_running_loop().call_later(SETTLE_S, self._release)
+            self._settle = asyncio.get_running_loop().call_later(SETTLE_S, self._end_settling)
 
-    def _release(self) -> None:
+    def _end_settling(self) -> None:
         if self._settle is not None:
             self._settle.cancel()
             self._settle = None
@@ -198,11 +200,11 @@ class CanHub:
     Parameters
     ----------
     host, port:
-        Address to listen at; port 0 takes a free one, which `port` then tells.
+        Address to listen at; with port 0, `port` is the free port chosen by `start`.
     log:
-        File that gets every frame as a candump log.
+        Candump log of all frames.
     now:
-        Clock of the frames' time stamps (s since 1970).
+        Clock of the timestamps (s since 1970).
     """
 
     def __init__(
@@ -224,7 +226,7 @@ class CanHub:
         self._flusher: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
-        """Listen. Raises ProtocolError if the address or the log cannot be had."""
+        """Listen. Raises ProtocolError if the address or the log is not available."""
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: _Client(self), self.host, self.port)
@@ -257,31 +259,31 @@ class CanHub:
             try:
                 self._log.close()
             except OSError as error:
-                self._give_up_log(error)
+                self._abandon_log(error)
             self._log = None
 
     def join(self, client: _Client) -> None:
-        """Take in a new client."""
+        """Add a client."""
         self._clients.append(client)
         self.statistics.clients += 1
 
     def leave(self, client: _Client) -> None:
-        """Let go of a client."""
+        """Remove a client."""
         self._clients.remove(client)
         self.statistics.clients -= 1
 
     def distribute(self, sender: _Client, frames: list[CanFrame]) -> None:
-        """Hand frames to every other client of the sender's bus."""
+        """Deliver frames to every other client of the sender's bus."""
         seconds = self._now()
         stamp = f"{seconds:.6f}".encode()
         lines = [(format_frame(frame, stamp), frame.remote) for frame in frames]
         self.statistics.frames += len(lines)
-        everything = [line for line, _ in lines]
-        plain = [line for line, remote in lines if not remote]
+        all_lines = [line for line, _ in lines]
+        data_lines = [line for line, remote in lines if not remote]
         for client in self._clients:
             if client is sender or not client.raw or client.bus != sender.bus:
                 continue
-            wanted = everything if client.remote else plain
+            wanted = all_lines if client.remote else data_lines
             dropped = client.deliver(sender, wanted)
             self.statistics.delivered += len(wanted) - dropped
             self.statistics.dropped += dropped
@@ -291,7 +293,7 @@ class CanHub:
                 for frame in frames:
                     self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
             except OSError as error:
-                self._give_up_log(error)
+                self._abandon_log(error)
 
     def _flush_log(self) -> None:
         if self._log is None:
@@ -299,14 +301,14 @@ class CanHub:
         try:
             self._log.flush()
         except OSError as error:
-            self._give_up_log(error)
+            self._abandon_log(error)
         else:
             self._flusher = asyncio.get_running_loop().call_later(FLUSH_LOG_S, self._flush_log)
 
-    def _give_up_log(self, error: OSError) -> None:
-        """Say once that the log ends here; the bus goes on without it."""
+    def _abandon_log(self, error: OSError) -> None:
+        """Log once that the log ends here; the bus continues without it."""
         log, self._log = self._log, None
-        _LOGGER.warning("CAN hub: log %s ends here: %s; the bus goes on", self._log_path, reason(error))
+        _LOGGER.warning("CAN hub: log %s ends here: %s; the bus continues", self._log_path, reason(error))
         if log is not None:
-            with contextlib.suppress(OSError):  # what it holds back cannot be written either
+            with contextlib.suppress(OSError):  # its buffer cannot be written either
                 log.close()

@@ -1,4 +1,4 @@
-"""The interface definition: read from `configs/icd/*.toml`, checked as a whole, and served by name and identifier."""
+"""The interface definition: loaded from `configs/icd/*.toml`, validated, indexed by name and id."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _SIZES: Final[dict[str, int]] = {
 
 
 class UnknownNameError(ProtocolError, KeyError):
-    """A name that the interface definition does not have; the text offers near ones."""
+    """A name that is not in the interface definition; the text suggests similar ones."""
 
     def __str__(self) -> str:
         """Return the plain text (KeyError would quote it)."""
@@ -62,7 +62,7 @@ class UnknownNameError(ProtocolError, KeyError):
 
 
 class Names(dict[str, _Item]):
-    """Items by name; a name that is not there raises UnknownNameError with near names."""
+    """Items by name; a missing name raises UnknownNameError with suggestions."""
 
     def __init__(self, what: str, items: Iterable[tuple[str, _Item]]) -> None:
         super().__init__(items)
@@ -76,7 +76,7 @@ class Names(dict[str, _Item]):
 
 @dataclass(frozen=True)
 class InterfaceDefinition:
-    """All that a device and its OBC agree on."""
+    """The interface between a device and its OBC: rows, enumerations and parameters."""
 
     name: str
     version: str
@@ -86,31 +86,31 @@ class InterfaceDefinition:
     enums: Names[EnumDefinition]
     parameters: Names[Parameter]
     sections: tuple[Section, ...] = ()
-    """Text for people beside the rows: conventions."""
+    """Documentation that accompanies the rows, such as conventions."""
 
     @cached_property
     def telecommands_by_id(self) -> Mapping[int, Row]:
-        """Telecommands by identifier."""
+        """Telecommands by id."""
         return {row.id: row for row in self.telecommands.values()}
 
     @cached_property
     def telemetry_by_id(self) -> Mapping[int, Row]:
-        """Telemetry by identifier."""
+        """Telemetry by id."""
         return {row.id: row for row in self.telemetry.values()}
 
     @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:
-        """Parameters by identifier."""
+        """Parameters by id."""
         return {parameter.id: parameter for parameter in self.parameters.values()}
 
-    def row_by_id(self, identifier: int) -> Row | None:
-        """Return the row of an identifier, telecommand or telemetry, or None."""
-        table = self.telemetry_by_id if identifier >= FIRST_TELEMETRY_ID else self.telecommands_by_id
-        return table.get(identifier)
+    def row_by_id(self, row_id: int) -> Row | None:
+        """Return the telecommand or telemetry row with this id, or None."""
+        table = self.telemetry_by_id if row_id >= FIRST_TELEMETRY_ID else self.telecommands_by_id
+        return table.get(row_id)
 
     @property
     def rows(self) -> Iterator[Row]:
-        """All rows: telecommands, then telemetry, each by identifier."""
+        """All rows: telecommands, then telemetry, each in order of id."""
         return chain(
             (self.telecommands_by_id[key] for key in sorted(self.telecommands_by_id)),
             (self.telemetry_by_id[key] for key in sorted(self.telemetry_by_id)),
@@ -118,7 +118,7 @@ class InterfaceDefinition:
 
 
 def default_icd_path() -> Path:
-    """Folder of the interface definition that travels with the package."""
+    """Return the folder of the interface definition that ships with the package."""
     package = Path(__file__).resolve().parent.parent
     return package / "configs" / "icd"
 
@@ -126,8 +126,8 @@ def default_icd_path() -> Path:
 def load_icd(path: Path | str | None = None) -> InterfaceDefinition:
     """Read an interface definition: a folder of TOML files, or one file.
 
-    Without a path, the definition that travels with the package, read once. Raises IcdError, which names file, row
-    and field.
+    Without a path, return the definition that ships with the package, which is read once. Raises IcdError, whose text
+    names file, row and field.
     """
     return _load_default() if path is None else _load(Path(path))
 
@@ -161,12 +161,12 @@ def _read(file: Path) -> FileModel:
         return FileModel.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
-        raise IcdError(f"{file}: {_place(document, first['loc'])}: {first['msg']}") from None
+        raise IcdError(f"{file}: {_key_path(document, first['loc'])}: {first['msg']}") from None
 
 
-def _place(document: object, location: tuple[int | str, ...]) -> str:
-    """Write a place in a document with the names of rows and fields in place of their positions."""
-    words: list[str] = []
+def _key_path(document: object, location: tuple[int | str, ...]) -> str:
+    """Return a key's dotted path, with names of rows and fields instead of positions."""
+    steps: list[str] = []
     here = document
     for step in location:
         try:
@@ -174,12 +174,12 @@ def _place(document: object, location: tuple[int | str, ...]) -> str:
         except (KeyError, IndexError, TypeError):
             here = None
         named = here.get("name") if isinstance(here, dict) else None
-        words.append(str(named if named is not None and isinstance(step, int) else step))
-    return ".".join(words)
+        steps.append(str(named if named is not None and isinstance(step, int) else step))
+    return ".".join(steps)
 
 
 class _Builder:
-    """Gathers files and checks that together they make one definition."""
+    """Collects the files of a definition and validates them together."""
 
     def __init__(self) -> None:
         self._head: tuple[str, str, str] | None = None
@@ -250,9 +250,9 @@ class _Builder:
         where = f"{file}: parameter {model.name}"
         if model.name in self._parameters:
             raise IcdError(f"{where}: defined twice")
-        twin = next((other.name for other in self._parameters.values() if other.id == model.id), None)
-        if twin is not None:
-            raise IcdError(f"{where}: id {model.id} is already that of {twin}")
+        same_id = next((other.name for other in self._parameters.values() if other.id == model.id), None)
+        if same_id is not None:
+            raise IcdError(f"{where}: id {model.id} is already used by {same_id}")
         enum = self._enum(model.enum, where) if model.type == "enum8" else None
         low, high = self._parameter_limits(model, enum, where)
         parameter = Parameter(
@@ -286,7 +286,7 @@ class _Builder:
         waiting = [(file, model) for file, model in models if model.include]
         done: list[Row] = []
         for file, model in chain(((file, model) for file, model in models if not model.include), waiting):
-            for row in self._rows_of(kind, file, model, rows):
+            for row in self._expand_row(kind, file, model, rows):
                 self._check_unique(file, row, done, rows)
                 rows[row.name] = row
                 done.append(row)
@@ -300,11 +300,13 @@ class _Builder:
             raise IcdError(f"{where}: id {row.id} is not a {row.kind} id ({side})")
         if row.name in rows:
             raise IcdError(f"{where}: name used twice")
-        twin = next((other.name for other in done if other.id == row.id), None)
-        if twin is not None:
-            raise IcdError(f"{where}: id {row.id} is already that of {twin}")
+        same_id = next((other.name for other in done if other.id == row.id), None)
+        if same_id is not None:
+            raise IcdError(f"{where}: id {row.id} is already used by {same_id}")
 
-    def _rows_of(self, kind: RowKind, file: Path, model: RowModel, rows: Mapping[str, Row]) -> Iterator[Row]:
+    def _expand_row(
+        self, kind: RowKind, file: Path, model: RowModel, rows: Mapping[str, Row]
+    ) -> Iterator[Row]:
         where = f"{file}: {kind} {model.name}"
         if (model.fields is None) == (model.include is None):
             raise IcdError(f"{where}: needs either `fields` or `include`")
@@ -321,11 +323,11 @@ class _Builder:
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
             raise IcdError(f"{where}: last_id {last} is below id {model.id}")
-        for identifier in range(model.id, last + 1):
-            suffix = "" if model.last_id is None else f"_{identifier - model.id + 1}"
+        for row_id in range(model.id, last + 1):
+            suffix = "" if model.last_id is None else f"_{row_id - model.id + 1}"
             yield Row(
                 kind=kind,
-                id=identifier,
+                id=row_id,
                 name=model.name + suffix,
                 size=model.size,
                 fields=tuple(layout.fields),
@@ -353,7 +355,7 @@ class _Builder:
 
 
 class _Layout:
-    """Lays the fields of one row one after another."""
+    """Places the fields of one row one after another."""
 
     def __init__(self, builder: _Builder, where: str, provenance: str) -> None:
         self._builder = builder
@@ -370,7 +372,7 @@ class _Layout:
             self._append(replace(item, slot=moved[item.slot.index]))
 
     def add(self, model: FieldModel) -> None:
-        """Append a field, a run of numbered fields, or the bits of a bit field."""
+        """Append a field, a series of numbered fields, or the bits of a bit field."""
         where = f"{self._where}: field {model.name or 'unused'}"
         if model.type.startswith("bits"):
             self._add_bits(model, where)
@@ -381,7 +383,7 @@ class _Layout:
             if model.size is None:
                 raise IcdError(f"{where}: type {model.type} needs a size")
         elif model.size is not None:
-            raise IcdError(f"{where}: type {model.type} has its own size; remove `size`")
+            raise IcdError(f"{where}: type {model.type} has a fixed size; remove `size`")
         for number in range(1, (model.count or 1) + 1):
             suffix = f"_{number}" if model.count else ""
             self._append(self._field(model, where, suffix))

@@ -1,4 +1,4 @@
-"""The form of interface definition files: pydantic models that refuse unknown keys and wrong types."""
+"""Schema of interface definition files; it rejects unknown keys and wrong types."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class _Model(BaseModel):
 
 
 class DefinitionModel(_Model):
-    """Head of a definition: its name and version."""
+    """Header of a definition: its name, version and description."""
 
     name: str
     version: str
@@ -37,7 +37,7 @@ class EnumModel(_Model):
 
 
 class BitModel(_Model):
-    """One bit or a group of bits; without a name it is unused."""
+    """One bit or a group of bits; unused if it has no name."""
 
     name: Name | None = None
     width: Annotated[int, Field(ge=1, le=31)] = 1
@@ -48,11 +48,11 @@ class BitModel(_Model):
 
 
 class FieldModel(_Model):
-    """One field of a row; without a name it is unused and sent as zeros."""
+    """One field of a row; unused and sent as zeros if it has no name."""
 
     name: Name | None = None
     count: Annotated[int, Field(ge=2, le=64)] | None = None
-    """Makes fields name_1 … name_count."""
+    """Expands to the fields name_1 … name_count."""
     type: FieldType
     size: Annotated[int, Field(ge=1, le=4096)] | None = None
     """Bytes of a `bytes` or `text` field."""
@@ -67,7 +67,8 @@ class FieldModel(_Model):
     parameter: str | None = None
     """Name of the parameter that the field sets or reports."""
     wrap: bool = False
-    """In telemetry: beyond its range the lowest bits instead of the nearest limit."""
+    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
+    nearest limit."""
     provenance: Provenance | None = None
     doc: str = ""
 
@@ -77,7 +78,7 @@ class RowModel(_Model):
 
     id: Annotated[int, Field(ge=0, le=255)]
     last_id: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Makes rows name_1 … for id … last_id, all of one layout."""
+    """Expands to the rows name_1 … for the ids id … last_id, all with the same layout."""
     name: Name
     doc: str
     provenance: Provenance
@@ -85,7 +86,7 @@ class RowModel(_Model):
     size: Annotated[int, Field(ge=0, le=4096)]
     fields: list[FieldModel] | None = None
     include: list[str] | None = None
-    """Names of rows whose fields make up this one, in order."""
+    """Names of rows whose fields this row concatenates, in order."""
 
 
 class ParameterModel(_Model):
@@ -103,7 +104,7 @@ class ParameterModel(_Model):
 
 
 class SectionModel(_Model):
-    """Text for people beside the rows: paragraphs and a table."""
+    """Documentation that accompanies the rows: paragraphs and a table."""
 
     heading: Annotated[str, Field(min_length=1)]
     paragraphs: list[str] = []
@@ -121,4 +122,4 @@ class FileModel(_Model):
     parameter: list[ParameterModel] = []
     section: list[SectionModel] = []
     canopen: dict[str, object] | None = None
-    """The CANopen mapping, read by `starhil.protocol.canopen`; no part of the rows."""
+    """The CANopen mapping, read by `starhil.protocol.canopen.layout`."""

@@ -1,4 +1,4 @@
-"""What crosses a link, whatever the link: requests, replies, faults and the published error codes."""
+"""Messages of every link: requests, replies, link faults, and the published error codes."""
 
 from __future__ import annotations
 
@@ -6,15 +6,23 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Final
 
+from starhil.protocol.errors import ProtocolError
+
 FIRST_TELEMETRY_ID: Final = 128
-"""Identifiers from here on are telemetry; those below are telecommands."""
+"""Ids from this one up are telemetry, those below are telecommands."""
+
+DEFAULT_MAX_SIZE: Final = 512
+"""Longest message that a receiver accepts, as the published host library's buffer."""
+
+DEFAULT_TIMEOUT_S: Final = 0.5
+"""Silence within a message after which it is abandoned."""
 
 BURST_ID: Final = 119
-"""Identifier under which the packets of a file burst are sent."""
+"""Id of the packets of a file burst."""
 
 
 class ErrorCode(IntEnum):
-    """Answer to a request: 0 to 4 are generation 1's, 5 to 10 were added by generation 2."""
+    """Result of a request: generation 1 has 0 to 4, generation 2 added 5 to 10."""
 
     OK = 0
     INVALID_ID = 1
@@ -30,14 +38,14 @@ class ErrorCode(IntEnum):
 
 
 class RequestKind(Enum):
-    """What an OBC asks for."""
+    """Kinds of requests that an OBC sends."""
 
     TELECOMMAND = "telecommand"
     TELEMETRY = "telemetry"
 
 
 class ReplyKind(Enum):
-    """What a device sends."""
+    """Kinds of messages that a device sends."""
 
     ACK = "ack"
     NACK = "nack"
@@ -48,14 +56,14 @@ class ReplyKind(Enum):
 
 
 class FaultKind(Enum):
-    """What was wrong with bytes or frames that gave no message."""
+    """Faults of bytes or frames that did not yield a message."""
 
     UART_PROTOCOL = "uart_protocol"
-    """Bytes outside or against the framing."""
+    """Bytes outside a message or that violate the framing."""
     UART_INCOMPLETE = "uart_incomplete"
     """A message began and did not end."""
     UART_OVERLONG = "uart_overlong"
-    """A message longer than the receiver takes."""
+    """A message longer than the receiver accepts."""
     CAN_SEQUENCE = "can_sequence"
     """A segment out of order."""
     CAN_INCOMPLETE = "can_incomplete"
@@ -63,9 +71,9 @@ class FaultKind(Enum):
     CAN_LENGTH = "can_length"
     """A data length that the message type does not allow."""
     CAN_TYPE = "can_type"
-    """A message type that a device or host does not take."""
+    """A message type that a device or host does not accept."""
     CAN_OVERLONG = "can_overlong"
-    """A segmented message longer than the receiver takes, or too many at once."""
+    """A segmented message longer than the receiver accepts, or too many open at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,44 +82,51 @@ class Request:
 
     kind: RequestKind
     id: int
-    """Identifier on the wire, 0 to 255."""
+    """Id on the wire, 0 to 255."""
     data: bytes = b""
     source: int = 0
-    """CAN address of the asker; 0 on serial."""
+    """CAN address of the sender; 0 on serial."""
 
     @classmethod
-    def of(cls, identifier: int, data: bytes = b"", source: int = 0) -> Request:
-        """Make a request whose kind follows from its identifier."""
-        kind = RequestKind.TELEMETRY if identifier >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
-        return cls(kind, identifier, data, source)
+    def of(cls, row_id: int, data: bytes = b"", source: int = 0) -> Request:
+        """Return a request whose kind follows from its id."""
+        kind = RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
+        return cls(kind, row_id, data, source)
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What a device answers or sends by itself."""
+    """A device's answer to a request, or a message that it sends unprompted."""
 
     kind: ReplyKind
     id: int | None
-    """Identifier that is answered; None where a serial dialect does not carry it and nothing was expected."""
+    """Id of the answered request or of the message; None if the serial dialect does not carry it.
+    """
     data: bytes = b""
     code: ErrorCode | int = ErrorCode.OK
-    """Error code of a NACK; an unknown code stays a plain number."""
+    """Error code of a NACK; an unpublished code is a plain number."""
     destination: int = 0
-    """CAN address that the reply goes to (device side); 0 on serial."""
+    """CAN address of the receiver (set on the device side); 0 on serial."""
     source: int = 0
-    """CAN address that the reply came from (OBC side); 0 on serial."""
+    """CAN address of the sender (set on the OBC side); 0 on serial."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkFault:
-    """Input that made no message: the kind is for the counters, the detail for a person."""
+    """Input that yielded no message: the kind for the counters, the detail as text."""
 
     kind: FaultKind
     detail: str
 
 
+def check_receiver_limits(max_size: int, timeout_s: float) -> None:
+    """Raise ProtocolError unless both limits of a receiver are positive."""
+    if max_size < 1 or timeout_s <= 0:
+        raise ProtocolError(f"receiver limits {max_size} bytes, {timeout_s} s must be positive")
+
+
 def error_code(raw: int) -> ErrorCode | int:
-    """Name an error code; one that is not published stays a number."""
+    """Return the ErrorCode of a number, or the number itself if it is not a published code."""
     try:
         return ErrorCode(raw)
     except ValueError:

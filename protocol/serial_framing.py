@@ -1,19 +1,21 @@
-"""Serial framing of the CubeSpace family: `1F 7F <id> <data> 1F FF` with 0x1F doubled, as sans-I/O state machines.
+"""Serial framing of the CubeSpace family: `1F 7F <id> <data> 1F FF` with 0x1F doubled, as a sans-I/O state machine.
 
-Three forms of reply are in use, all public: dialect a (CubeComputer: the reply carries the id), b (stand-alone
-CubeSense node: it does not) and c (generation 2: start bytes tell acknowledge, refusal, event and unsolicited
-telemetry apart).
+Three public dialects of replies are in use: a (CubeComputer: the reply carries the id), b (stand-alone CubeSense node:
+it does not) and c (generation 2: the start byte distinguishes ACK, NACK, event and unsolicited telemetry).
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import (
     BURST_ID,
+    DEFAULT_MAX_SIZE,
+    DEFAULT_TIMEOUT_S,
     FIRST_TELEMETRY_ID,
     FaultKind,
     LinkFault,
@@ -21,6 +23,7 @@ from starhil.protocol.messages import (
     ReplyKind,
     Request,
     RequestKind,
+    check_receiver_limits,
     error_code,
 )
 
@@ -35,15 +38,9 @@ START_UNSOLICITED: Final = 0x4F
 BURST_SIZE: Final = 22
 """Bytes of a burst packet: its number (u16) and 20 bytes of the file."""
 
-DEFAULT_MAX_SIZE: Final = 512
-"""Longest message (id and data) that a receiver takes, as the published host library's buffer."""
-
-DEFAULT_TIMEOUT_S: Final = 0.5
-"""Silence within a message after which it is given up."""
-
 
 class Dialect(StrEnum):
-    """Form of serial replies."""
+    """Formats of serial replies."""
 
     A = "a"
     B = "b"
@@ -51,7 +48,7 @@ class Dialect(StrEnum):
 
     @property
     def supports_unsolicited(self) -> bool:
-        """Whether the dialect can tell unsolicited telemetry and events from replies."""
+        """Whether the dialect has unsolicited telemetry and events."""
         return self is Dialect.C
 
 
@@ -61,16 +58,16 @@ class _State(Enum):
     IDLE_ESCAPED = auto()
     """Outside a message, after an escape byte."""
     FIRST = auto()
-    """At the first byte after the start: the id, where there is one."""
+    """At the first byte after the start: the id, if the message has one."""
     FIRST_ESCAPED = auto()
-    """After an escape byte in place of the id."""
+    """After an escape byte at the position of the id."""
     BODY = auto()
     BODY_ESCAPED = auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """What stands between start and end, with the stuffing taken out."""
+    """The content between start and end of a message, without the stuffing."""
 
     start: int
     """Start byte: 7F, or 07, 0F, 2F, 4F in dialect c."""
@@ -78,11 +75,10 @@ class Packet:
 
 
 class Deframer:
-    """Find packets in a stream of bytes, however it is cut; junk becomes faults, one for each run of it.
+    """Finds packets in a stream of bytes; each run of junk yields one fault.
 
-    A run of junk ends with the next start of a message or with a silence of the time-out. An id of 0x1F is ambiguous
-    in the field: some senders double it, others do not. Both are read as id 0x1F as long as a start or end cannot be
-    meant.
+    A run of junk ends at the next start of a message or after a silence of the timeout. An id of 0x1F is ambiguous in
+    practice: some senders double it, others do not. Both forms are read as id 0x1F unless they are a start or an end.
     """
 
     def __init__(
@@ -93,8 +89,7 @@ class Deframer:
         max_size: int = DEFAULT_MAX_SIZE,
         timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
-        if max_size < 1 or timeout_s <= 0:
-            raise ProtocolError(f"receiver limits {max_size} bytes, {timeout_s} s must be positive")
+        check_receiver_limits(max_size, timeout_s)
         self._starts = starts
         self._first_is_id = first_is_id
         self._max_size = max_size
@@ -112,7 +107,7 @@ class Deframer:
         return self._state not in (_State.IDLE, _State.IDLE_ESCAPED)
 
     def feed(self, data: bytes, now: float) -> list[Packet | LinkFault]:
-        """Take bytes that arrived at time `now` (s, any origin) and return what they complete."""
+        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
         self._events = list(self.flush(now))
         if data:
             self._last_time = now
@@ -122,7 +117,7 @@ class Deframer:
         return self._events
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Give up a message that has been silent for the time-out."""
+        """Abandon a message that has been silent for the timeout."""
         if now - self._last_time < self._timeout_s:
             return []
         state, in_junk, size = self._state, self._in_junk, len(self._body)
@@ -135,13 +130,13 @@ class Deframer:
         return [LinkFault(FaultKind.UART_INCOMPLETE, text)]
 
     def _advance(self, data: bytes, position: int) -> int:
-        """Take one byte, or all up to the next escape byte; return the position after it."""
+        """Process one byte, or all up to the next escape byte; return the position after it."""
         match self._state:
             case _State.IDLE | _State.BODY:
                 escape = data.find(ESCAPE, position)
                 end = len(data) if escape < 0 else escape
                 if end > position:
-                    self._take(data[position:end])
+                    self._add_plain_bytes(data[position:end])
                     return end
                 self._state = _State.BODY_ESCAPED if self.busy else _State.IDLE_ESCAPED
             case _State.FIRST:
@@ -149,7 +144,7 @@ class Deframer:
                     self._state = _State.FIRST_ESCAPED if self._first_is_id else _State.BODY_ESCAPED
                 else:
                     self._state = _State.BODY
-                    self._take(data[position : position + 1])
+                    self._add_plain_bytes(data[position : position + 1])
             case _State.IDLE_ESCAPED:
                 self._after_idle_escape(data[position])
             case _State.FIRST_ESCAPED:
@@ -158,20 +153,20 @@ class Deframer:
                 self._after_body_escape(data[position])
         return position + 1
 
-    def _take(self, run: bytes) -> None:
-        """Take bytes that are neither escape bytes nor escaped."""
+    def _add_plain_bytes(self, run: bytes) -> None:
+        """Add bytes that are neither escape bytes nor escaped."""
         if self.busy:
             self._body += run
             if len(self._body) > self._max_size:
-                self._give_up(FaultKind.UART_OVERLONG, f"message longer than {self._max_size} bytes")
+                self._abandon(FaultKind.UART_OVERLONG, f"message longer than {self._max_size} bytes")
         else:
-            self._junk(run[0])
+            self._report_junk(run[0])
 
     def _after_idle_escape(self, byte: int) -> None:
         if byte in self._starts:
-            self._open(byte)
+            self._start_message(byte)
             return
-        self._junk(ESCAPE)
+        self._report_junk(ESCAPE)
         if byte != ESCAPE:
             self._state = _State.IDLE
 
@@ -180,12 +175,12 @@ class Deframer:
             self._after_body_escape(byte)
             return
         self._state = _State.BODY
-        self._take(bytes((ESCAPE,) if byte == ESCAPE else (ESCAPE, byte)))
+        self._add_plain_bytes(bytes((ESCAPE,) if byte == ESCAPE else (ESCAPE, byte)))
 
     def _after_body_escape(self, byte: int) -> None:
         self._state = _State.BODY
         if byte == ESCAPE:
-            self._take(bytes((ESCAPE,)))
+            self._add_plain_bytes(bytes((ESCAPE,)))
         elif byte == END:
             body = bytes(self._body)
             self._reset(in_junk=False)
@@ -194,13 +189,13 @@ class Deframer:
             else:
                 self._events.append(LinkFault(FaultKind.UART_PROTOCOL, "message without an id"))
         elif byte in self._starts:
-            text = f"message of {len(self._body)} bytes cut off by the start of another"
+            text = f"message of {len(self._body)} bytes interrupted by the start of another"
             self._events.append(LinkFault(FaultKind.UART_INCOMPLETE, text))
-            self._open(byte)
+            self._start_message(byte)
         else:
-            self._give_up(FaultKind.UART_PROTOCOL, f"byte {byte:02X} after an escape byte within a message")
+            self._abandon(FaultKind.UART_PROTOCOL, f"byte {byte:02X} after an escape byte within a message")
 
-    def _open(self, start: int) -> None:
+    def _start_message(self, start: int) -> None:
         self._reset(in_junk=False)
         self._state = _State.FIRST
         self._start = start
@@ -210,12 +205,12 @@ class Deframer:
         self._in_junk = in_junk
         self._body.clear()
 
-    def _give_up(self, kind: FaultKind, text: str) -> None:
-        """Drop the message; what is left of it counts as the same run of junk."""
+    def _abandon(self, kind: FaultKind, text: str) -> None:
+        """Drop the message; the rest of it belongs to the same run of junk."""
         self._events.append(LinkFault(kind, text))
         self._reset(in_junk=True)
 
-    def _junk(self, byte: int) -> None:
+    def _report_junk(self, byte: int) -> None:
         if not self._in_junk:
             self._events.append(LinkFault(FaultKind.UART_PROTOCOL, f"byte {byte:02X} outside a message"))
         self._in_junk = True
@@ -227,14 +222,14 @@ def stuff(data: bytes) -> bytes:
 
 
 def encode_packet(start: int, body: bytes) -> bytes:
-    """Frame a body with the given start byte."""
+    """Frame a body with this start byte."""
     return bytes((ESCAPE, start)) + stuff(body) + bytes((ESCAPE, END))
 
 
 def encode_request(request: Request, *, stuff_id: bool = True) -> bytes:
     """Frame a telecommand or telemetry request as an OBC sends it, the same in all dialects.
 
-    Without `stuff_id` an id of 0x1F goes out single, as some flight software sends it.
+    Without `stuff_id` an id of 0x1F is sent once, as some flight software does.
     """
     if stuff_id:
         return encode_packet(START, bytes((request.id,)) + request.data)
@@ -242,10 +237,10 @@ def encode_request(request: Request, *, stuff_id: bool = True) -> bytes:
 
 
 def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
-    """Frame a device's reply in the given dialect.
+    """Frame a device's reply in a dialect.
 
-    A refused telemetry request is answered by the bare error code where telemetry would stand; no public source
-    shows generation 1's form, so that one is ours. Burst packets have one form in all dialects.
+    In dialects a and b the NACK of a telemetry request is the error code in place of the telemetry; no public source
+    shows that form, it is ours. Burst packets have the same form in all dialects.
 
     Raises
     ------
@@ -260,7 +255,7 @@ def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
         raise ProtocolError(f"serial dialect {dialect} has no {reply.kind.value} messages; use dialect c")
     body = reply.data if reply.kind is ReplyKind.TELEMETRY else bytes((int(reply.code),))
     if dialect is Dialect.A:
-        body = bytes((_need_id(reply),)) + body
+        body = bytes((_require_id(reply),)) + body
     return encode_packet(START, body)
 
 
@@ -272,44 +267,60 @@ def _encode_generation_2(reply: Reply) -> bytes:
         ReplyKind.UNSOLICITED: (START_UNSOLICITED, reply.data),
         ReplyKind.EVENT: (START_EVENT, reply.data),
     }[reply.kind]
-    return encode_packet(start, bytes((_need_id(reply),)) + data)
+    return encode_packet(start, bytes((_require_id(reply),)) + data)
 
 
-def _need_id(reply: Reply) -> int:
+def _require_id(reply: Reply) -> int:
     if reply.id is None:
         raise ProtocolError(f"a {reply.kind.value} in this serial dialect needs an id")
     return reply.id
 
 
-class DeviceReceiver:
-    """The device's end: bytes in, requests and faults out."""
+_Message = TypeVar("_Message", Request, Reply)
 
-    def __init__(self, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S) -> None:
-        self._deframer = Deframer(
-            frozenset((START,)), first_is_id=True, max_size=max_size, timeout_s=timeout_s
-        )
+
+class _Receiver(ABC, Generic[_Message]):
+    """Common base of both ends: bytes in, messages and faults out."""
+
+    def __init__(self, deframer: Deframer) -> None:
+        self._deframer = deframer
 
     @property
     def busy(self) -> bool:
-        """Whether a message has begun and not ended, so that `flush` may be due."""
+        """Whether a message has begun and not ended, so that `flush` may become due."""
         return self._deframer.busy
 
-    def feed(self, data: bytes, now: float) -> list[Request | LinkFault]:
-        """Take bytes that arrived at time `now` (s, any origin) and return what they complete."""
+    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
+        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
         return [
-            event if isinstance(event, LinkFault) else Request.of(event.body[0], event.body[1:])
+            event if isinstance(event, LinkFault) else self._interpret(event)
             for event in self._deframer.feed(data, now)
         ]
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Give up a message that has been silent for the time-out."""
+        """Abandon a message that has been silent for the timeout."""
         return self._deframer.flush(now)
 
+    @abstractmethod
+    def _interpret(self, packet: Packet) -> _Message | LinkFault:
+        """Return the message of a packet, or the fault if it has none."""
 
-class HostReceiver:
+
+class DeviceReceiver(_Receiver[Request]):
+    """The device's end: bytes in, requests and faults out."""
+
+    def __init__(self, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S) -> None:
+        starts = frozenset((START,))
+        super().__init__(Deframer(starts, first_is_id=True, max_size=max_size, timeout_s=timeout_s))
+
+    def _interpret(self, packet: Packet) -> Request:
+        return Request.of(packet.body[0], packet.body[1:])
+
+
+class HostReceiver(_Receiver[Reply]):
     """The OBC's end: bytes in, replies and faults out, in one dialect.
 
-    Dialects a and b do not say what a message is: `expect` tells it before a request is sent.
+    Dialects a and b do not identify a message, so `expect` must be called before a request is sent.
     """
 
     def __init__(
@@ -319,30 +330,17 @@ class HostReceiver:
         if dialect is Dialect.C:
             starts |= {START_ACK, START_NACK, START_EVENT, START_UNSOLICITED}
         self._dialect = dialect
-        self._deframer = Deframer(
-            frozenset(starts),
-            first_is_id=dialect is not Dialect.B,
-            max_size=max_size,
-            timeout_s=timeout_s,
+        first_is_id = dialect is not Dialect.B
+        super().__init__(
+            Deframer(frozenset(starts), first_is_id=first_is_id, max_size=max_size, timeout_s=timeout_s)
         )
         self._expected: tuple[Request, int] | None = None
 
     def expect(self, request: Request, reply_size: int) -> None:
-        """Tell what is asked next, and how many bytes of data its telemetry has (0 for a telecommand)."""
+        """Set the next request, and the data bytes of its telemetry (0 for a telecommand)."""
         self._expected = (request, reply_size)
 
-    def feed(self, data: bytes, now: float) -> list[Reply | LinkFault]:
-        """Take bytes that arrived at time `now` (s, any origin) and return what they complete."""
-        return [
-            event if isinstance(event, LinkFault) else self._reply(event)
-            for event in self._deframer.feed(data, now)
-        ]
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Give up a message that has been silent for the time-out."""
-        return self._deframer.flush(now)
-
-    def _reply(self, packet: Packet) -> Reply | LinkFault:
+    def _interpret(self, packet: Packet) -> Reply | LinkFault:
         if self._dialect is Dialect.C:
             return self._generation_2(packet)
         body = packet.body
@@ -351,11 +349,11 @@ class HostReceiver:
         if self._dialect is Dialect.A:
             expected = self._expected
             size = expected[1] if expected is not None and expected[0].id == body[0] else None
-            return self._named(body[0], body[1:], size)
+            return self._generation_1(body[0], body[1:], size)
         if self._expected is None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes to no request")
         request, size = self._expected
-        return self._named(request.id, body, size)
+        return self._generation_1(request.id, body, size)
 
     def _is_burst(self, body: bytes) -> bool:
         if len(body) != BURST_SIZE + 1 or body[0] != BURST_ID:
@@ -365,67 +363,69 @@ class HostReceiver:
         request, size = self._expected
         return request.kind is RequestKind.TELECOMMAND or size != len(body)
 
-    def _named(self, identifier: int, data: bytes, size: int | None) -> Reply | LinkFault:
-        """Read a generation 1 reply by its id; `size` is that of the telemetry row where it is known."""
-        if identifier >= FIRST_TELEMETRY_ID:
+    def _generation_1(self, row_id: int, data: bytes, size: int | None) -> Reply | LinkFault:
+        """Interpret a reply of generation 1; `size` is that of the telemetry row, if known."""
+        if row_id >= FIRST_TELEMETRY_ID:
             self._expected = None
             if len(data) == 1 and size not in (None, 1):
-                return Reply(ReplyKind.NACK, identifier, code=error_code(data[0]))
-            return Reply(ReplyKind.TELEMETRY, identifier, data)
+                return Reply(ReplyKind.NACK, row_id, code=error_code(data[0]))
+            return Reply(ReplyKind.TELEMETRY, row_id, data)
         if len(data) != 1:
             return LinkFault(
                 FaultKind.UART_PROTOCOL,
-                f"acknowledge of telecommand {identifier} has {len(data)} bytes, must be 1",
+                f"ACK of telecommand {row_id} has {len(data)} bytes, must be 1",
             )
         self._expected = None
         code = error_code(data[0])
-        return Reply(ReplyKind.NACK if code else ReplyKind.ACK, identifier, code=code)
+        return Reply(ReplyKind.NACK if code else ReplyKind.ACK, row_id, code=code)
 
     def _generation_2(self, packet: Packet) -> Reply | LinkFault:
-        identifier, data = packet.body[0], packet.body[1:]
+        row_id, data = packet.body[0], packet.body[1:]
         match packet.start:
             case 0x07:
-                if identifier >= FIRST_TELEMETRY_ID:
-                    return Reply(ReplyKind.TELEMETRY, identifier, data)
-                return Reply(ReplyKind.ACK, identifier, data)
+                kind = ReplyKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else ReplyKind.ACK
+                return Reply(kind, row_id, data)
             case 0x0F:
                 if len(data) != 1:
                     return LinkFault(
-                        FaultKind.UART_PROTOCOL, f"refusal of {identifier} has {len(data)} bytes, must be 1"
+                        FaultKind.UART_PROTOCOL, f"NACK of {row_id} has {len(data)} bytes, must be 1"
                     )
-                return Reply(ReplyKind.NACK, identifier, code=error_code(data[0]))
+                return Reply(ReplyKind.NACK, row_id, code=error_code(data[0]))
             case 0x2F:
-                return Reply(ReplyKind.EVENT, identifier, data)
+                return Reply(ReplyKind.EVENT, row_id, data)
             case 0x4F:
-                return Reply(ReplyKind.UNSOLICITED, identifier, data)
+                return Reply(ReplyKind.UNSOLICITED, row_id, data)
             case _:
-                if identifier == BURST_ID and len(data) == BURST_SIZE:
-                    return Reply(ReplyKind.BURST, identifier, data)
+                if row_id == BURST_ID and len(data) == BURST_SIZE:
+                    return Reply(ReplyKind.BURST, row_id, data)
                 return LinkFault(
-                    FaultKind.UART_PROTOCOL, f"message {identifier} with the start byte of a request"
+                    FaultKind.UART_PROTOCOL, f"message {row_id} with the start byte of a request"
                 )
 
 
 class PacingSchedule:
-    """When bytes leave a serial line: one after another at its bit rate."""
+    """Times at which bytes leave a serial line, one after another at its bit rate."""
 
     def __init__(self, baud: int, bits_per_byte: int = 10) -> None:
         if baud <= 0 or bits_per_byte <= 0:
-            raise ProtocolError(f"baud rate {baud} and {bits_per_byte} bits a byte must be positive")
+            raise ProtocolError(f"baud rate {baud} and {bits_per_byte} bits per byte must be positive")
         self.seconds_per_byte: Final = bits_per_byte / baud
         """Time that one byte takes on the line."""
         self._free_at = float("-inf")
 
     def reserve(self, now: float, size: int) -> tuple[float, float]:
-        """Put `size` bytes on the line at the earliest; return when the first begins and the last has left."""
+        """Reserve the line for `size` bytes.
+
+        Return when the first begins and when the last has left.
+        """
         begin = max(now, self._free_at)
         self._free_at = begin + size * self.seconds_per_byte
         return begin, self._free_at
 
     def release(self) -> None:
-        """Free the line at once: what was reserved will not be sent."""
+        """Free the line: the reserved bytes are not sent."""
         self._free_at = float("-inf")
 
     def free_at(self, now: float) -> float:
-        """Return when the line is free, not before `now`."""
+        """Return when the line is free, at the earliest `now`."""
         return max(now, self._free_at)

@@ -1,8 +1,8 @@
-"""The socketcand text protocol, sans-I/O: commands `< … >` cut out of a stream, frames to text and back.
+"""The socketcand text protocol, sans-I/O: split a stream into commands `< … >`, convert frames to text and back.
 
-One addition of ours: after `< remote >` (answered `< ok >`) a client may send, and is sent, remote frames; their
-identifier has eight digits with the kernel's flags 40000000 (remote) and 80000000 (29-bit). Clients that have not
-asked never see remote frames, because the plain protocol cannot tell them from data frames.
+One extension: after `< remote >` (answered by `< ok >`) a client may send and receive remote frames. Their CAN ID has
+eight digits with the kernel's flags 40000000 (remote) and 80000000 (29-bit). Other clients never receive remote frames,
+because the plain protocol cannot distinguish them from data frames.
 """
 
 from __future__ import annotations
@@ -18,23 +18,26 @@ EXTENDED_FLAG: Final = 0x80000000
 REMOTE_FLAG: Final = 0x40000000
 
 MAX_COMMAND: Final = 256
-"""Longest command that is taken; a frame needs at most 60 characters."""
+"""Longest accepted command; a frame needs at most 60 characters."""
 
 _SEND: Final = re.compile(rb"send +([0-9A-Fa-f]{1,8}) +([0-8])((?: +[0-9A-Fa-f]{1,2})*) *")
 
 
 class CommandError(ProtocolError):
-    """Text that is not a command of the socketcand protocol."""
+    """Text that is not a valid command of the socketcand protocol."""
 
 
 class CommandSplitter:
-    """Cut a stream of bytes into commands; text outside `< >` and overlong commands come out as None."""
+    """Split a stream of bytes into commands.
+
+    Text outside `< >` and overlong commands yield None.
+    """
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes | None]:
-        """Take bytes and return the commands they complete, without brackets and outer spaces."""
+        """Return the commands that these bytes complete, without brackets and outer spaces."""
         pieces = (self._rest + data).split(b">")
         self._rest = pieces.pop()
         commands: list[bytes | None] = []
@@ -51,22 +54,25 @@ class CommandSplitter:
 
 
 def parse_send(command: bytes) -> CanFrame:
-    """Read `send ID LEN B B …`. Raises CommandError naming what is wrong."""
+    """Parse `send ID LENGTH B B …`. Raises CommandError."""
     match = _SEND.fullmatch(command)
     if match is None:
         raise CommandError("malformed send: must be send ID LENGTH BYTES, all in hexadecimal")
-    identifier, length, digits = match[1], int(match[2]), match[3].split()
+    can_id, length, digits = match[1], int(match[2]), match[3].split()
     if len(digits) != length:
         raise CommandError(f"send with length {length} has {len(digits)} bytes")
     data = b"".join(digits)
     if len(data) != 2 * length:
         data = b"".join(digit.zfill(2) for digit in digits)
-    extended, remote, number = parse_identifier(identifier)
+    extended, remote, number = parse_can_id(can_id)
     return CanFrame(number, bytes.fromhex(data.decode()), extended, remote)
 
 
-def parse_identifier(digits: bytes) -> tuple[bool, bool, int]:
-    """Read an identifier: up to three digits for 11 bits, eight for 29; return extended, remote, number."""
+def parse_can_id(digits: bytes) -> tuple[bool, bool, int]:
+    """Parse a CAN ID of up to three digits (11-bit) or eight (29-bit).
+
+    Return extended, remote, number.
+    """
     number = int(digits, 16)
     extended, remote = len(digits) == 8, False
     if extended and number > MAX_EXTENDED_ID:
@@ -74,39 +80,42 @@ def parse_identifier(digits: bytes) -> tuple[bool, bool, int]:
             extended, remote = bool(number & EXTENDED_FLAG), True
         number &= MAX_EXTENDED_ID
     if len(digits) not in (1, 2, 3, 8) or (not extended and number > MAX_STANDARD_ID):
-        raise CommandError(f"identifier {digits.decode()} has neither up to 3 digits (11-bit) nor 8 (29-bit)")
+        raise CommandError(f"CAN ID {digits.decode()} has neither up to 3 digits (11-bit) nor 8 (29-bit)")
     return extended, remote, number
 
 
-def format_identifier(frame: CanFrame) -> bytes:
-    """Write an identifier: three digits for 11 bits, eight for 29 and for remote frames."""
+def format_can_id(frame: CanFrame) -> bytes:
+    """Format a CAN ID: three digits for 11 bits, eight for 29 bits and for remote frames."""
     if frame.remote:
         return b"%08X" % (frame.id | REMOTE_FLAG | (EXTENDED_FLAG if frame.extended else 0))
     return b"%08X" % frame.id if frame.extended else b"%03X" % frame.id
 
 
 def format_send(frame: CanFrame) -> bytes:
-    """Write the command that sends a frame."""
+    """Format the command by which a client sends a frame."""
     data = frame.data
-    return b"< send %b %d %b >" % (format_identifier(frame), len(data), data.hex(" ").encode())
+    return b"< send %b %d %b >" % (format_can_id(frame), len(data), data.hex(" ").encode())
 
 
 def format_frame(frame: CanFrame, stamp: bytes) -> bytes:
-    """Write a frame as a server tells it to clients; `stamp` is the time, as `seconds.microseconds`."""
-    return b"< frame %b %b %b >" % (format_identifier(frame), stamp, frame.data.hex().upper().encode())
+    """Format a frame as a server sends it to clients.
+
+    `stamp` is the time as `seconds.microseconds`.
+    """
+    return b"< frame %b %b %b >" % (format_can_id(frame), stamp, frame.data.hex().upper().encode())
 
 
 def parse_frame(command: bytes) -> CanFrame:
-    """Read `frame ID TIME HEX` as a client gets it. Raises CommandError."""
-    words = command.split()
-    if len(words) not in (3, 4) or words[0] != b"frame":
+    """Parse `frame ID TIME HEX` as a client receives it. Raises CommandError."""
+    fields = command.split()
+    if len(fields) not in (3, 4) or fields[0] != b"frame":
         raise CommandError(f"not a frame: {command[:40].decode(errors='replace')}")
     try:
-        extended, remote, number = parse_identifier(words[1])
-        data = bytes.fromhex(words[3].decode()) if len(words) == 4 else b""
-        seconds = float(words[2])
+        extended, remote, number = parse_can_id(fields[1])
+        data = bytes.fromhex(fields[3].decode()) if len(fields) == 4 else b""
+        seconds = float(fields[2])
         if not math.isfinite(seconds):
-            raise CommandError("time stamp is no number")
+            raise CommandError("timestamp is not a number")
         return CanFrame(number, data, extended, remote, seconds)
     except (ValueError, ProtocolError):
         raise CommandError(f"malformed frame: {command[:40].decode(errors='replace')}") from None

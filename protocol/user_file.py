@@ -1,4 +1,4 @@
-"""Reading files that a user names: regular files only, up to a size, so that no reader waits or fills the memory."""
+"""Read files that a user names: regular files only, up to a size limit."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Final
 
 MAX_BYTES: Final = 10_000_000
-"""Largest file of settings that is read, bytes."""
+"""Default size limit, bytes."""
 
 
 class UnsuitableFileError(OSError):
-    """What stands under a name is no file that can be read whole; `strerror` says why."""
+    """A path that is not a regular file, or is too large; `strerror` gives the reason."""
 
 
 def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
@@ -22,9 +22,9 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
     Raises
     ------
     OSError
-        The file cannot be read, is not a regular one, or holds more than `limit` bytes; `strerror` says which.
+        The file cannot be read, is not a regular file, or holds more than `limit` bytes; `strerror` gives the reason.
     ValueError
-        No file can have this name.
+        The name is not valid for a file.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as stream:
@@ -40,5 +40,8 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
 
 
 def read_user_text(path: Path, limit: int = MAX_BYTES) -> str:
-    """Return the content of a regular UTF-8 file, without a byte order mark; UnicodeDecodeError if it is not UTF-8."""
+    """Return the text of a regular UTF-8 file, without a byte order mark.
+
+    Raises UnicodeDecodeError as well.
+    """
     return read_user_file(path, limit).decode("utf-8-sig")

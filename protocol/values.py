@@ -1,4 +1,4 @@
-"""Values of the interface definition: enumerations, limits and device parameters, checked in one place."""
+"""Values of the interface definition: enumerations, limits and device parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 
 Value = bool | int | float | str | bytes
-"""A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw bytes."""
+"""A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw
+bytes."""
 
 INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {
@@ -23,35 +24,38 @@ INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
         for bits in (8, 16, 32, 64)
     }
 )
-"""Least and greatest raw value of each integer type."""
+"""Lowest and highest raw value of each integer type."""
 
 F32_MAX: Final = 3.4028234663852886e38
-"""Greatest finite single-precision number."""
+"""Largest finite single-precision number."""
 
 
 class IcdError(ProtocolError):
-    """An interface definition that does not hold together; the text names file, row and field."""
+    """An invalid interface definition; the text names file, row and field."""
 
 
 class MessageError(ProtocolError):
-    """A message or value against the interface definition; `code` is the published error code."""
+    """A message or value that violates the interface definition.
+
+    `code` is the published error code.
+    """
 
     code: ErrorCode = ErrorCode.INVALID_PARAMETER
 
     def __init__(self, text: str, *, index: int = 0) -> None:
         super().__init__(text)
         self.index = index
-        """Position of the refused field in its row, for the acknowledge telemetry."""
+        """Position of the rejected field in its row, for the acknowledge telemetry."""
 
 
 class LengthError(MessageError):
-    """Data whose length is not the row's size."""
+    """Data whose length differs from the row's size."""
 
     code = ErrorCode.INVALID_LENGTH
 
 
 class FieldError(MessageError):
-    """A value outside its type, limits or enumeration; the text starts with row.field."""
+    """A value outside its type, limits or enumeration; the text begins with row.field."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,10 @@ class EnumDefinition:
         return MappingProxyType({number: name for name, number in self.values.items()})
 
     def number(self, value: Value, where: str, *, index: int = 0) -> int:
-        """Return the number of a name, or of a number that has a name; raise FieldError otherwise."""
+        """Return the number of a name, or of a number that has a name.
+
+        Raise FieldError otherwise.
+        """
         if isinstance(value, str):
             if value in self.values:
                 return self.values[value]
@@ -80,7 +87,7 @@ class EnumDefinition:
 
 
 def to_f32(value: float) -> float:
-    """Round a number to single precision; too large a number becomes infinite."""
+    """Round a number to single precision; a number that is too large becomes infinite."""
     if math.isfinite(value) and abs(value) > F32_MAX:
         return math.copysign(math.inf, value)
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
@@ -94,7 +101,7 @@ def number_of(value: Value, where: str, *, index: int = 0) -> int | float:
 
 
 def limits_text(minimum: float | None, maximum: float | None, unit: str) -> str:
-    """Write limits for an error message, as in `0.1 to 20 Hz`."""
+    """Format limits for an error message, as in `0.1 to 20 Hz`."""
     low = "any" if minimum is None else f"{minimum:g}"
     high = "any" if maximum is None else f"{maximum:g}"
     return f"{low} to {high} {unit}".rstrip()
@@ -102,7 +109,7 @@ def limits_text(minimum: float | None, maximum: float | None, unit: str) -> str:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a definition's text for people: heading, paragraphs, a table."""
+    """A section of a definition's documentation: heading, paragraphs and a table."""
 
     heading: str
     paragraphs: tuple[str, ...]
@@ -112,10 +119,10 @@ class Section:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the device, the same on the bus, in the device and in the object dictionary."""
+    """A parameter of the device, as the bus, the device and the object dictionary share it."""
 
     id: int
-    """Identifier in set_parameter and select_parameter, 1 to 254."""
+    """Id in set_parameter and select_parameter, 1 to 254."""
     name: str
     type: str
     """Wire type: u8 … i32, f32, f64, bool or enum8."""
@@ -127,9 +134,9 @@ class Parameter:
     enum: EnumDefinition | None = field(default=None)
 
     def check(self, value: Value) -> bool | int | float | str:
-        """Return the value in the parameter's own type, or raise FieldError naming the limits.
+        """Return the value in the parameter's type, or raise FieldError that names the limits.
 
-        Numbers stand for switches (0, 1) and for members of enumerations, as set_parameter sends them.
+        Numbers are accepted for booleans (0, 1) and members of enumerations, since set_parameter sends numbers.
         """
         if self.enum is not None:
             return self.enum.names[self.enum.number(value, self.name)]
@@ -154,7 +161,7 @@ class Parameter:
         return number
 
     def to_number(self, value: Value) -> float:
-        """Return the checked value as the number that set_parameter and telemetry `parameter` carry."""
+        """Return the checked value as set_parameter and the telemetry `parameter` carry it."""
         checked = self.check(value)
         if isinstance(checked, str):
             return float(self.enum.values[checked]) if self.enum is not None else math.nan

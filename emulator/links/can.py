@@ -18,7 +18,7 @@ from starhil.protocol.can_framing import (
     MAX_STANDARD_ID,
     CanDeviceReceiver,
     CanFrame,
-    CanIdentifier,
+    CanId,
     encode_reply_frames,
 )
 from starhil.protocol.messages import Reply
@@ -91,7 +91,7 @@ class CanLink(DeviceLink[CanFrame, int]):
         await super().close()
 
     def _receive(self, item: CanFrame) -> None:
-        if item.extended and CanIdentifier.unpack(item.id).source == self._address.number:
+        if item.extended and CanId.unpack(item.id).source == self._address.number:
             self._address.report_elsewhere()
         super()._receive(item)
 

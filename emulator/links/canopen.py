@@ -21,7 +21,7 @@ from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.wire_faults import WireFaults
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Picture, abort_of, check_status
+from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -80,7 +80,7 @@ class DeviceApplication:
         self._requests = requests
         self._device = requests.device
         self._finish_write = finish
-        self._last_image: Picture | None = None
+        self._last_image: GreyImage | None = None
 
     def clear(self) -> None:
         """Discard the captured image, as the device has restarted."""
@@ -124,12 +124,12 @@ class DeviceApplication:
         except MessageError as error:
             raise abort_of(error) from None
 
-    def image(self, name: str) -> Picture:
+    def image(self, name: str) -> GreyImage:
         """Return the image that `take_image` captured, or the one that save_image stored."""
         if name == "stored":
             stored = self._device.images.stored
             if stored is not None:
-                return Picture(stored.edge, stored.edge, stored.frame, stored.pixels)
+                return GreyImage(stored.edge, stored.edge, stored.frame, stored.pixels)
         elif self._last_image is not None:
             return self._last_image
         raise SdoAbortError(AbortCode.NO_DATA, f"{name} image")
@@ -140,7 +140,7 @@ class DeviceApplication:
             raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being captured")
         deferred = Deferred()
 
-        def done(picture: Picture | None) -> None:
+        def done(picture: GreyImage | None) -> None:
             if picture is None:
                 self._finish_write(deferred, SdoAbortError(AbortCode.HARDWARE, "no frame"))
             else:
@@ -149,7 +149,7 @@ class DeviceApplication:
 
         self._device.images.capture_full(
             lambda full: done(
-                None if full is None else Picture(full.width, full.height, full.frame, full.pixels)
+                None if full is None else GreyImage(full.width, full.height, full.frame, full.pixels)
             )
         )
         return deferred

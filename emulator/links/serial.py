@@ -10,7 +10,7 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.protocol.messages import Reply
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
-from starhil.protocol.transports.serial import SerialTransport
+from starhil.protocol.transports.paced import SerialTransport
 
 JUNK_BYTES: Final = 8
 

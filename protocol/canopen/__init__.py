@@ -1,12 +1,13 @@
-"""A CANopen slave after CiA 301 and CiA 305, without input or output: frames and the time in, frames and events out.
+"""A sans-I/O CANopen slave after CiA 301 and CiA 305: frames and the time in, frames and events out.
 
-It stands on the `canopen` library's object dictionary; that library's own local node, and durand's node, keep their
-own clocks and lack parts that a slave must have (block transfer with repetition, time-outs, error history, store and
-restore, node guarding, event-driven PDOs that obey the NMT state), so the state machines here are our own.
+The object dictionary is that of the `canopen` library. The state machines are custom, because `canopen.LocalNode` and
+durand's node start their own timers and lack parts of a slave: SDO block transfer with retransmission, timeouts, error
+history, store and restore, node guarding, event-driven PDOs that follow the NMT state. The conformance cases that each
+of them fails are listed in tests/protocol/canopen/test_conformance_of_library_node.py and test_conformance_of_durand.py.
 """
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Application, Picture, StandInApplication, check_status
+from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, check_status
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, NmtState, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -26,10 +27,10 @@ __all__ = [
     "ErrorRegister",
     "EventKind",
     "FileStorage",
+    "GreyImage",
     "MemoryStorage",
     "NmtState",
     "ParameterStorage",
-    "Picture",
     "SdoAbortError",
     "SlaveEvent",
     "StandInApplication",

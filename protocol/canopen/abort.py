@@ -9,7 +9,7 @@ from starhil.protocol.errors import ProtocolError
 
 
 class AbortCode(IntEnum):
-    """The reasons with which an SDO server may end a transfer."""
+    """Reasons for which an SDO server may abort a transfer."""
 
     TOGGLE = 0x05030000
     TIMEOUT = 0x05040000
@@ -77,11 +77,11 @@ ABORT_TEXTS: Final[dict[AbortCode, str]] = {
     AbortCode.NO_DICTIONARY: "no object dictionary is present",
     AbortCode.NO_DATA: "no data available",
 }
-"""What each code says, in words of our own."""
+"""Short text of each code."""
 
 
 class SdoAbortError(ProtocolError):
-    """An access to the object dictionary that is refused, with the abort code that says why."""
+    """A refused access to the object dictionary, with the SDO abort code."""
 
     def __init__(self, code: AbortCode, detail: str = "") -> None:
         self.code = code

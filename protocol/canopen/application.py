@@ -1,4 +1,4 @@
-"""What a device gives to its object dictionary and takes from it, as an interface and as a stand-in without a device."""
+"""Interface of the object dictionary to the device, and a stand-in for tests and exports."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ STATUS_ABORTS = {
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A grey image of 8 bits, row by row from the top, and the number of the frame that it shows."""
+class GreyImage:
+    """A greyscale image of 8 bits per pixel, row by row from the top, and its frame counter."""
 
     width: int
     height: int
@@ -33,10 +33,10 @@ class Picture:
 
 
 class Application(Protocol):
-    """The device behind an object dictionary; each method may refuse by `SdoAbortError`."""
+    """The device behind an object dictionary; each method may raise `SdoAbortError` to refuse."""
 
     def telemetry(self, row: Row) -> bytes:
-        """Return the present bytes of a telemetry row."""
+        """Return the current bytes of a telemetry row."""
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
         """Execute a telecommand whose payload has been checked against its row."""
@@ -47,69 +47,69 @@ class Application(Protocol):
     def set_parameter(self, name: str, value: Value) -> None:
         """Set a parameter; the value is within the limits of the interface definition."""
 
-    def image(self, name: str) -> Picture:
-        """Return an image: `frame`, the last one taken by `take_image`, or `stored`, that of save_image."""
+    def image(self, name: str) -> GreyImage:
+        """Return the image `frame` (the last of `take_image`) or `stored` (that of save_image)."""
 
     def take_image(self, name: str) -> Deferred | None:
         """Take an image for reading."""
 
 
 def check_status(status: int, what: str) -> None:
-    """Turn a published error code into an `SdoAbortError`; 0 passes."""
+    """Raise `SdoAbortError` for a published error code other than 0."""
     if status != ErrorCode.OK:
         code = ErrorCode(status)
         raise SdoAbortError(STATUS_ABORTS.get(code, AbortCode.GENERAL), f"{what}: {code.name.lower()}")
 
 
 def abort_of(error: MessageError) -> SdoAbortError:
-    """Return the refusal that a value against the interface definition gets."""
+    """Return the SDO abort for a value that violates the interface definition."""
     return SdoAbortError(
         AbortCode.LENGTH if isinstance(error, LengthError) else AbortCode.VALUE_RANGE, str(error)
     )
 
 
 class StandInApplication:
-    """An application without a device: telemetry as it was set, parameters held, telecommands noted.
+    """An application without a device: preset telemetry, stored parameters, recorded telecommands.
 
     Attributes
     ----------
     rows
-        Values of telemetry rows by row name; the row's defaults where none are given.
+        Values of telemetry rows by row name; other rows have their defaults.
     commands
         Telecommands executed: row name and values.
     images, taken
-        Images by name; names of those that were to be taken.
+        Images by name; names of the images requested by `take_image`.
     """
 
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._parameters: dict[str, Value] = {name: item.default for name, item in icd.parameters.items()}
         self.rows: dict[str, dict[str, Value]] = {}
-        self.images: dict[str, Picture] = {}
+        self.images: dict[str, GreyImage] = {}
         self.taken: list[str] = []
         self.commands: list[tuple[str, dict[str, Value]]] = []
 
     def telemetry(self, row: Row) -> bytes:
-        """Encode the values that were set."""
+        """Return the preset values, encoded."""
         return row.encode(self.rows.get(row.name, {}))
 
     def telecommand(self, row: Row, payload: bytes) -> None:
-        """Note the telecommand."""
+        """Record the telecommand."""
         self.commands.append((row.name, dict(row.decode(payload))))
 
     def parameter(self, name: str) -> Value:
-        """Return the held value."""
+        """Return the stored value."""
         return self._parameters[name]
 
     def set_parameter(self, name: str, value: Value) -> None:
-        """Hold the value."""
+        """Store the value."""
         self._parameters[name] = value
 
-    def image(self, name: str) -> Picture:
-        """Return the image that was set."""
+    def image(self, name: str) -> GreyImage:
+        """Return the preset image."""
         if name not in self.images:
             raise SdoAbortError(AbortCode.NO_DATA, name)
         return self.images[name]
 
     def take_image(self, name: str) -> None:
-        """Note the wish."""
+        """Record the request."""
         self.taken.append(name)

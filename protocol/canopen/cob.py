@@ -1,4 +1,4 @@
-"""COB-IDs: the communication object identifiers of CiA 301 and the rules for configuring them."""
+"""COB-IDs of CiA 301: predefined CAN IDs, flags, and the rules for changing them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INVALID: Final = 1 << 31
 BIT_30: Final = 1 << 30
 """PDO: no RTR allowed; SYNC and TIME: the device produces the message."""
 EXTENDED: Final = 1 << 29
-"""The 29-bit frame format; this slave speaks the base format only."""
+"""29-bit CAN ID; this slave uses 11-bit CAN IDs only."""
 ID_MASK: Final = 0x1FFFFFFF
 
 RESTRICTED: Final = (
@@ -32,27 +32,28 @@ RESTRICTED: Final = (
     (0x6E0, 0x6FF),
     (0x701, 0x7FF),
 )
-"""Identifiers, first and last, that no configurable communication object may use (CiA 301, restricted CAN-IDs)."""
+"""CAN IDs, first and last, that no configurable communication object may use (CiA 301, restricted
+CAN-IDs)."""
 
 
-def check_identifier(cob_id: int) -> None:
-    """Refuse a COB-ID whose frame format or identifier a configurable object may not have.
+def check_can_id(cob_id: int) -> None:
+    """Reject a COB-ID whose frame format or CAN ID a configurable object may not have.
 
     Raises
     ------
     SdoAbortError
-        VALUE_RANGE for the extended frame format, an identifier over 11 bits or a restricted one.
+        VALUE_RANGE for the extended frame format, a CAN ID over 11 bits or a restricted one.
     """
-    identifier = cob_id & ID_MASK
-    if cob_id & EXTENDED or identifier > 0x7FF:
-        raise SdoAbortError(AbortCode.VALUE_RANGE, f"COB-ID 0x{cob_id:08X} is not an 11-bit identifier")
-    if any(first <= identifier <= last for first, last in RESTRICTED):
-        raise SdoAbortError(AbortCode.VALUE_RANGE, f"identifier 0x{identifier:03X} is restricted")
+    can_id = cob_id & ID_MASK
+    if cob_id & EXTENDED or can_id > 0x7FF:
+        raise SdoAbortError(AbortCode.VALUE_RANGE, f"COB-ID 0x{cob_id:08X} has no 11-bit CAN ID")
+    if any(first <= can_id <= last for first, last in RESTRICTED):
+        raise SdoAbortError(AbortCode.VALUE_RANGE, f"CAN ID 0x{can_id:03X} is restricted")
 
 
 def check_replacement(old: int, new: int, *, lives_before: bool, lives_after: bool) -> None:
-    """Refuse a change of identifier (32-bit COB-ID entries) of an object that exists before and after."""
+    """Reject a change of the CAN ID in a COB-ID entry of an object that exists before and after."""
     if lives_before and lives_after and (old ^ new) & (ID_MASK | EXTENDED):
         raise SdoAbortError(
-            AbortCode.VALUE_RANGE, "disable the communication object before changing its identifier"
+            AbortCode.VALUE_RANGE, "disable the communication object before changing its CAN ID"
         )

@@ -1,4 +1,4 @@
-"""The objects of the communication profile (1000h to 1FFFh) that the slave serves, as the library's classes."""
+"""Objects of the communication profile (1000h to 1FFFh), built with `canopen`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ DOMAIN: Final = datatypes.DOMAIN
 HISTORY_LENGTH: Final = 8
 CONSUMERS: Final = 4
 HEARTBEAT_MS: Final = 1000
-RPDO_IDENTIFIERS: Final = (0x200, 0x300, 0x400, 0x500)
-TPDO_IDENTIFIERS: Final = (0x180, 0x280, 0x380, 0x480)
+RPDO_CAN_IDS: Final = (0x200, 0x300, 0x400, 0x500)
+TPDO_CAN_IDS: Final = (0x180, 0x280, 0x380, 0x480)
 EVENT_DRIVEN: Final = 255
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Who the node is: 1000h, 1008h to 100Ah and 1018h."""
+    """Identity of the node: objects 1000h, 1008h to 100Ah and 1018h."""
 
     device_type: int = 0
     device_name: str = "star sensor"
@@ -43,12 +43,12 @@ class Identity:
 
 @dataclass(frozen=True)
 class PdoDefault:
-    """A PDO as it is before anybody configures it.
+    """Default configuration of a PDO.
 
     Attributes
     ----------
     enabled
-        Whether it exists; its COB-ID is then the predefined one of the first four PDOs.
+        Whether the PDO exists. The first four PDOs have the predefined COB-IDs.
     transmission_type
         0 to 240 synchronous, 254 or 255 by event.
     inhibit, event_ms
@@ -77,7 +77,7 @@ def variable(
     mappable: bool = False,
     limits: tuple[float, float] | None = None,
 ) -> ODVariable:
-    """Make a variable of the library's object dictionary; `limits` are raw values."""
+    """Return a variable of the object dictionary; `limits` are raw values."""
     item = ODVariable(name, index, subindex)
     item.data_type = data_type
     item.access_type = access
@@ -90,7 +90,7 @@ def variable(
 
 
 def set_limits(item: ODVariable, low: float, high: float) -> None:
-    """Set the least and greatest raw value (the library's annotation knows integers only)."""
+    """Set the lowest and highest raw value (the library's annotation covers integers only)."""
     item.min, item.max = low, high  # type: ignore[assignment]
 
 
@@ -102,7 +102,10 @@ def add_record(
     array: bool = False,
     count: tuple[str, int] | None = None,
 ) -> None:
-    """Add a record or array; sub-index 0 tells the highest sub-index, or is a writable `count` (name, default)."""
+    """Add a record or array.
+
+    Sub-index 0 is the highest sub-index, or a writable `count` (name, default).
+    """
     index = members[0].index
     group = ODArray(name, index) if array else ODRecord(name, index)
     if count is None:
@@ -123,11 +126,11 @@ def add_communication(
     Parameters
     ----------
     od
-        Takes the objects.
+        Object dictionary to which the objects are added.
     identity
-        Who the node is.
+        Identity of the node.
     rpdos, tpdos
-        The PDOs, the first of each with number 1.
+        The PDOs, numbered from 1.
     """
     information = od.device_information
     information.vendor_name = identity.vendor_name
@@ -224,8 +227,8 @@ def _add_services(od: ObjectDictionary, identity: Identity) -> None:
 
 def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
     index = 0x1400 + number
-    predefined = number < len(RPDO_IDENTIFIERS)
-    cob_id = (RPDO_IDENTIFIERS[number] if predefined else 0) | (0 if default.enabled else INVALID)
+    predefined = number < len(RPDO_CAN_IDS)
+    cob_id = (RPDO_CAN_IDS[number] if predefined else 0) | (0 if default.enabled else INVALID)
     add_record(
         od,
         f"RPDO {number + 1} communication parameter: {default.name}",
@@ -240,8 +243,8 @@ def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
 
 def _add_tpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
     index = 0x1800 + number
-    predefined = number < len(TPDO_IDENTIFIERS)
-    cob_id = BIT_30 | (TPDO_IDENTIFIERS[number] if predefined else 0) | (0 if default.enabled else INVALID)
+    predefined = number < len(TPDO_CAN_IDS)
+    cob_id = BIT_30 | (TPDO_CAN_IDS[number] if predefined else 0) | (0 if default.enabled else INVALID)
     add_record(
         od,
         f"TPDO {number + 1} communication parameter: {default.name}",

@@ -1,4 +1,4 @@
-"""What the parts of a node share: the present time, the NMT state, frames to send and events to report."""
+"""State that the services of a node share: time, NMT state, frames to send and events to report."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.dictionary import Dictionary
 
 UNCONFIGURED: int = 0xFF
-"""Node-ID of a node that LSS has to give one."""
+"""Node-ID of a node that waits for LSS to assign one."""
 
 
 class NmtState(IntEnum):
@@ -22,7 +22,7 @@ class NmtState(IntEnum):
 
 
 class EventKind(StrEnum):
-    """What a node reports to its application."""
+    """Kinds of events that a node reports to its application."""
 
     STATE = "state"
     RESET_NODE = "reset_node"
@@ -45,18 +45,18 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True)
 class SlaveEvent:
-    """Something that happened in a node.
+    """An event of a node.
 
     Attributes
     ----------
     kind
         What happened.
     now
-        When, s, on the clock of the caller.
+        Time of the event, s, on the caller's clock.
     value
         A number: NMT state, node-ID, error code, bit/s, Unix time in s.
     detail
-        One line in words.
+        One line of text.
     """
 
     kind: EventKind
@@ -66,7 +66,7 @@ class SlaveEvent:
 
 
 class Context:
-    """Shared by the parts of one node; the node sets `now` before it calls a part."""
+    """Shared by the services of one node, which sets `now` before it calls a service."""
 
     def __init__(self, dictionary: Dictionary, node_id: int) -> None:
         self.dictionary = dictionary
@@ -77,7 +77,7 @@ class Context:
         self.events: list[SlaveEvent] = []
 
     def send(self, cob_id: int, data: bytes) -> None:
-        """Send a data frame of the base format."""
+        """Send a data frame with an 11-bit CAN ID."""
         self.frames.append(CanFrame(cob_id, data, extended=False))
 
     def report(self, kind: EventKind, value: float = 0, detail: str = "") -> None:

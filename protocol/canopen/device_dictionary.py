@@ -1,4 +1,4 @@
-"""Builds a node's object dictionary: the communication profile, and the interface definition as the layout places it."""
+"""The object dictionary of a device, from communication profile and interface definition."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Application, Picture, StandInApplication, abort_of
+from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, abort_of
 from starhil.protocol.canopen.communication import (
     Identity,
     PdoDefault,
@@ -43,27 +43,28 @@ DATA_TYPES: Final[dict[str, int]] = {
     "enum8": datatypes.UNSIGNED8,
     "bytes": datatypes.OCTET_STRING,
 }
-"""Types of the interface definition → CANopen. A switch is a byte, since a BOOLEAN maps as one bit into a PDO."""
+"""Types of the interface definition → CANopen. A bool is a byte, because a BOOLEAN is one bit in a
+PDO."""
 
 Key = tuple[int, int]
 
 
 class DeviceDictionary(Dictionary):
-    """Object dictionary of a device, made from its interface definition.
+    """Object dictionary of a device, built from its interface definition.
 
     Parameters
     ----------
     icd
         The interface definition.
     layout
-        Where its rows, fields and parameters stand.
+        Indices of its rows, fields and parameters.
     identity
-        Who the node is; by default what the layout says.
+        Identity of the node; that of the layout by default.
 
     Attributes
     ----------
     sources
-        Telemetry row → keys of the entries that show it.
+        Telemetry row → keys of the entries that contain it.
     parameters
         Parameter → key of its entry.
     """
@@ -87,7 +88,7 @@ class DeviceDictionary(Dictionary):
         self._cached_at = -1
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
         for placed in layout.object:
-            self._place(objects, placed)
+            self._add_object(objects, placed)
         rpdos = [self._pdo_default(objects, model) for model in layout.rpdo]
         tpdos = [self._pdo_default(objects, model) for model in layout.tpdo]
         self.identity = identity or identity_of(layout)
@@ -101,7 +102,7 @@ class DeviceDictionary(Dictionary):
             self.entries[key].maximum_size = size
 
     def row_bytes(self, row: Row) -> bytes:
-        """Return a telemetry row, asked of the application once in a sampling instant."""
+        """Return a telemetry row's bytes, read from the application once per sampling instant."""
         if self._cached_at != self.instant:
             self._cache.clear()
             self._cached_at = self.instant
@@ -117,7 +118,7 @@ class DeviceDictionary(Dictionary):
             raise IcdError(f"canopen.toml: no object {name!r} to map")
         return key
 
-    def _place(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+    def _add_object(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         if placed.index in objects.indices:
             raise IcdError(f"canopen.toml: index {placed.index:04X}h is used twice")
         if placed.requests:
@@ -139,7 +140,7 @@ class DeviceDictionary(Dictionary):
             key = (placed.index, row.id)
             if row.kind == "telemetry":
                 member = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
-                self._show(key, row, row.name, partial(self.row_bytes, row))
+                self._bind_reader(key, row, row.name, partial(self.row_bytes, row))
             else:
                 member = self._telecommand_variable(row.name, key, row)
             member.description = row.doc
@@ -154,7 +155,7 @@ class DeviceDictionary(Dictionary):
             member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
             _describe(member, fields)
             for field in fields:
-                self._show(key, row, field.name, partial(self._row_part, row, slot))
+                self._bind_reader(key, row, field.name, partial(self._read_slot, row, slot))
             members.append(member)
         add_record(objects, placed.name, members)
 
@@ -173,7 +174,7 @@ class DeviceDictionary(Dictionary):
                 )
             else:
                 member.access_type = "rw"
-            self._show(key, row, "", partial(self._row_part, row, slot))
+            self._bind_reader(key, row, "", partial(self._read_slot, row, slot))
         objects.add_object(member)
         self._names[f"{placed.index:04x}"] = key
 
@@ -213,15 +214,15 @@ class DeviceDictionary(Dictionary):
 
     def _place_image(self, objects: ObjectDictionary, placed: PlacedObject, name: str) -> None:
         index = placed.index
-        readers: list[tuple[str, int, Callable[[Picture], bytes]]] = [
+        readers: list[tuple[str, int, Callable[[GreyImage], bytes]]] = [
             ("pixels", datatypes.DOMAIN, lambda image: image.pixels),
             ("width", datatypes.UNSIGNED16, lambda image: image.width.to_bytes(2, "little")),
             ("height", datatypes.UNSIGNED16, lambda image: image.height.to_bytes(2, "little")),
             ("frame counter", datatypes.UNSIGNED32, lambda image: image.frame.to_bytes(4, "little")),
         ]
         members: list[ODVariable] = []
-        for part, data_type, extract in readers:
-            member = variable(part, index, len(members) + 1, data_type, "ro")
+        for name_in_record, data_type, extract in readers:
+            member = variable(name_in_record, index, len(members) + 1, data_type, "ro")
             self._readers[index, member.subindex] = partial(self._read_image, name, extract)
             members.append(member)
         members[0].description = "8 bits a pixel, row by row from the top"
@@ -232,7 +233,7 @@ class DeviceDictionary(Dictionary):
             members.append(member)
         add_record(objects, placed.name, members)
 
-    def _read_image(self, name: str, extract: Callable[[Picture], bytes]) -> bytes:
+    def _read_image(self, name: str, extract: Callable[[GreyImage], bytes]) -> bytes:
         return extract(self.application.image(name))
 
     def _place_packed(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
@@ -245,15 +246,18 @@ class DeviceDictionary(Dictionary):
             _describe(member, fields)
             member.min = member.max = None
             member.factor = model.scale
-            self._show(key, row, name, _Packer(self, row, slot, fields, model))
+            self._bind_reader(key, row, name, _Packer(self, row, slot, fields, model))
             members.append(member)
         add_record(objects, placed.name, members)
 
     def _telecommand_variable(self, name: str, key: Key, row: Row) -> ODVariable:
-        """Make what a client writes to execute a telecommand: its one value, all its bytes, or 1 if it has none."""
+        """Return the variable whose write executes a telecommand.
+
+        The client writes the only value, all bytes, or 1 if the telecommand has no data.
+        """
         if row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
-            self._writers[key] = partial(self._execute_bare, row)
+            self._writers[key] = partial(self._execute_without_data, row)
         elif len(row.slots) == 1 and row.slots[0].type != "bytes":
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
@@ -275,13 +279,13 @@ class DeviceDictionary(Dictionary):
             raise abort_of(error) from None
         return self.application.telecommand(row, payload)
 
-    def _execute_bare(self, row: Row, _data: bytes) -> Deferred | None:
+    def _execute_without_data(self, row: Row, _data: bytes) -> Deferred | None:
         return self._execute(row, b"")
 
-    def _row_part(self, row: Row, slot: Slot) -> bytes:
+    def _read_slot(self, row: Row, slot: Slot) -> bytes:
         return self.row_bytes(row)[_span(slot)]
 
-    def _show(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
+    def _bind_reader(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
         self._readers[key] = reader
         self.sources.setdefault(row.name, set()).add(key)
         self._names[f"{key[0]:04x}.{name}"] = key
@@ -312,7 +316,7 @@ class DeviceDictionary(Dictionary):
 
 
 class _Packer:
-    """Reads a field of a telemetry row in a narrower integer type."""
+    """Reads a field of a telemetry row as a narrower integer."""
 
     def __init__(
         self, dictionary: DeviceDictionary, row: Row, slot: Slot, fields: list[Field], model: PackedField
@@ -345,12 +349,12 @@ class _Packer:
     def _raw(self, value: Value) -> int:
         enum = None if self._field is None else self._field.enum
         if enum is None or not isinstance(value, str):
-            raise SdoAbortError(AbortCode.GENERAL, f"{self._model.source}: {value!r} is no number")
+            raise SdoAbortError(AbortCode.GENERAL, f"{self._model.source}: {value!r} is not a number")
         return enum.values[value]
 
 
 def identity_of(layout: CanopenModel) -> Identity:
-    """Return the identity that the layout gives."""
+    """Return the identity in the layout."""
     return Identity(
         device_type=layout.device_type,
         device_name=layout.device_name,
@@ -369,14 +373,17 @@ def build_dictionary(
     serial_number: int = 1,
     software_version: str = "1",
 ) -> DeviceDictionary:
-    """Build the object dictionary of the device from the interface definition that travels with the package."""
+    """Build the object dictionary of the device .
+
+    By default from the definition that ships with the package.
+    """
     layout = load_layout() if layout is None else layout
     identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
     return DeviceDictionary(load_icd() if icd is None else icd, layout, identity)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
-    """Return the slots of a row that carry values, each with its fields."""
+    """Return the slots of a row that have named fields, each with these fields."""
     slots = []
     for slot in row.slots:
         fields = [field for field in row.named_fields.values() if field.slot.index == slot.index]
@@ -390,7 +397,10 @@ def _span(slot: Slot) -> slice:
 
 
 def _describe(member: ODVariable, fields: list[Field]) -> None:
-    """Give a variable the unit, scale, limits, names and text of its field; a bit field gets the names of its bits."""
+    """Copy unit, scale, limits, names and text of a field to its variable.
+
+    Name the bits of a bit field.
+    """
     first = fields[0]
     if first.width:
         for field in fields:

@@ -1,7 +1,7 @@
-"""The object dictionary of a running node: values, access checks and handlers over the library's classes.
+"""The object dictionary of a running node: values, access checks and handlers.
 
-`canopen.ObjectDictionary` describes the objects (and makes the EDS); a `Dictionary` adds to each of its variables an
-`Entry` with the present value as bytes on the wire, and the functions that read and write it in the device.
+`canopen.ObjectDictionary` describes the objects. A `Dictionary` adds an `Entry` to each variable, with the current value
+as bytes on the wire and the functions that read and write it in the device.
 """
 
 from __future__ import annotations
@@ -19,39 +19,40 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 Value = int | float | bool | str | bytes
 
 MAXIMUM_STRING: Final = 256
-"""Longest string or octet string, in bytes, that a write may bring unless the entry says otherwise."""
+"""Longest string or octet string, bytes, that may be written unless the entry has another limit."""
 
 COMMUNICATION: Final = range(0x1000, 0x2000)
-"""Indices of the communication profile; all above belong to the application."""
+"""Indices of the communication profile; higher indices belong to the application."""
 
 
 class Deferred:
-    """A write that the device has taken and whose result comes later; the node is then told by `finish_write`."""
+    """A write that the device has accepted and whose result follows by `finish_write`."""
 
 
 Writer = Callable[[bytes], Deferred | None]
-"""Takes a value that passed all checks; refuses by `SdoAbortError`, or tells that the result comes later."""
+"""Writes a value that passed all checks; raises `SdoAbortError`, or returns a token if the result
+follows later."""
 
 
 @dataclass(slots=True)
 class Entry:
-    """One variable of a node's object dictionary with its present value.
+    """One variable of a node's object dictionary with its current value.
 
     Attributes
     ----------
     variable
-        Its description in the library's object dictionary.
+        Description in the library's object dictionary.
     value
-        Present value as on the wire; not used while `reader` is given.
+        Current value as on the wire; unused if there is a `reader`.
     reader
-        Gives the present value from the device instead of `value`.
+        Returns the current value from the device instead of `value`.
     writer
-        Takes a value that passed the access, length and range checks; refuses by raising `SdoAbortError`. It runs before
-        `value` is changed.
+        Writes a value that passed the access, length and range checks, before `value` changes; raises `SdoAbortError` to
+        refuse.
     maximum_size
-        Longest value in bytes of a type without a fixed size.
+        Longest value, bytes, of a type without a fixed size.
     persistent
-        Whether store (1010h) keeps it.
+        Whether store (1010h) saves it.
     """
 
     variable: ODVariable
@@ -72,20 +73,20 @@ class Entry:
         return type_size(self.variable.data_type)
 
     def read(self) -> bytes:
-        """Return the present value as on the wire, whatever the access type (the node's own access)."""
+        """Return the current value as on the wire, without an access check."""
         return self.value if self.reader is None else self.reader()
 
     def number(self) -> int:
-        """Return the value of an integer entry that the node holds itself."""
+        """Return the value of an unsigned entry without a reader."""
         return int.from_bytes(self.value, "little")
 
     def set_number(self, value: int) -> None:
-        """Set the value of an unsigned entry that the node holds itself, without checks."""
+        """Set the value of an unsigned entry without a reader, without checks."""
         self.value = value.to_bytes(self.size or 4, "little")
 
 
 def type_size(data_type: int | None) -> int | None:
-    """Bytes of a CANopen data type, or None where the length is free (strings, DOMAIN)."""
+    """Return the bytes of a CANopen data type, or None if the length varies (strings, DOMAIN)."""
     if data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
         return 6
     packer = ODVariable.STRUCT_TYPES.get(data_type if data_type is not None else -1)
@@ -93,7 +94,7 @@ def type_size(data_type: int | None) -> int | None:
 
 
 def encode(data_type: int, value: Value) -> bytes:
-    """Pack a raw (unscaled) value; `bytes` pass as they are.
+    """Pack a raw (unscaled) value; `bytes` pass unchanged.
 
     Raises
     ------
@@ -114,7 +115,7 @@ def encode(data_type: int, value: Value) -> bytes:
         raise SdoAbortError(
             AbortCode.VALUE_RANGE, f"{value!r} does not fit type 0x{data_type:04X}: {error}"
         ) from None
-    raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value!r} has no form in type 0x{data_type:04X}")
+    raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value!r} cannot be encoded as type 0x{data_type:04X}")
 
 
 def decode(data_type: int, data: bytes) -> Value:
@@ -136,8 +137,7 @@ class Dictionary:
     Parameters
     ----------
     od
-        The described objects; entries are made for all of its variables, with `default` as first value (defaults
-        that are relative to the node-ID are set by `load_defaults`).
+        Description of the objects. Each variable gets an entry; `load_defaults` sets the default values.
     """
 
     def __init__(self, od: ObjectDictionary) -> None:
@@ -152,15 +152,15 @@ class Dictionary:
                 entry.persistent = variable.writable and variable.readable
                 self.entries[entry.key] = entry
         self.changed: set[tuple[int, int]] = set()
-        """Keys written since the node last looked."""
+        """Keys written since the node last cleared them."""
         self.instant = 0
-        """Counts the sampling instants: values that a provider gave once in an instant are used all through it."""
+        """Number of the sampling instant; within one, a reader may return the same sample again."""
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self.entries.values())
 
     def find(self, index: int, subindex: int) -> Entry:
-        """Return an entry; `SdoAbortError` NO_OBJECT or NO_SUBINDEX if there is none."""
+        """Return an entry. Raises `SdoAbortError` NO_OBJECT or NO_SUBINDEX."""
         entry = self.entries.get((index, subindex))
         if entry is not None:
             return entry
@@ -169,33 +169,39 @@ class Dictionary:
         raise SdoAbortError(AbortCode.NO_OBJECT, f"{index:04X}h")
 
     def load_defaults(self, indices: range, node_id: int) -> None:
-        """Set the entries of a range of indices to their defaults, node-ID added where these are relative."""
+        """Set the entries of a range of indices to their defaults.
+
+        Relative defaults include the node-ID.
+        """
         for (index, _), entry in self.entries.items():
             if index in indices and entry.reader is None:
                 entry.value = default_bytes(entry.variable, node_id)
 
     def new_instant(self) -> None:
-        """Begin a new sampling instant: from here providers are asked anew, once each."""
+        """Begin a new sampling instant: readers sample the device again."""
         self.instant += 1
 
     def read(self, index: int, subindex: int) -> bytes:
-        """Read as an SDO client does; `SdoAbortError` if there is no such entry or it is write-only."""
+        """Read as an SDO client.
+
+        Raises `SdoAbortError` if there is no such entry or it is write-only.
+        """
         entry = self.find(index, subindex)
         if not entry.variable.readable:
             raise SdoAbortError(AbortCode.WRITE_ONLY, f"{index:04X}h:{subindex:02X}h")
         return entry.read()
 
     def writable(self, index: int, subindex: int) -> Entry:
-        """Return an entry that an SDO client may write; `SdoAbortError` READ_ONLY and others if not."""
+        """Return an entry that an SDO client may write; raise `SdoAbortError` otherwise."""
         entry = self.find(index, subindex)
         if not entry.variable.writable:
             raise SdoAbortError(AbortCode.READ_ONLY, f"{index:04X}h:{subindex:02X}h")
         return entry
 
     def write(self, index: int, subindex: int, data: bytes) -> Deferred | None:
-        """Write as an SDO client does: access, length and range are checked, then the handler decides.
+        """Write as an SDO client: check access, length and range, then call the handler.
 
-        Returns a token if the result comes later.
+        Returns a token if the result follows later.
         """
         entry = self.writable(index, subindex)
         check_length(entry, len(data))
@@ -208,7 +214,7 @@ class Dictionary:
 
 
 def default_bytes(variable: ODVariable, node_id: int) -> bytes:
-    """Return a variable's default as bytes; zero or empty where it has none."""
+    """Return a variable's default as bytes; zero or empty if it has none."""
     default = variable.default
     if default is None:
         return bytes(type_size(variable.data_type) or 0)
@@ -218,7 +224,7 @@ def default_bytes(variable: ODVariable, node_id: int) -> bytes:
 
 
 def check_length(entry: Entry, length: int) -> None:
-    """Refuse a length in bytes that the entry's type does not have."""
+    """Reject a length that the entry's type does not have, bytes."""
     lowest, highest = (0, entry.maximum_size) if entry.size is None else (entry.size, entry.size)
     if length > highest:
         raise SdoAbortError(
@@ -231,7 +237,7 @@ def check_length(entry: Entry, length: int) -> None:
 
 
 def check_value(variable: ODVariable, data: bytes) -> None:
-    """Refuse a number outside the variable's limits, outside its named values, or that is no number."""
+    """Reject NaN, and a number outside the variable's limits or named values."""
     data_type = variable.data_type or 0
     if type_size(data_type) is None or data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
         return
@@ -247,4 +253,4 @@ def check_value(variable: ODVariable, data: bytes) -> None:
     if variable.min is not None and value < variable.min:
         raise SdoAbortError(AbortCode.VALUE_LOW, f"{value} for {variable.qualname}, at least {variable.min}")
     if variable.value_descriptions and value not in variable.value_descriptions:
-        raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value} is no named value of {variable.qualname}")
+        raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value} is not a named value of {variable.qualname}")

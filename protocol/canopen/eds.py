@@ -1,6 +1,6 @@
-"""The electronic data sheet of a node (CiA 306), written from its object dictionary.
+"""The electronic data sheet (EDS, CiA 306) of a node, generated from its object dictionary.
 
-The library's own writer puts in the hour of its call and entries that checkers refuse; what it reads, this writes.
+`canopen.export_od` is not used: it writes the time of the call, and entries that EDS checkers reject.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ DOMAIN: Final = 0x2
 ARRAY: Final = 0x8
 RECORD: Final = 0x9
 EDS_DATE: Final = dt.date(2026, 1, 1)
-"""Date of the data sheet unless another is given: the same dictionary gives the same text."""
+"""Default date of the EDS: the same dictionary always yields the same text."""
 
 Section = list[tuple[str, str]]
 
 
 def build_eds(dictionary: Dictionary, *, file_name: str = "star-sensor.eds", date: dt.date = EDS_DATE) -> str:
-    """Return the text of the electronic data sheet.
+    """Return the text of the EDS.
 
     Parameters
     ----------
     dictionary
-        The object dictionary that it describes.
+        Object dictionary to describe.
     file_name, date
-        What the data sheet says of itself.
+        File name and date in the header of the EDS.
     """
     sections: list[tuple[str, Section, str]] = [
         ("FileInfo", _file_info(dictionary, file_name, date), ""),
@@ -74,9 +74,9 @@ def _text(sections: Iterable[tuple[str, Section, str]]) -> Iterator[str]:
 
 
 def _plain(text: str) -> str:
-    """Return text that a data sheet may hold: one line of ASCII without comment signs."""
-    for sign, word in (("°", "deg"), ("µ", "u"), (";", ","), ("#", "No."), ("\n", " ")):
-        text = text.replace(sign, word)
+    """Return text as an EDS allows: one line of ASCII without comment signs."""
+    for sign, replacement in (("°", "deg"), ("µ", "u"), (";", ","), ("#", "No."), ("\n", " ")):
+        text = text.replace(sign, replacement)
     return text.encode("ascii", errors="replace").decode("ascii")
 
 

@@ -1,4 +1,4 @@
-"""Emergency producer: error register, error history, EMCY messages with inhibit time (CiA 301, EMCY)."""
+"""Emergency producer: error register, error history, EMCY messages (CiA 301, EMCY)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from enum import IntEnum, IntFlag
 from functools import partial
 from typing import Final
 
+import construct
+
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import ID_MASK, INVALID, check_identifier, check_replacement
+from starhil.protocol.canopen.cob import ID_MASK, INVALID, check_can_id, check_replacement
 from starhil.protocol.canopen.context import Context, EventKind
 
 ERROR_REGISTER: Final = (0x1001, 0)
@@ -17,11 +19,20 @@ COB_ID: Final = (0x1014, 0)
 INHIBIT: Final = (0x1015, 0)
 INHIBIT_UNIT_S: Final = 1e-4
 LONGEST_QUEUE: Final = 32
-"""Messages that wait for the inhibit time; the oldest falls out beyond it (its error stays in the history)."""
+"""Most messages that wait for the inhibit time; beyond it the oldest is dropped (its error stays in
+the history)."""
+
+
+MESSAGE: Final = construct.Struct(
+    "code" / construct.Int16ul,
+    "register" / construct.Int8ul,
+    "data" / construct.Padded(5, construct.GreedyBytes),
+)
+"""The 8 bytes of an EMCY message: error code, error register, manufacturer-specific bytes."""
 
 
 class ErrorCode(IntEnum):
-    """EMCY error codes that this slave sends by itself."""
+    """EMCY error codes of the communication profile."""
 
     RESET = 0x0000
     GENERIC = 0x1000
@@ -50,7 +61,7 @@ class ErrorRegister(IntFlag):
 
 
 class EmergencyProducer:
-    """Holds the errors that are present and tells the bus of each that comes or goes."""
+    """Keeps the active errors and sends a message for each that is raised or cleared."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -68,11 +79,14 @@ class EmergencyProducer:
         self._count.reader = lambda: bytes([len(self._history)])
         self._count.writer = self._clear_history
         for subindex in range(1, self._capacity + 1):
-            dictionary.find(HISTORY, subindex).reader = partial(self._recall, subindex - 1)
-        self._register.reader = lambda: bytes([self._bits()])
+            dictionary.find(HISTORY, subindex).reader = partial(self._read_history, subindex - 1)
+        self._register.reader = lambda: bytes([self._register_bits()])
 
     def reset(self, *, application: bool) -> None:
-        """Forget the queue and the communication errors; at a reset of the node all errors and the history."""
+        """Clear the queue and the communication errors.
+
+        With `application`, all errors and the history.
+        """
         self._queue.clear()
         self._free_at = 0.0
         for error, bits in list(self._active.items()):
@@ -82,23 +96,23 @@ class EmergencyProducer:
             self._history.clear()
 
     def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> bool:
-        """Report an error unless the same one is present already.
+        """Report an error unless it is active already.
 
         Parameters
         ----------
         code
             Error code, 16 bits.
         bits
-            Bits of the error register that it sets; the generic bit comes by itself.
+            Bits of the error register to set; the generic bit is always set.
         data
             Up to 5 manufacturer-specific bytes.
         key
-            Tells apart errors of one code (a PDO number, a node-ID).
+            Distinguishes errors of one code (a PDO number, a node-ID).
 
         Returns
         -------
         bool
-            Whether it is new.
+            Whether the error is new.
         """
         if (code, key) in self._active:
             return False
@@ -110,7 +124,7 @@ class EmergencyProducer:
         return True
 
     def clear_error(self, code: int, *, key: bytes = b"") -> bool:
-        """Report that an error is gone; the message has code 0 and names the code in its manufacturer bytes."""
+        """Report a cleared error: code 0, and its code in the manufacturer-specific bytes."""
         if self._active.pop((code, key), None) is None:
             return False
         self._context.report(EventKind.EMERGENCY, 0, f"error 0x{code:04X} gone")
@@ -123,35 +137,36 @@ class EmergencyProducer:
         return self._free_at if self._queue and self._context.communicates else None
 
     def flush(self) -> None:
-        """Send what waits, as far as the state and the inhibit time allow."""
+        """Send waiting messages, as state and inhibit time allow."""
         while self._queue and self._context.communicates and self._context.now >= self._free_at:
             message = self._queue.popleft()
             if not self._cob_id.number() & INVALID:
                 self._context.send(self._cob_id.number() & ID_MASK, message)
                 self._free_at = self._context.now + self._inhibit.number() * INHIBIT_UNIT_S
 
-    def _bits(self) -> int:
+    def _register_bits(self) -> int:
         register = 0
         for bits in self._active.values():
             register |= bits
         return register
 
     def _enqueue(self, code: int, data: bytes) -> None:
-        self._queue.append(code.to_bytes(2, "little") + bytes([self._bits()]) + data[:5].ljust(5, b"\0"))
+        fields = {"code": code, "register": self._register_bits(), "data": data[:5]}
+        self._queue.append(MESSAGE.build(fields))
         self.flush()
 
-    def _recall(self, position: int) -> bytes:
+    def _read_history(self, position: int) -> bytes:
         if position >= len(self._history):
             raise SdoAbortError(AbortCode.NO_DATA, f"{len(self._history)} errors in the history")
         return self._history[position].to_bytes(4, "little")
 
     def _clear_history(self, data: bytes) -> None:
         if data != b"\0":
-            raise SdoAbortError(AbortCode.VALUE_RANGE, "the error history takes 0 only")
+            raise SdoAbortError(AbortCode.VALUE_RANGE, "the error history accepts only 0")
         self._history.clear()
 
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
         check_replacement(old, new, lives_before=not old & INVALID, lives_after=not new & INVALID)
         if not new & INVALID:
-            check_identifier(new)
+            check_can_id(new)

@@ -21,7 +21,7 @@ GUARDING_KEY: Final = b"guarding"
 
 @dataclass
 class Monitor:
-    """Watch over the heartbeat of one node; it begins with the first heartbeat."""
+    """Supervision of the heartbeat of one node; it begins with the first heartbeat."""
 
     period_s: float
     deadline: float | None = None
@@ -29,14 +29,14 @@ class Monitor:
 
 
 class ErrorControl:
-    """Says that this node lives, and notes that others do.
+    """Produces the heartbeat of this node and supervises those of others.
 
     Parameters
     ----------
     context, emergency
         Shared by the node.
     on_failure
-        Called when a watched node or the guarding master falls silent: the error behaviour of 1029h.
+        Called when a supervised node or the guarding master falls silent; applies the error behaviour of 1029h.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class ErrorControl:
         self._guarding_lost = False
 
     def configure(self) -> None:
-        """Begin anew: toggle bit at 0, heartbeats from one period on, no node heard yet."""
+        """Restart: toggle bit 0, next heartbeat after one period, no node heard yet."""
         self._toggle = 0
         self._life_deadline = None
         self._guarding_lost = False
@@ -71,7 +71,7 @@ class ErrorControl:
 
     @property
     def next_deadline(self) -> float | None:
-        """When the next heartbeat is due or a watch runs out."""
+        """When the next heartbeat is due or a supervision expires."""
         times = [
             self._next_heartbeat,
             self._life_deadline,
@@ -80,7 +80,7 @@ class ErrorControl:
         return min((time for time in times if time is not None), default=None)
 
     def receive_heartbeat(self, node_id: int, data: bytes) -> None:
-        """Take an error control message of another node (heartbeat or boot-up)."""
+        """Process an error control message of another node (heartbeat or boot-up)."""
         if len(data) != 1:
             return
         monitor = self._monitors.get(node_id)
@@ -154,7 +154,7 @@ class ErrorControl:
             node_id = value >> 16 & 0xFF
             others = [other.number() for other in self._consumers if other is not entry]
             if value & 0xFFFF and any(other >> 16 & 0xFF == node_id and other & 0xFFFF for other in others):
-                raise SdoAbortError(AbortCode.INCOMPATIBLE, f"node {node_id} is watched by another entry")
+                raise SdoAbortError(AbortCode.INCOMPATIBLE, f"node {node_id} is supervised by another entry")
             self._unwatch(entry.number())
             self._watch(value)
 

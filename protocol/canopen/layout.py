@@ -1,4 +1,4 @@
-"""`configs/icd/canopen.toml`: where the interface definition stands in the object dictionary, read and checked."""
+"""The layout of the interface definition in the object dictionary: `configs/icd/canopen.toml`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class _Model(BaseModel):
 
 
 class PackedField(_Model):
-    """A field of a telemetry row in a narrower integer type."""
+    """A field of a telemetry row as a narrower integer."""
 
     source: str = Field(alias="from")
-    """ROW.FIELD; a bit stands for the whole byte that it is in."""
+    """ROW.FIELD; a bit selects the whole byte that contains it."""
     name: str | None = None
-    """Name in the record, the field's own by default."""
+    """Name in the record; the field's name by default."""
     type: PackedType
     scale: Annotated[float, Field(gt=0)] = 1.0
     """Physical = raw * scale."""
@@ -37,7 +37,7 @@ class PackedField(_Model):
 
 
 class PlacedObject(_Model):
-    """One object of the application and what it stands for."""
+    """One object of the application and its content."""
 
     index: Index
     name: str
@@ -61,13 +61,13 @@ class PlacedObject(_Model):
         ]
         if sum(kinds) != 1:
             raise ValueError(
-                "needs just one of requests, telemetry, value and/or telecommand, parameters, image, packed"
+                "needs exactly one of requests, telemetry, value and/or telecommand, parameters, image, packed"
             )
         return self
 
 
 class PdoModel(_Model):
-    """A PDO as it is by default."""
+    """Default configuration of a PDO."""
 
     name: str
     enabled: bool = False
@@ -78,7 +78,7 @@ class PdoModel(_Model):
 
 
 class CanopenModel(_Model):
-    """The whole file, below its table `canopen`."""
+    """Content of the table `canopen`."""
 
     device_type: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
     device_name: str
@@ -97,22 +97,22 @@ class _FileModel(_Model):
 
 
 def load_layout(path: Path | str | None = None) -> CanopenModel:
-    """Read where the interface definition stands in the object dictionary.
+    """Read the layout of the interface definition in the object dictionary.
 
     Parameters
     ----------
     path
-        The file, or the folder it is in; by default the one that travels with the package, read once.
+        The file or its folder; by default the file that ships with the package, read once.
 
     Raises
     ------
     IcdError
-        Names file and key.
+        The text names file and key.
     """
     if path is None:
         return _load_default()
-    given = Path(path)
-    return _load(given / FILE_NAME if given.is_dir() else given)
+    path = Path(path)
+    return _load(path / FILE_NAME if path.is_dir() else path)
 
 
 @lru_cache(maxsize=1)
@@ -128,7 +128,7 @@ def _load(path: Path) -> CanopenModel:
         raise IcdError(f"{path}: cannot read the CANopen layout: {error.strerror}") from None
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(step) for step in first["loc"])
-        raise IcdError(f"{path}: {place}: {first['msg']}") from None
+        key = ".".join(str(step) for step in first["loc"])
+        raise IcdError(f"{path}: {key}: {first['msg']}") from None
     except (ValueError, RecursionError) as error:
         raise IcdError(f"{path}: not valid TOML: {error}") from None

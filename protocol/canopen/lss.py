@@ -1,4 +1,4 @@
-"""LSS slave: node-ID and bit rate set over the bus, identity asked for and searched (CiA 305)."""
+"""LSS slave: sets node-ID and bit rate, answers inquiries and identity scans (CiA 305)."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ class Command(IntEnum):
 
 
 class LssHost(Protocol):
-    """What the LSS slave asks of its node."""
+    """What the LSS slave requires of its node."""
 
     def activate_node_id(self, node_id: int) -> None:
-        """Leave the unconfigured state with this node-ID."""
+        """Leave the unconfigured state with a node-ID."""
 
     def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
         """Change the bit rate: silence for `delay_s` before and after."""
 
     def store_lss(self, node_id: int, bit_rate: int) -> None:
-        """Keep node-ID and bit rate; `ProtocolError` if they cannot be kept."""
+        """Save node-ID and bit rate; raise `ProtocolError` if that fails."""
 
 
 class LssSlave:
@@ -81,9 +81,9 @@ class LssSlave:
     host
         The node itself.
     bit_rate
-        Bit rate that is in use, bit/s.
+        Current bit rate, bit/s.
     allowed_bit_rates
-        Those that the node can be set to, bit/s.
+        Bit rates that LSS may set, bit/s.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class LssSlave:
         self._scan_position = 0
 
     def receive(self, data: bytes) -> None:
-        """Take one frame of the LSS master; any other length than 8 is ignored."""
+        """Process a frame of the LSS master; ignore any length other than 8."""
         if len(data) != LENGTH:
             return
         command = data[0]
@@ -128,7 +128,7 @@ class LssSlave:
         return self._context.node_id == UNCONFIGURED and self.pending_node_id == UNCONFIGURED
 
     def _identity(self, number: int) -> int:
-        """Vendor-ID, product code, revision number or serial number for 0 to 3."""
+        """Return the vendor-ID, product code, revision number or serial number for 0 to 3."""
         return self._context.dictionary.find(IDENTITY, number + 1).number()
 
     def _send(self, command: int, payload: bytes = b"") -> None:
@@ -146,7 +146,7 @@ class LssSlave:
             self._host.activate_node_id(self.pending_node_id)
 
     def _switch_selective(self, command: int, number: int) -> None:
-        """Four frames in their order, each with a part of this node's identity, select it."""
+        """Select this node after four frames in order, each with one number of its identity."""
         step = command - Command.SWITCH_VENDOR
         if step == 0:
             self._selected = 0
@@ -160,7 +160,7 @@ class LssSlave:
             self._send(Command.SWITCHED)
 
     def _identify(self, command: int, number: int) -> None:
-        """Six frames in their order: vendor, product, and ranges of revision and serial number."""
+        """Identify after six frames in order: vendor, product, ranges of revision and serial."""
         step = command - Command.IDENTIFY_VENDOR
         if step == 0:
             self._identified = 0
@@ -175,7 +175,10 @@ class LssSlave:
             self._send(Command.IDENTIFIED)
 
     def _fastscan(self, number: int, bit: int, part: int, following: int) -> None:
-        """Compare the upper bits of one part of the identity; the match of a whole part leads to the next."""
+        """Compare the upper bits of one number of the identity.
+
+        A complete match leads to the next number.
+        """
         if not self._unconfigured or self.configuring:
             return
         if bit == 0x80:
@@ -192,7 +195,7 @@ class LssSlave:
             self.configuring = following < part
 
     def _configuration(self, command: int, data: bytes) -> None:
-        """Take a command that only a node in the configuration state obeys."""
+        """Execute a command that requires the configuration state."""
         if Command.INQUIRE_VENDOR <= command <= Command.INQUIRE_SERIAL:
             self._send(command, self._identity(command - Command.INQUIRE_VENDOR).to_bytes(4, "little"))
         elif command == Command.INQUIRE_NODE_ID:
@@ -202,7 +205,7 @@ class LssSlave:
             if valid:
                 self.pending_node_id = data[1]
                 self._context.report(
-                    EventKind.NODE_ID, data[1], "from the next reset of the communication on"
+                    EventKind.NODE_ID, data[1], "takes effect at the next reset of communication"
                 )
             self._send(command, bytes([OK if valid else OUT_OF_RANGE]))
         elif command == Command.CONFIGURE_BIT_TIMING:

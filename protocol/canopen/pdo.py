@@ -1,4 +1,4 @@
-"""RPDOs and TPDOs at run time: synchronous and event-driven transmission, timers, length checks (CiA 301, PDO)."""
+"""Transmission and reception of PDOs, synchronous and event-driven (CiA 301, PDO)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedO
 
 
 class ReceivePdo:
-    """Writes the mapped objects when its message comes (event-driven) or at the next SYNC (synchronous)."""
+    """Writes the mapped objects when its message arrives, or at the next SYNC if synchronous."""
 
     def __init__(self, context: Context, emergency: EmergencyProducer, number: int) -> None:
         self._context = context
@@ -25,7 +25,7 @@ class ReceivePdo:
         self.next_deadline: float | None = None
 
     def configure(self) -> None:
-        """Take over the present records; what waited for SYNC is dropped."""
+        """Apply the current records; drop what waits for SYNC."""
         self.records.changed = False
         self._objects = self.records.mapped()
         self._size = sum(mapped.size for mapped in self._objects)
@@ -33,12 +33,12 @@ class ReceivePdo:
         self.next_deadline = None
 
     @property
-    def identifier(self) -> int | None:
-        """Identifier of its message, None while it does not exist or maps nothing."""
-        return self.records.identifier if self.records.valid and self._objects else None
+    def can_id(self) -> int | None:
+        """CAN ID of its message, None while the PDO is invalid or maps nothing."""
+        return self.records.can_id if self.records.valid and self._objects else None
 
     def receive(self, data: bytes) -> None:
-        """Take a message: too short is not processed, too long is processed and reported."""
+        """Process a message; report a wrong length, and drop a message that is too short."""
         if len(data) < self._size:
             detail = bytes([*self._key, len(data)])
             self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
@@ -62,13 +62,13 @@ class ReceivePdo:
             self._apply(data)
 
     def synchronise(self) -> None:
-        """Act on the message that waits for SYNC."""
+        """Apply the message that waits for SYNC."""
         if self._pending is not None:
             data, self._pending = self._pending, None
             self._apply(data)
 
     def tick(self) -> None:
-        """Report that the next message did not come in time."""
+        """Report that the next message did not arrive in time."""
         if self.next_deadline is not None and self._context.now >= self.next_deadline:
             self.next_deadline = None
             self._emergency.raise_error(
@@ -76,7 +76,10 @@ class ReceivePdo:
             )
 
     def _apply(self, data: bytes) -> None:
-        """Write all objects, or none if one value is out of its limits; a refusal is reported by EMCY 8200h."""
+        """Write all objects, or none if one value is outside its limits.
+
+        Report a refusal by EMCY 8200h.
+        """
         writes: list[tuple[int, int, bytes]] = []
         position = 0
         try:
@@ -115,7 +118,7 @@ class TransmitPdo:
         self._event_at: float | None = None
 
     def configure(self) -> None:
-        """Take over the present records; timers start now, the synchronous count begins anew."""
+        """Apply the current records; restart the timers and the SYNC count."""
         self.records.changed = False
         self._objects = self.records.mapped()
         self._keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
@@ -136,7 +139,7 @@ class TransmitPdo:
 
     @property
     def next_deadline(self) -> float | None:
-        """When the event timer runs out or the inhibit time lets a waiting event go."""
+        """When the event timer expires or the inhibit time ends for a waiting event."""
         if not self.active or self._synchronous:
             return None
         if self._event:
@@ -151,11 +154,11 @@ class TransmitPdo:
         self._event = not self._synchronous
 
     def concerns(self, keys: frozenset[tuple[int, int]]) -> bool:
-        """Tell whether one of these objects is mapped."""
+        """Return whether one of these objects is mapped."""
         return not self._keys.isdisjoint(keys)
 
     def trigger(self) -> None:
-        """Note an event; `tick` sends an event-driven PDO as soon as the inhibit time allows."""
+        """Mark an event; `tick` sends an event-driven PDO as soon as the inhibit time allows."""
         if self.active:
             self._event = True
 
@@ -187,7 +190,7 @@ class TransmitPdo:
         self._send()
         period = self.records.event_s
         if due is not None and period and due + period > self._context.now:
-            self._event_at = due + period  # that it was sent a little late does not shift the next one
+            self._event_at = due + period  # a late transmission does not shift the next one
 
     def _restart_timer(self) -> None:
         period = self.records.event_s
@@ -202,7 +205,7 @@ class TransmitPdo:
             self._context.report(EventKind.REFUSED, self.records.number + 1, f"TPDO: {refusal}")
             return
         self._free_at = self._context.now + self.records.inhibit_s
-        self._context.send(self.records.identifier, data)
+        self._context.send(self.records.can_id, data)
 
 
 class PdoService:
@@ -234,7 +237,7 @@ class PdoService:
 
     @property
     def next_deadline(self) -> float | None:
-        """When the next timer of a PDO runs out."""
+        """When the next timer of a PDO expires."""
         times = [pdo.next_deadline for pdo in self._all]
         return min((time for time in times if time is not None), default=None)
 
@@ -244,21 +247,21 @@ class PdoService:
             transmitting.start()
 
     def stop(self) -> None:
-        """Leave OPERATIONAL: nothing waits any more."""
+        """Leave OPERATIONAL: drop all that waits."""
         for receiving in self.receiving:
             receiving.configure()
         for transmitting in self.transmitting:
             transmitting.configure()
 
     def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
-        """Note that these objects have new values."""
+        """Trigger the TPDOs that map one of these objects."""
         changed = frozenset(keys)
         for pdo in self.transmitting:
             if pdo.concerns(changed):
                 pdo.trigger()
 
     def synchronise(self, counter: int) -> None:
-        """Act on a SYNC: first send (all sampled at this instant), then act on received messages."""
+        """Act on a SYNC: first send samples of this instant, then apply received messages."""
         for transmitting in self.transmitting:
             transmitting.synchronise(counter)
         for receiving in self.receiving:

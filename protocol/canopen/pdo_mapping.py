@@ -1,4 +1,4 @@
-"""PDO communication and mapping records: what may be configured when, and what a mapping means (CiA 301)."""
+"""PDO communication and mapping records, and the rules for changing them (CiA 301)."""
 
 from __future__ import annotations
 
@@ -6,24 +6,32 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+import construct
+
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import BIT_30, ID_MASK, INVALID, check_identifier, check_replacement
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, INVALID, check_can_id, check_replacement
 from starhil.protocol.canopen.dictionary import Dictionary, Entry, type_size
 
 LARGEST_MAPPING: Final = 8
-"""Objects of a PDO, at most: the granularity is 8 bits."""
+"""Most objects in a PDO: the granularity is 8 bits."""
 LARGEST_PDO: Final = 8
-"""Bytes of a PDO, at most."""
+"""Most bytes in a PDO."""
 FIRST_DUMMY: Final = 0x0002
 LAST_DUMMY: Final = 0x0007
-"""Data types whose index may be mapped in an RPDO as a place holder (INTEGER8 to UNSIGNED32)."""
+"""Data types whose index may be mapped in an RPDO as a placeholder (INTEGER8 to UNSIGNED32)."""
 LAST_CYCLIC: Final = 240
 """Transmission types up to this one are synchronous."""
 EVENT_DRIVEN: Final = frozenset({254, 255})
 
 
+MAPPING_ENTRY: Final = construct.Struct(
+    "index" / construct.Int16ub, "subindex" / construct.Int8ub, "bits" / construct.Int8ub
+)
+"""The 32-bit value of a mapping entry, most significant byte first."""
+
+
 class Direction(Enum):
-    """RPDO or TPDO: indices of the first communication and mapping record."""
+    """RPDO or TPDO, with the indices of the first communication and mapping record."""
 
     RECEIVE = (0x1400, 0x1600)
     TRANSMIT = (0x1800, 0x1A00)
@@ -41,14 +49,14 @@ class Direction(Enum):
 
 @dataclass(frozen=True)
 class MappedObject:
-    """One object of a PDO; a place holder has no entry."""
+    """One object of a PDO; a placeholder has no entry."""
 
     entry: Entry | None
     size: int
 
 
 def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedObject:
-    """Return what a mapping entry (index, sub-index, bits) stands for.
+    """Return the object of a mapping entry, as in `MAPPING_ENTRY`.
 
     Raises
     ------
@@ -56,11 +64,14 @@ def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedO
         NO_OBJECT for an object that does not exist, NOT_MAPPABLE for one that cannot be mapped in this direction
         or in this length.
     """
-    index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
+    entry_bits = MAPPING_ENTRY.parse(value.to_bytes(4, "big"))
+    index, subindex, bits = entry_bits.index, entry_bits.subindex, entry_bits.bits
     if direction is Direction.RECEIVE and FIRST_DUMMY <= index <= LAST_DUMMY and subindex == 0:
         size = type_size(index)
         if size is None or bits != size * 8:
-            raise SdoAbortError(AbortCode.NOT_MAPPABLE, f"place holder 0x{index:04X} has not {bits} bits")
+            raise SdoAbortError(
+                AbortCode.NOT_MAPPABLE, f"placeholder 0x{index:04X} does not have {bits} bits"
+            )
         return MappedObject(None, size)
     try:
         entry = dictionary.find(index, subindex)
@@ -72,7 +83,7 @@ def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedO
     if not variable.pdo_mappable or not usable or (direction is Direction.RECEIVE and access == "rwr"):
         raise SdoAbortError(AbortCode.NOT_MAPPABLE, f"{index:04X}h:{subindex:02X}h")
     if entry.size is None or bits != entry.size * 8:
-        raise SdoAbortError(AbortCode.NOT_MAPPABLE, f"{index:04X}h:{subindex:02X}h has not {bits} bits")
+        raise SdoAbortError(AbortCode.NOT_MAPPABLE, f"{index:04X}h:{subindex:02X}h does not have {bits} bits")
     return MappedObject(entry, entry.size)
 
 
@@ -82,7 +93,7 @@ class PdoRecords:
     Parameters
     ----------
     dictionary
-        Holds the records.
+        Object dictionary with the records.
     direction
         RPDO or TPDO.
     number
@@ -94,7 +105,7 @@ class PdoRecords:
         self.direction = direction
         self.number = number
         self.changed = True
-        """Set when a record was written; the node then configures the PDO anew."""
+        """Whether a record was written since the PDO was configured."""
         communication = direction.communication + number
         mapping = direction.mapping + number
         self._cob_id = dictionary.find(communication, 1)
@@ -123,13 +134,13 @@ class PdoRecords:
         return not self._cob_id.number() & INVALID
 
     @property
-    def identifier(self) -> int:
-        """Identifier of its message."""
+    def can_id(self) -> int:
+        """CAN ID of its message."""
         return self._cob_id.number() & ID_MASK
 
     @property
     def transmission_type(self) -> int:
-        """When it is sent or acted upon."""
+        """Transmission type: when the PDO is sent or applied."""
         return self._type.number()
 
     @property
@@ -139,16 +150,19 @@ class PdoRecords:
 
     @property
     def event_s(self) -> float:
-        """TPDO: longest time between two transmissions; RPDO: deadline of the next message; s, 0 for none."""
+        """TPDO: longest time between two transmissions.
+
+        RPDO: deadline of the next message; s, 0 for none.
+        """
         return 0.0 if self._event_timer is None else self._event_timer.number() * 1e-3
 
     @property
     def sync_start(self) -> int:
-        """Counter value of the first SYNC that counts, 0 for any."""
+        """SYNC counter at which the PDO starts, 0 for any."""
         return 0 if self._sync_start is None else self._sync_start.number()
 
     def mapped(self) -> list[MappedObject]:
-        """Return the mapped objects in their order; none while the mapping is disabled."""
+        """Return the mapped objects in order; none while the mapping is disabled."""
         count = min(self._count.number(), LARGEST_MAPPING)
         return [resolve(self._dictionary, slot.number(), self.direction) for slot in self._slots[:count]]
 
@@ -160,7 +174,7 @@ class PdoRecords:
                 AbortCode.VALUE_RANGE, "remote requests are not supported: bit 30 must be set"
             )
         if not new & INVALID:
-            check_identifier(new)
+            check_can_id(new)
         self.changed = True
 
     def _write_type(self, data: bytes) -> None:

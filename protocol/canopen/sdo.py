@@ -1,4 +1,4 @@
-"""SDO server: initiates transfers and hands further requests to the transfer under way (CiA 301, SDO)."""
+"""SDO server: initiates transfers, passes further requests to the active one (CiA 301, SDO)."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from starhil.protocol.canopen.sdo_transfer import (
 from starhil.protocol.errors import ProtocolError
 
 LENGTH: Final = 8
-"""Data bytes of every SDO frame; others are no SDO."""
+"""Data bytes of every SDO frame."""
 ABORT: Final = 0x80
 RESULT_TIMEOUT_S: Final = 30.0
-"""Longer than the device needs for any result: an exposure, with the processing of the frame before it, takes seconds."""
+"""Longer than any result takes: an exposure, after the processing of the image before it, takes
+seconds."""
 
 
 @dataclass
 class _Waiting:
-    """A download that is taken and not yet answered."""
+    """A download that is accepted and not yet answered."""
 
     deferred: Deferred
     answers: list[bytes]
@@ -44,11 +45,11 @@ class SdoServer:
     Parameters
     ----------
     dictionary
-        What is read and written.
+        Object dictionary to read and write.
     timeout_s
-        A transfer is aborted when its client is silent for so long.
+        Silence of the client after which a transfer is aborted.
     result_timeout_s
-        A download is aborted when the device has no result of it for so long; meanwhile it is the client that waits.
+        Time after which a download without a result of the device is aborted.
     """
 
     def __init__(
@@ -61,21 +62,25 @@ class SdoServer:
         self._waiting: _Waiting | None = None
         self.deadline: float | None = None
         self.faults: list[str] = []
-        """What handlers of the application raised beside `SdoAbortError`; the node makes events of it."""
+        """Texts of other errors than `SdoAbortError` that the application raised; the node reports
+        them as events."""
 
     @property
     def busy(self) -> bool:
-        """Whether a transfer is under way."""
+        """Whether a transfer is active."""
         return self._transfer is not None or self._waiting is not None
 
     def reset(self) -> None:
-        """Forget the transfer under way; nothing is sent."""
+        """Drop the active transfer without an answer."""
         self._transfer = None
         self._waiting = None
         self.deadline = None
 
     def finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> list[bytes]:
-        """Answer a download whose result has come; nothing if its client no longer waits for it."""
+        """Answer a download whose result is known.
+
+        Return nothing if the client no longer waits for it.
+        """
         waiting = self._waiting
         if waiting is None or waiting.deferred is not deferred:
             return []
@@ -86,11 +91,11 @@ class SdoServer:
         return [self._abort(refusal.code, waiting.index, waiting.subindex)]
 
     def tick(self, now: float) -> list[bytes]:
-        """Abort the transfer whose client is silent, or whose result stays away, for too long."""
-        under_way = self._transfer or self._waiting
-        if under_way is None or self.deadline is None or now < self.deadline:
+        """Abort a transfer whose client or whose result exceeds its timeout."""
+        active = self._transfer or self._waiting
+        if active is None or self.deadline is None or now < self.deadline:
             return []
-        return [self._abort(AbortCode.TIMEOUT, under_way.index, under_way.subindex)]
+        return [self._abort(AbortCode.TIMEOUT, active.index, active.subindex)]
 
     def receive(self, data: bytes, now: float) -> list[bytes]:
         """Take the data of one frame and return the data of the answers.
@@ -106,8 +111,8 @@ class SdoServer:
             return []
         index, subindex = int.from_bytes(data[1:3], "little"), data[3]
         if not self._begins(data):
-            under_way = self._transfer or self._waiting
-            index, subindex = (0, 0) if under_way is None else (under_way.index, under_way.subindex)
+            active = self._transfer or self._waiting
+            index, subindex = (0, 0) if active is None else (active.index, active.subindex)
         try:
             answers = self._handle(data, index, subindex)
         except SdoAbortError as abort:
@@ -129,7 +134,7 @@ class SdoServer:
         return isinstance(self._transfer, BlockDownload) and self._transfer.streaming
 
     def _begins(self, data: bytes) -> bool:
-        """Tell whether a request initiates a transfer, and thereby replaces the one under way."""
+        """Return whether a request initiates a transfer, and so replaces the active one."""
         if self._streaming():
             return False
         command = data[0]

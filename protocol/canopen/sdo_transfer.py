@@ -1,7 +1,7 @@
-"""Segmented and block SDO transfers, server side: one object for each transfer under way (CiA 301, SDO protocols).
+"""Segmented and block SDO transfers, server side: one object per active transfer (CiA 301, SDO protocols).
 
-A transfer is handed the 8 bytes of each further request and returns the 8-byte answers; `done` says that it has
-ended. What breaks the protocol raises `SdoAbortError`; the server sends the abort and drops the transfer.
+A transfer receives the 8 bytes of each further request and returns the 8-byte answers; `done` is set when it has ended.
+A violation of the protocol raises `SdoAbortError`; the server sends the abort and drops the transfer.
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ from starhil.protocol.canopen.dictionary import Deferred
 SEGMENT: Final = 7
 """Data bytes of a segment."""
 MAXIMUM_BLOCK: Final = 127
-"""Segments of a block, at most."""
+"""Most segments in a block."""
 
 Commit = Callable[[bytes], Deferred | None]
-"""Writes the whole data to the object; refuses by `SdoAbortError`, or tells that the result comes later."""
+"""Writes the complete data to the object; raises `SdoAbortError`, or returns a token if the result
+follows later."""
 
 
 class Transfer:
-    """A transfer under way at an index and sub-index."""
+    """An active transfer of an index and sub-index."""
 
     def __init__(self, index: int, subindex: int) -> None:
         self.index = index
         self.subindex = subindex
         self.done = False
         self.deferred: Deferred | None = None
-        """Set at the end of a download whose result comes later: the answer has to wait for it."""
+        """Set at the end of a download whose result follows later; the answer waits for it."""
 
     def request(self, data: bytes) -> list[bytes]:
-        """Take one request; the base class knows none."""
+        """Answer one request; the base class rejects all."""
         raise SdoAbortError(AbortCode.COMMAND, f"0x{data[0]:02X}")
 
 
 class ReceiveBuffer:
-    """Collects the data of a download, up to the size announced and the size the object takes.
+    """Collects the data of a download, up to the announced size and the size that the object accepts.
 
     Parameters
     ----------
     announced
-        Size that the client gave, None if it gave none.
+        Size announced by the client, or None.
     maximum
-        Most bytes that the object takes.
+        Most bytes that the object accepts.
     """
 
     def __init__(self, announced: int | None, maximum: int) -> None:
@@ -54,14 +55,14 @@ class ReceiveBuffer:
         self.data = bytearray()
 
     def check(self) -> None:
-        """Refuse more data than the object takes or than were announced."""
+        """Reject more data than the object accepts or the client announced."""
         if len(self.data) > self.maximum:
             raise SdoAbortError(AbortCode.LENGTH_HIGH, f"{len(self.data)} bytes, at most {self.maximum}")
         if self.announced is not None and len(self.data) > self.announced:
             raise SdoAbortError(AbortCode.LENGTH, f"{len(self.data)} bytes, {self.announced} announced")
 
     def finish(self) -> bytes:
-        """Return the whole data; refuse fewer than announced."""
+        """Return the complete data; reject less than announced."""
         self.check()
         if self.announced is not None and len(self.data) != self.announced:
             raise SdoAbortError(AbortCode.LENGTH, f"{len(self.data)} bytes, {self.announced} announced")
@@ -69,7 +70,7 @@ class ReceiveBuffer:
 
 
 class SegmentedDownload(Transfer):
-    """Client writes in segments of up to 7 bytes, each confirmed."""
+    """The client writes segments of up to 7 bytes, each confirmed."""
 
     def __init__(self, index: int, subindex: int, buffer: ReceiveBuffer, commit: Commit) -> None:
         super().__init__(index, subindex)
@@ -78,7 +79,7 @@ class SegmentedDownload(Transfer):
         self._toggle = 0
 
     def request(self, data: bytes) -> list[bytes]:
-        """Take a segment (command specifier 0)."""
+        """Process a segment (command specifier 0)."""
         command = data[0]
         if command >> 5 != 0:
             return super().request(data)
@@ -96,7 +97,7 @@ class SegmentedDownload(Transfer):
 
 
 class SegmentedUpload(Transfer):
-    """Client reads in segments of up to 7 bytes."""
+    """The client reads segments of up to 7 bytes."""
 
     def __init__(self, index: int, subindex: int, data: bytes) -> None:
         super().__init__(index, subindex)
@@ -105,7 +106,7 @@ class SegmentedUpload(Transfer):
         self._toggle = 0
 
     def request(self, data: bytes) -> list[bytes]:
-        """Take a segment request (command specifier 3)."""
+        """Answer a segment request (command specifier 3)."""
         command = data[0]
         if command >> 5 != 3:
             return super().request(data)
@@ -121,10 +122,9 @@ class SegmentedUpload(Transfer):
 
 
 class BlockDownload(Transfer):
-    """Client writes in blocks of up to 127 unconfirmed segments, a CRC over all at the end.
+    """The client writes blocks of up to 127 unconfirmed segments, with a CRC over all data at the end.
 
-    A gap in the sequence is answered after the block's last segment with the number of the last good one; the client
-    sends the rest again.
+    After a gap, the confirmation of the block names the last segment in sequence; the client repeats the rest.
     """
 
     def __init__(
@@ -139,11 +139,11 @@ class BlockDownload(Transfer):
 
     @property
     def streaming(self) -> bool:
-        """Whether the next frame is a segment, whose first byte is no command."""
+        """Whether the next frame is a segment, whose first byte is not a command."""
         return not self._ending
 
     def request(self, data: bytes) -> list[bytes]:
-        """Take a segment, or the end of the transfer once the last segment has come."""
+        """Process a segment, or the end request after the last segment."""
         return self._end(data) if self._ending else self._segment(data)
 
     def _segment(self, data: bytes) -> list[bytes]:
@@ -180,7 +180,10 @@ class BlockDownload(Transfer):
 
 
 class BlockUpload(Transfer):
-    """Client reads in blocks of up to 127 segments; it confirms a block and may ask for the rest of it again."""
+    """The client reads blocks of up to 127 segments.
+
+    It confirms each block and may request the rest of it again.
+    """
 
     def __init__(self, index: int, subindex: int, data: bytes, block_size: int, *, crc: bool) -> None:
         super().__init__(index, subindex)
@@ -193,7 +196,7 @@ class BlockUpload(Transfer):
         self._ending = False
 
     def request(self, data: bytes) -> list[bytes]:
-        """Take the start, a block's confirmation or the end (command specifier 5, subcommands 3, 2 and 1)."""
+        """Answer start, confirmation of a block or end (specifier 5, subcommands 3, 2 and 1)."""
         command = data[0]
         if command >> 5 != 5:
             return super().request(data)
@@ -234,7 +237,10 @@ class BlockUpload(Transfer):
 
 
 def valid_block_size(size: int) -> int:
-    """Return a number of segments a block, 1 to 127; `SdoAbortError` BLOCK_SIZE for any other."""
+    """Return a number of segments per block if it is 1 to 127.
+
+    Raise `SdoAbortError` BLOCK_SIZE otherwise.
+    """
     if not 1 <= size <= MAXIMUM_BLOCK:
-        raise SdoAbortError(AbortCode.BLOCK_SIZE, f"{size} segments a block")
+        raise SdoAbortError(AbortCode.BLOCK_SIZE, f"{size} segments per block")
     return size

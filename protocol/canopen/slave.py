@@ -1,7 +1,7 @@
-"""A CANopen slave without input or output: frames and the time go in, frames and events come out (CiA 301, CiA 305).
+"""A sans-I/O CANopen slave: frames and the time in, frames and events out (CiA 301, CiA 305).
 
-The caller owns bus and clock: it hands over each frame with `receive`, calls `tick` at `next_deadline`, sends the
-frames that come back in their order, and takes the events. Nothing here waits, reads a clock or starts a thread.
+The caller owns bus and clock: it passes each frame to `receive`, calls `tick` at `next_deadline`, sends the returned
+frames in order, and collects the events. The slave never waits, reads a clock or starts a thread.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from starhil.protocol.canopen.timestamp import TimeConsumer
 from starhil.protocol.errors import ProtocolError
 
 STATE_COMMANDS: Final = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
-"""NMT command specifier → state that it asks for."""
+"""NMT command specifier → requested state."""
 RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
@@ -46,20 +46,20 @@ class CanopenSlave:
     dictionary
         Object dictionary with at least the communication profile of `communication.add_communication`.
     node_id
-        1 to 127, or 255 for a node that waits for LSS; what LSS stored goes before it.
+        1 to 127, or 255 for a node that waits for LSS; a node-ID stored by LSS takes precedence.
     bit_rate
-        Bit rate in use, bit/s; what LSS stored goes before it.
+        Current bit rate, bit/s; a bit rate stored by LSS takes precedence.
     storage
-        Where parameters survive a restart; by default they do not.
+        Storage of the parameters; by default they do not survive a restart.
     sdo_timeout_s
-        Silence of an SDO client that ends its transfer.
+        Silence of an SDO client after which its transfer is aborted.
     bit_rates
         Bit rates that LSS may set, bit/s.
 
     Raises
     ------
     ProtocolError
-        If the node-ID is none.
+        The node-ID is invalid.
     """
 
     def __init__(
@@ -89,7 +89,8 @@ class CanopenSlave:
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
         self.pdos = PdoService(context, self.emergency)
         self.on_reset: Callable[[], int | None] | None = None
-        """Resets the application when NMT resets the node; the node-ID that it returns holds, unless LSS stored one."""
+        """Resets the application when NMT resets the node; a returned node-ID applies unless LSS
+        has stored one."""
         self._clock_offset_us = 0
         self._silence: tuple[float, float] | None = None
         self._pending_bit_rate = bit_rate
@@ -103,17 +104,17 @@ class CanopenSlave:
 
     @property
     def node_id(self) -> int:
-        """Node-ID in use, 255 while LSS has to give one."""
+        """Current node-ID, 255 while it waits for LSS."""
         return self._context.node_id
 
     def start(self, now: float) -> list[CanFrame]:
         """Power on: load the parameters, boot up and enter PRE-OPERATIONAL."""
         self._begin(now)
         self._initialise(application=True)
-        return self._finish()
+        return self._collect_frames()
 
     def receive(self, frame: CanFrame, now: float) -> list[CanFrame]:
-        """Take a frame from the bus; those of the extended format and of unknown identifiers are ignored."""
+        """Process a frame from the bus; ignore extended frames and unknown CAN IDs."""
         handlers = self._routes.get(frame.id)
         if frame.extended or handlers is None:
             return []
@@ -121,10 +122,10 @@ class CanopenSlave:
         if self._silence is None:
             for handler in tuple(handlers):
                 handler(frame)
-        return self._finish()
+        return self._collect_frames()
 
     def tick(self, now: float) -> list[CanFrame]:
-        """Act on the timers that have run out."""
+        """Act on the timers that have expired."""
         self._begin(now)
         self._end_silence()
         if self._context.state is not NmtState.INITIALISING and self._silence is None:
@@ -136,10 +137,10 @@ class CanopenSlave:
                 self.pdos.synchronise(counter)
             self.pdos.tick()
             self.emergency.flush()
-        return self._finish()
+        return self._collect_frames()
 
     def next_deadline(self) -> float | None:
-        """When `tick` has to be called, on the clock of the caller; None while nothing is due."""
+        """Return when `tick` must be called, on the caller's clock; None while nothing is due."""
         if self._silence is not None:
             return self._silence[0] if self._context.now < self._silence[0] else self._silence[1]
         if self._context.state is NmtState.INITIALISING:
@@ -154,47 +155,47 @@ class CanopenSlave:
         return min((time for time in times if time is not None), default=None)
 
     def notify(self, keys: frozenset[tuple[int, int]] | set[tuple[int, int]], now: float) -> list[CanFrame]:
-        """Tell that objects have new values: event-driven TPDOs go out, acyclic ones wait for SYNC."""
+        """Report new values of objects: event-driven TPDOs are sent, acyclic ones wait for SYNC."""
         self._begin(now)
         self.pdos.trigger(keys)
         self.pdos.tick()
-        return self._finish()
+        return self._collect_frames()
 
     def finish_write(
         self, deferred: Deferred, now: float, refusal: SdoAbortError | None = None
     ) -> list[CanFrame]:
-        """Tell the result of a write that a handler of the application deferred: done, or refused after all."""
+        """Report the result of a write that the application deferred: success, or a refusal."""
         self._begin(now)
         for data in self.sdo.finish(deferred, refusal):
             self._context.send(SDO_TRANSMIT + self.node_id, data)
-        return self._finish()
+        return self._collect_frames()
 
     def raise_emergency(
         self, code: int, register_bits: int, data: bytes = b"", *, now: float, key: bytes = b""
     ) -> list[CanFrame]:
-        """Report an error of the application that has come; see `EmergencyProducer.raise_error`."""
+        """Report an error of the application; see `EmergencyProducer.raise_error`."""
         self._begin(now)
         self.emergency.raise_error(code, register_bits, data, key=key)
-        return self._finish()
+        return self._collect_frames()
 
     def clear_emergency(self, code: int, *, now: float, key: bytes = b"") -> list[CanFrame]:
-        """Report that an error of the application is gone."""
+        """Report that an error of the application is cleared."""
         self._begin(now)
         self.emergency.clear_error(code, key=key)
-        return self._finish()
+        return self._collect_frames()
 
     def reset_node(self, now: float, node_id: int | None = None) -> list[CanFrame]:
-        """Restart as after NMT "reset node", on the application's own wish and without its event.
+        """Restart as after NMT "reset node", at the request of the application and without the event.
 
-        A `node_id` that is given holds from here on, unless LSS has stored one.
+        A `node_id` applies from now on, unless LSS has stored one.
         """
         self._begin(now)
         self._prepare_node_id(node_id)
         self._initialise(application=True)
-        return self._finish()
+        return self._collect_frames()
 
     def take_events(self) -> list[SlaveEvent]:
-        """Return what happened since the last call."""
+        """Return the events since the last call."""
         events, self._context.events = self._context.events, []
         return events
 
@@ -204,13 +205,13 @@ class CanopenSlave:
         self._initialise(application=False)
 
     def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
-        """Be silent, report the new bit rate after `delay_s`, be silent for as long again (LSS)."""
+        """Stop sending, switch the bit rate after `delay_s`, resume after another (LSS)."""
         now = self._context.now
         self._pending_bit_rate = bit_rate
         self._silence = (now + delay_s, now + 2 * delay_s)
 
     def store_lss(self, node_id: int, bit_rate: int) -> None:
-        """Keep node-ID and bit rate (LSS)."""
+        """Save node-ID and bit rate (LSS)."""
         self.store.save_lss(node_id, bit_rate)
 
     def _bind(self) -> None:
@@ -231,8 +232,8 @@ class CanopenSlave:
         self._context.now = now
         self.dictionary.new_instant()
 
-    def _finish(self) -> list[CanFrame]:
-        """Let writes take effect, then hand over the frames."""
+    def _collect_frames(self) -> list[CanFrame]:
+        """Apply written parameters, then return the frames to send."""
         context = self._context
         if self.dictionary.changed:
             changed = frozenset(self.dictionary.changed)
@@ -258,23 +259,23 @@ class CanopenSlave:
             self._silence = None
 
     def _route(self) -> None:
-        """Say which identifier goes where; everything but LSS needs a node-ID."""
+        """Say which CAN ID goes where; everything but LSS needs a node-ID."""
         routes: dict[int, list[Handler]] = {}
 
-        def add(identifier: int | None, handler: Handler) -> None:
-            if identifier is not None:
-                routes.setdefault(identifier, []).append(handler)
+        def add(can_id: int | None, handler: Handler) -> None:
+            if can_id is not None:
+                routes.setdefault(can_id, []).append(handler)
 
         add(LSS_MASTER, self._on_lss)
         if self.node_id != UNCONFIGURED:
             add(NMT, self._on_nmt)
-            add(self.sync.identifier, self._on_sync)
-            add(self.time.identifier, self._on_time)
+            add(self.sync.can_id, self._on_sync)
+            add(self.time.can_id, self._on_time)
             add(SDO_RECEIVE + self.node_id, self._on_sdo)
             for other in range(1, 128):
                 add(ERROR_CONTROL + other, self._on_error_control)
             for pdo in self.pdos.receiving:
-                add(pdo.identifier, self._pdo_handler(pdo.receive))
+                add(pdo.can_id, self._pdo_handler(pdo.receive))
         self._routes = routes
 
     def _pdo_handler(self, receive: Callable[[bytes], None]) -> Handler:
@@ -359,7 +360,7 @@ class CanopenSlave:
             self.lss.pending_node_id = node_id
 
     def _initialise(self, *, application: bool) -> None:
-        """Pass through INITIALISING: parameters at their stored values, boot-up message, PRE-OPERATIONAL."""
+        """Load the stored parameters, send the boot-up message, enter PRE-OPERATIONAL."""
         context = self._context
         context.state = NmtState.INITIALISING
         context.node_id = self.lss.pending_node_id
@@ -377,7 +378,10 @@ class CanopenSlave:
         context.report(EventKind.STATE, context.state)
 
     def _configure(self) -> None:
-        """Take over the parameters of the communication profile; refuse stored ones that no longer fit."""
+        """Apply the parameters of the communication profile.
+
+        Replace an invalid stored PDO mapping by the defaults.
+        """
         try:
             self.pdos.configure(everything=True)
         except SdoAbortError as refusal:

@@ -1,4 +1,4 @@
-"""Where a node keeps its parameters over a restart: in memory, or in a file that is replaced as a whole."""
+"""Storage of a node's parameters: in memory, or in a file that is replaced atomically."""
 
 from __future__ import annotations
 
@@ -23,20 +23,26 @@ class StorageError(ProtocolError):
 
 
 class ParameterStorage(Protocol):
-    """Keeps groups of named values over a restart."""
+    """Keeps groups of named values across a restart."""
 
     def load(self, group: str) -> dict[str, bytes]:
-        """Return a group's values, empty if none are stored; `StorageError` if they are damaged."""
+        """Return a group's values, empty if none are stored.
+
+        Raises `StorageError` if they are damaged.
+        """
 
     def save(self, group: str, values: Mapping[str, bytes]) -> None:
-        """Replace a group's values as a whole; `StorageError` if that fails, the old ones then stay."""
+        """Replace all values of a group.
+
+        Raises `StorageError` if that fails; the old values then remain.
+        """
 
     def clear(self, group: str) -> None:
-        """Forget a group's values."""
+        """Delete a group's values."""
 
 
 class MemoryStorage:
-    """Keeps values for as long as the object lives."""
+    """Keeps values for the lifetime of the object."""
 
     def __init__(self) -> None:
         self._groups: dict[str, dict[str, bytes]] = {}
@@ -50,7 +56,7 @@ class MemoryStorage:
         self._groups[group] = dict(values)
 
     def clear(self, group: str) -> None:
-        """Forget a group's values."""
+        """Delete a group's values."""
         self._groups.pop(group, None)
 
 
@@ -60,15 +66,18 @@ class FileStorage:
     Parameters
     ----------
     path
-        The file; its folder is made at the first save. One process at a time may use it (the emulator locks its
-        state folder): the new file always has the same name, so that a killed save leaves nothing for good.
+        The file; the first save creates its folder. One process at a time may use it (the emulator locks its state
+        folder): the temporary file has a fixed name, so that an interrupted save leaves at most one.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def load(self, group: str) -> dict[str, bytes]:
-        """Return a group's values; `StorageError` if the file cannot be read or its checksum is wrong."""
+        """Return a group's values.
+
+        Raises `StorageError` if the file cannot be read or its checksum is wrong.
+        """
         values = self._read().get(group, {})
         return {name: bytes.fromhex(value) for name, value in values.items()}
 
@@ -79,7 +88,7 @@ class FileStorage:
         self._write(groups)
 
     def clear(self, group: str) -> None:
-        """Forget a group's values."""
+        """Delete a group's values."""
         groups = self._readable()
         if groups.pop(group, None) is not None or not self._intact():
             self._write(groups)
@@ -131,7 +140,7 @@ def _checksum(groups: Mapping[str, Mapping[str, str]]) -> int:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Let the renaming reach the disk."""
+    """Flush the renaming to the disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

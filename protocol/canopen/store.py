@@ -1,4 +1,4 @@
-"""Store and restore of parameters: 1010h and 1011h with their signatures (CiA 301)."""
+"""Store and restore parameters: objects 1010h and 1011h with their signatures (CiA 301)."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ GROUPS: Final = {2: COMMUNICATION, 3: APPLICATION}
 SAVE: Final = b"save"
 LOAD: Final = b"load"
 ON_COMMAND: Final = b"\x01\0\0\0"
-"""What reading 1010h and 1011h tells: the node stores on command, not by itself."""
+"""Value read from 1010h and 1011h: the node stores on command, not autonomously."""
 
 
 class ParameterStore:
-    """Keeps parameters over a restart, and gives the defaults back.
+    """Saves parameters across a restart, and restores the defaults.
 
     Parameters
     ----------
     context
         Shared by the node.
     storage
-        Where the values are kept.
+        Storage of the values.
     """
 
     def __init__(self, context: Context, storage: ParameterStorage) -> None:
         self._context = context
         self._storage = storage
         self.on_save: Callable[[], Deferred | None] | None = None
-        """Stores the parameters that the application keeps itself; `SdoAbortError` if it cannot."""
+        """Saves the application's own parameters; raises `SdoAbortError` if it cannot."""
         self.on_restore: Callable[[], Deferred | None] | None = None
-        """Lets the application's own parameters be the defaults from its next restart on."""
+        """Resets the application's own parameters to the defaults at its next restart."""
         for index, action in ((STORE, self._store), (RESTORE, self._restore)):
             for subindex in (ALL, *GROUPS):
                 entry = context.dictionary.find(index, subindex)
@@ -48,7 +48,7 @@ class ParameterStore:
                 entry.persistent = False
 
     def load(self, group: str) -> None:
-        """Set the group's entries to their defaults, then to what is stored of them."""
+        """Set the group's entries to their defaults, then to their stored values."""
         self.set_defaults(group)
         for name, value in self._stored(group).items():
             entry = self._named(name)
@@ -56,7 +56,7 @@ class ParameterStore:
                 entry.value = value
 
     def set_defaults(self, group: str) -> None:
-        """Set the group's entries to their defaults; the store stays as it is."""
+        """Set the group's entries to their defaults; leave the stored values unchanged."""
         above = range(COMMUNICATION_INDICES.stop, 0x10000)
         indices = COMMUNICATION_INDICES if group == COMMUNICATION else above
         self._context.dictionary.load_defaults(indices, self._context.node_id)
@@ -69,11 +69,11 @@ class ParameterStore:
         return int.from_bytes(values["node_id"], "little"), int.from_bytes(values["bit_rate"], "little")
 
     def save_lss(self, node_id: int, bit_rate: int) -> None:
-        """Keep node-ID and bit rate, bit/s; `StorageError` if they cannot be kept."""
+        """Save node-ID and bit rate, bit/s. Raises `StorageError` if that fails."""
         self._storage.save(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")})
 
     def clear_lss(self) -> None:
-        """Forget what LSS stored; `StorageError` if that fails."""
+        """Delete what LSS stored. Raises `StorageError` if that fails."""
         self._storage.clear(LSS)
 
     def _stored(self, group: str) -> dict[str, bytes]:
@@ -113,10 +113,13 @@ class ParameterStore:
         try:
             self._storage.save(group, values)
         except StorageError as error:
-            self._failed(error)
+            self._abort_on_storage_error(error)
 
     def _differs(self, entry: Entry) -> bool:
-        """Tell whether a value is not its default: a default that follows the node-ID goes on doing so."""
+        """Return whether a value differs from its default.
+
+        A default relative to the node-ID stays relative.
+        """
         return entry.value != default_bytes(entry.variable, self._context.node_id)
 
     def _restore(self, subindex: int, data: bytes) -> Deferred | None:
@@ -128,12 +131,12 @@ class ParameterStore:
                 try:
                     self._storage.clear(group)
                 except StorageError as error:
-                    self._failed(error)
+                    self._abort_on_storage_error(error)
                 if group == APPLICATION and self.on_restore is not None:
                     deferred = self.on_restore()
         self._context.report(EventKind.RESTORED, subindex)
         return deferred
 
-    def _failed(self, error: StorageError) -> None:
+    def _abort_on_storage_error(self, error: StorageError) -> None:
         self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
         raise SdoAbortError(AbortCode.HARDWARE, str(error))

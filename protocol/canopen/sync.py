@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_can_id, check_replacement
 from starhil.protocol.canopen.context import Context
 from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
 
@@ -16,7 +16,7 @@ LARGEST_OVERFLOW: Final = 240
 
 
 class SyncService:
-    """Tells valid SYNC messages from others, and produces them if bit 30 of 1005h is set."""
+    """Validates SYNC messages, and produces them if bit 30 of 1005h is set."""
 
     def __init__(self, context: Context, emergency: EmergencyProducer) -> None:
         self._context = context
@@ -30,17 +30,20 @@ class SyncService:
         self.next_deadline: float | None = None
 
     @property
-    def identifier(self) -> int:
-        """Identifier of the SYNC message."""
+    def can_id(self) -> int:
+        """CAN ID of the SYNC message."""
         return self._cob_id.number() & ID_MASK
 
     def configure(self) -> None:
-        """Begin anew with the present parameters: counter at its start, production from one period on."""
+        """Reset the counter, and produce the first SYNC after one period."""
         self._counter = 0
         self._schedule(self._cob_id.number(), self._period.number())
 
     def receive(self, data: bytes) -> int | None:
-        """Return the counter of a valid SYNC (0 if it carries none), or None; report a wrong length."""
+        """Return the counter of a valid SYNC (0 if it carries none), or None.
+
+        Report a wrong length.
+        """
         if not self._context.communicates:
             return None
         if len(data) != (1 if self._overflow.number() else 0):
@@ -62,11 +65,11 @@ class SyncService:
         overflow = self._overflow.number()
         if overflow:
             self._counter = self._counter % overflow + 1
-        self._context.send(self.identifier, bytes([self._counter]) if overflow else b"")
+        self._context.send(self.can_id, bytes([self._counter]) if overflow else b"")
         return self._counter if overflow else 0
 
     def restart_counter(self) -> None:
-        """Let the next counter be 1: the node has left STOPPED."""
+        """Restart the counter at 1, as after leaving STOPPED."""
         self._counter = 0
 
     def _schedule(self, cob_id: int, period_us: int) -> None:
@@ -75,7 +78,7 @@ class SyncService:
 
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_identifier(new)
+        check_can_id(new)
         check_replacement(old, new, lives_before=bool(old & BIT_30), lives_after=bool(new & BIT_30))
         self._counter = 0
         self._schedule(new, self._period.number())

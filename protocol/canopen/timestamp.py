@@ -1,11 +1,11 @@
-"""TIME consumer: the master's time of day becomes the device's (CiA 301: 1012h, TIME_OF_DAY)."""
+"""TIME consumer: the device receives the master's time of day (CiA 301: 1012h, TIME_OF_DAY)."""
 
 from __future__ import annotations
 
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_identifier, check_replacement
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_can_id, check_replacement
 from starhil.protocol.canopen.context import Context, EventKind
 
 COB_ID: Final = (0x1012, 0)
@@ -17,7 +17,7 @@ DAY_MS: Final = 86_400_000
 
 
 def decode_time_of_day(data: bytes) -> float | None:
-    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of milliseconds, 16 of days), None if it is no time."""
+    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of ms, 16 of days), or None."""
     if len(data) != 6:
         return None
     milliseconds = int.from_bytes(data[:4], "little") & 0x0FFFFFFF
@@ -41,20 +41,20 @@ class TimeConsumer:
         self._cob_id.writer = self._check_cob_id
 
     @property
-    def identifier(self) -> int | None:
-        """Identifier of the TIME message, None while it is not consumed."""
+    def can_id(self) -> int | None:
+        """CAN ID of the TIME message, None while it is not consumed."""
         value = self._cob_id.number()
         return value & ID_MASK if value & CONSUMES else None
 
     def receive(self, data: bytes) -> None:
-        """Take a TIME message; one that is no time of day is ignored."""
+        """Process a TIME message; ignore one that is not a valid time of day."""
         unix_s = decode_time_of_day(data)
         if unix_s is not None and self._context.communicates:
             self._context.report(EventKind.TIME, unix_s)
 
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_identifier(new)
+        check_can_id(new)
         if new & BIT_30:
             raise SdoAbortError(AbortCode.VALUE_RANGE, "this node produces no TIME message")
         check_replacement(old, new, lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES))

@@ -1,4 +1,4 @@
-"""The interface definition in other people's formats, each made by one module from the rows alone."""
+"""Exports of the interface definition; one module per format."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ FORMATS: Final[Mapping[str, str]] = MappingProxyType(
         "cosmos": "command and telemetry definition of OpenC3 COSMOS",
     }
 )
-"""Names of the formats and what they are."""
+"""Description of each format by name."""
 
 
 def export(icd: InterfaceDefinition, name: str) -> str:
-    """Return the interface definition in the named format. Raises ProtocolError for a name that is none."""
+    """Return the interface definition in the named format.
+
+    Raises ProtocolError for an unknown name.
+    """
     if name not in FORMATS:
         raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(FORMATS)}")
     module = import_module(f"starhil.protocol.export.{name}")

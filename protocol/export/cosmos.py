@@ -1,7 +1,7 @@
 """The interface definition as command and telemetry text of OpenC3 COSMOS.
 
-A packet is the identifier byte followed by the row's data, as the serial framing carries it between start and end.
-COSMOS cuts off the fraction of a raw value that it computes, so a scaled parameter may go out one step too small.
+A packet is the id followed by the row's data, as between start and end of a serial message.
+COSMOS truncates the raw values that it computes, so a scaled parameter may be sent one step too small.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ID_BITS: Final = 8
 
 
 def render(icd: InterfaceDefinition) -> str:
-    """Return the text of the definition; commands and telemetry in one file."""
+    """Return commands and telemetry as one text."""
     return "\n".join(_lines(icd)) + "\n"
 
 
@@ -78,7 +78,7 @@ def _type(field: Field) -> str:
 
 
 def _limits(field: Field) -> str:
-    """Least, greatest and default value of a command parameter."""
+    """Return the lowest, highest and default value of a command parameter."""
     if field.slot.type == "bytes":
         return f" 0x{bytes(field.size).hex()}" if field.kind == "bytes" else ' ""'
     if field.enum is not None:

@@ -1,8 +1,8 @@
 """The interface definition as a CAN database (DBC).
 
-Each row gives its frames on the bus between the default addresses: request, telemetry and refusal, or telecommand,
-acknowledge and refusal. A message longer than 8 bytes describes the data after its segments have been joined (7 bytes
-and a counter each), as DBC files do for other transport protocols.
+Each row yields its messages between the default addresses: request, telemetry and NACK, or telecommand, ACK and NACK.
+A message longer than 8 bytes describes the data after its segments (7 bytes and a counter each) have been joined, as is
+usual in DBC files for transport protocols.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-from starhil.protocol.can_framing import MAX_FRAME_DATA, CanIdentifier, MessageType
+from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.icd import InterfaceDefinition
 
 EXTENDED: Final = 0x80000000
-"""Flag of 29-bit identifiers in DBC files."""
+"""Flag of a 29-bit CAN ID in DBC files."""
 
 _SIGNED: Final = ("i8", "i16", "i32", "i64")
 
@@ -26,7 +26,7 @@ _SIGNED: Final = ("i8", "i16", "i32", "i64")
 class _Message:
     """One message of the database."""
 
-    identifier: int
+    can_id: int
     name: str
     size: int
     sender: str
@@ -46,28 +46,28 @@ def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
     yield from (f'VERSION "{icd.name} {icd.version}"', "", "NS_ :", "", "BS_:", "", "BU_: OBC SENSOR")
     for message in messages:
         yield ""
-        yield f"BO_ {message.identifier | EXTENDED} {message.name}: {message.size} {message.sender}"
+        yield f"BO_ {message.can_id | EXTENDED} {message.name}: {message.size} {message.sender}"
         for signal in message.signals:
             yield from _signals(signal, "OBC" if message.sender == "SENSOR" else "SENSOR")
     yield ""
     yield f'CM_ "{_text(icd.doc)} Messages longer than 8 bytes describe the data after their segments are joined.";'
     for message in messages:
-        yield f'CM_ BO_ {message.identifier | EXTENDED} "{_text(message.doc)}";'
+        yield f'CM_ BO_ {message.can_id | EXTENDED} "{_text(message.doc)}";'
         for signal in message.signals:
             if signal.slot.type != "bytes":
-                yield f'CM_ SG_ {message.identifier | EXTENDED} {signal.name} "{_text(signal.doc)}";'
+                yield f'CM_ SG_ {message.can_id | EXTENDED} {signal.name} "{_text(signal.doc)}";'
     yield 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";'
     yield 'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";'
     for message in messages:
         for signal in message.signals:
             if signal.enum is not None:
                 values = " ".join(f'{value} "{name}"' for name, value in signal.enum.values.items())
-                yield f"VAL_ {message.identifier | EXTENDED} {signal.name} {values} ;"
+                yield f"VAL_ {message.can_id | EXTENDED} {signal.name} {values} ;"
     for message in messages:
         for signal in message.signals:
             if signal.kind == "float":
                 precision = 1 if signal.type == "f32" else 2
-                yield f"SIG_VALTYPE_ {message.identifier | EXTENDED} {signal.name} : {precision};"
+                yield f"SIG_VALTYPE_ {message.can_id | EXTENDED} {signal.name} : {precision};"
 
 
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:
@@ -78,31 +78,33 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     code = tuple(_at_start(field) for field in error)
     long = row.size > MAX_FRAME_DATA
     if row.kind == "telemetry":
-        asked, answered = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
+        request_type, reply_type = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
         if long:
-            answered = MessageType.TELEMETRY_EXTENDED
-        yield _Message(_id(asked, *to_device), f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
-        yield _Message(_id(answered, *to_host), f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
-        refused = MessageType.TELEMETRY_NACK
-    else:
-        asked = MessageType.TELECOMMAND_EXTENDED if long else MessageType.TELECOMMAND
-        yield _Message(_id(asked, *to_device), f"TC_{row.name}", row.size, "OBC", signals, row.doc)
-        answered = MessageType.TELECOMMAND_ACK
+            reply_type = MessageType.TELEMETRY_EXTENDED
         yield _Message(
-            _id(answered, *to_host), f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}."
+            _id(request_type, *to_device), f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}"
         )
-        refused = MessageType.TELECOMMAND_NACK
-    yield _Message(_id(refused, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
+        yield _Message(_id(reply_type, *to_host), f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
+        nack_type = MessageType.TELEMETRY_NACK
+    else:
+        request_type = MessageType.TELECOMMAND_EXTENDED if long else MessageType.TELECOMMAND
+        yield _Message(_id(request_type, *to_device), f"TC_{row.name}", row.size, "OBC", signals, row.doc)
+        reply_type = MessageType.TELECOMMAND_ACK
+        yield _Message(
+            _id(reply_type, *to_host), f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}."
+        )
+        nack_type = MessageType.TELECOMMAND_NACK
+    yield _Message(_id(nack_type, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
 
 
 def _at_start(field: Field) -> Field:
-    """Return the field as the first byte of a message of its own."""
+    """Return the field as the first byte of a separate message."""
     slot = type(field.slot)(0, field.slot.type, 0, field.slot.size)
     return Field(field.name, field.kind, slot, enum=field.enum, provenance=field.provenance, doc=field.doc)
 
 
 def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:
-    return CanIdentifier(kind, row_id, source, destination).pack()
+    return CanId(kind, row_id, source, destination).pack()
 
 
 def _signals(field: Field, receiver: str) -> Iterator[str]:
@@ -129,5 +131,5 @@ def _limits(field: Field) -> tuple[float, float]:
 
 
 def _text(text: str) -> str:
-    """Text without the quotes that would end it."""
+    """Return text with its double quotes replaced."""
     return text.replace('"', "'")

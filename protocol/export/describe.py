@@ -1,4 +1,4 @@
-"""Rows and fields in words, for the formats that people read."""
+"""Descriptions of rows and fields, shared by the human-readable formats."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ INTRODUCTION: Final = (
         "github.com/CalgaryToSpace/CTS-SAT-1-OBC-Firmware, RADSAT-SK is github.com/USST-RADSAT-SK/software-and-command."
     ),
 )
-"""Paragraphs that stand before the tables."""
+"""Paragraphs before the tables."""
 
 
 def number(value: float) -> str:
-    """Write a number without digits that say nothing."""
+    """Format a number with up to 10 significant digits."""
     return f"{value:.10g}"
 
 
 def title(row: Row) -> str:
-    """Heading of a row: its identifier and name."""
+    """Return the heading of a row: id and name."""
     return f"{row.id} (0x{row.id:02X}) {row.name}"
 
 
 def facts(row: Row) -> str:
-    """Size and source of a row."""
+    """Return size and source of a row."""
     size = f"{row.size} byte{'' if row.size == 1 else 's'}" if row.size else "No data"
     return f"{size}, {row.provenance}{f': {row.source}' if row.source else ''}"
 
 
 def beyond(row: Row, field: Field) -> str:
-    """What telemetry carries of a number beyond its range: clipped, wraps, or nothing to say."""
+    """Return what telemetry does with a number beyond its range: "clipped", "wraps" or nothing."""
     if row.kind != "telemetry" or field.kind not in ("integer", "float", "bits"):
         return ""
     if field.wrap:
@@ -62,7 +62,7 @@ def beyond(row: Row, field: Field) -> str:
 
 
 def meaning(row: Row, field: Field) -> str:
-    """Text of a field with what becomes of a number beyond its range, for formats without a column for it."""
+    """Return text and behaviour beyond the range, for formats without a range column."""
     low, high = (number(limit) for limit in field.physical_limits) if beyond(row, field) else ("", "")
     match beyond(row, field):
         case "wraps":
@@ -79,7 +79,7 @@ def field_cells(row: Row, field: Field) -> tuple[str, ...]:
     if field.parameter is not None:
         meaning = f"{meaning} Parameter {field.parameter}."
     return (
-        _place(field),
+        _position(field),
         field.name or "unused",
         _type(field),
         field.unit,
@@ -120,7 +120,7 @@ def sections(icd: InterfaceDefinition) -> Iterator[tuple[str, list[Row]]]:
     yield "Telemetry", [row for row in icd.rows if row.kind == "telemetry"]
 
 
-def _place(field: Field) -> str:
+def _position(field: Field) -> str:
     if not field.width:
         last = field.offset + field.size - 1
         return str(field.offset) if field.size == 1 else f"{field.offset}–{last}"
@@ -148,10 +148,10 @@ def _value(field: Field) -> str:
 
 
 def _range(row: Row, field: Field) -> str:
-    fate = beyond(row, field)
-    if fate:
+    behaviour = beyond(row, field)
+    if behaviour:
         low, high = field.physical_limits
-        return f"{number(low)} to {number(high)}, {fate}"
+        return f"{number(low)} to {number(high)}, {behaviour}"
     if field.kind not in ("integer", "float", "bits") or (field.minimum is None and field.maximum is None):
         return ""
     if field.minimum == field.maximum:

@@ -1,4 +1,4 @@
-"""The CANopen node's electronic data sheet."""
+"""The interface definition as the EDS of the CANopen node."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from starhil.protocol.icd import InterfaceDefinition
 
 
 def render(icd: InterfaceDefinition) -> str:
-    """Return the text of the data sheet of the node that serves this definition."""
+    """Return the EDS of the node that serves this definition."""
     return build_eds(build_dictionary(icd))

@@ -1,4 +1,4 @@
-"""The interface definition as one HTML page without outside parts."""
+"""The interface definition as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _anchor(section: Section) -> str:
 
 
 def _text(text: str) -> str:
-    """Escape a text, with what stands between backticks as code."""
+    """Escape a text and mark what is between backticks as code."""
     return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
 
 

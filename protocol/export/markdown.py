@@ -69,7 +69,7 @@ def _contents(icd: InterfaceDefinition) -> Iterator[str]:
 
 
 def _link(row: Row) -> str:
-    """Link to a row's heading, by the anchor that GitHub and others make of it."""
+    """Return a link to a row's heading, by the anchor that GitHub and others generate."""
     anchor = "".join(letter for letter in describe.title(row).lower() if letter.isalnum() or letter in " -_")
     return f"[{row.name}](#{anchor.replace(' ', '-')})"
 

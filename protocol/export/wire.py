@@ -1,4 +1,4 @@
-"""How the rows travel, in words and tables: serial framing, CAN identifiers, CANopen objects and PDOs."""
+"""Documentation of the links, as sections: serial framing, CAN IDs, CANopen objects and PDOs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from starhil.protocol.values import Section
 _TELEMETRY: Final = 0x80
 _TELECOMMAND: Final = 0x60
 _DATA: Final = 0xDA
-_WORDS: Final = {
+_PLACEHOLDERS: Final = {
     f"{_TELEMETRY:02X}": "id",
     f"{_TELECOMMAND:02X}": "id",
     f"{_DATA:02X}": "data",
     f"{ErrorCode.INVALID_PARAMETER:02X}": "code",
 }
-"""Bytes of the example messages and what they stand for."""
+"""Placeholder names for bytes of the example messages."""
 
 
 def sections() -> tuple[Section, ...]:
@@ -38,12 +38,12 @@ def _serial() -> Section:
         Reply(ReplyKind.UNSOLICITED, _TELEMETRY, data),
         Reply(ReplyKind.EVENT, _TELEMETRY, data),
     )
-    request = _form(encode_request(Request.of(_TELECOMMAND, data)))
+    request = _format_message(encode_request(Request.of(_TELECOMMAND, data)))
     text = (
         f"A request is {request}, with every byte 1F of the data doubled; 8 data bits, no parity, 1 stop bit. "
         "The form of the replies is the parameter serial_dialect; the code is a number of the enumeration error_code."
     )
-    whom = (
+    choice = (
         "Dialect a is for OBC software written for the CubeComputer: a reply repeats the identifier. Dialect b is for software that "
         "talks to a stand-alone node: a reply begins with the data, and only the request says what they are. Dialect c is "
         "generation 2. Nothing in a message names its dialect: with b in place of a, each value is read from the byte after its own and "
@@ -51,7 +51,7 @@ def _serial() -> Section:
     )
     return Section(
         "Serial line",
-        (text, whom),
+        (text, choice),
         ("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
         tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
     )
@@ -60,12 +60,12 @@ def _serial() -> Section:
 def _reply(reply: Reply, dialect: Dialect) -> str:
     if reply.kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT) and not dialect.supports_unsolicited:
         return "none"
-    return _form(encode_reply(reply, dialect))
+    return _format_message(encode_reply(reply, dialect))
 
 
-def _form(message: bytes) -> str:
-    """Write an example message with words in place of its own bytes."""
-    return " ".join(_WORDS.get(byte, byte) for byte in message.hex(" ").upper().split())
+def _format_message(message: bytes) -> str:
+    """Format an example message, with placeholders for its variable bytes."""
+    return " ".join(_PLACEHOLDERS.get(byte, byte) for byte in message.hex(" ").upper().split())
 
 
 def _can() -> Section:

@@ -1,6 +1,6 @@
 """The interface definition as XTCE 1.2 (XML Telemetric and Command Exchange).
 
-A packet is the identifier byte followed by the row's data, as the serial framing carries it between start and end.
+A packet is the id followed by the row's data, as between start and end of a serial message.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _LITTLE: Final = "leastSignificantByteFirst"
 
 
 def render(icd: InterfaceDefinition) -> str:
-    """Return the XML text. Raises IcdError for a bit field that runs across bytes, which XTCE cannot say in this order."""
+    """Return the XML text. Raises IcdError for bits across bytes, which XTCE cannot express."""
     system = ET.Element(
         "SpaceSystem", {"name": _identifier(icd.name), "xmlns": NAMESPACE, "shortDescription": icd.doc}
     )
@@ -40,7 +40,7 @@ def render(icd: InterfaceDefinition) -> str:
 
 
 def wire_order(row: Row) -> Iterator[Field]:
-    """Fields of a row in the order of their bits on the wire, most significant bit of each byte first."""
+    """Yield the fields of a row in wire order, most significant bit of each byte first."""
     for slot in row.slots:
         fields = [field for field in row.fields if field.slot is slot]
         for byte in range(slot.size) if fields[0].width else (0,):
@@ -125,7 +125,7 @@ def _entries(container: ET.Element, kind: str, names: Iterable[str]) -> None:
 
 
 def _type(types: ET.Element, what: str, name: str, field: Field) -> None:
-    """Write the type of a parameter or argument."""
+    """Add the type of a parameter or argument."""
     about = {"name": f"{name}_type"}
     if field.slot.type == "bytes":
         kind = ET.SubElement(types, f"Binary{what}Type", about)
@@ -160,7 +160,7 @@ def _type(types: ET.Element, what: str, name: str, field: Field) -> None:
 
 
 def _integer(kind: ET.Element, field: Field) -> None:
-    """Write the unit and the encoding of an integer, with its scale."""
+    """Add the unit, encoding and scale of an integer."""
     _unit(kind, field)
     encoding = ET.SubElement(
         kind,
@@ -195,8 +195,6 @@ def _unit(kind: ET.Element, field: Field) -> None:
 
 
 def _initial(field: Field) -> str:
-    if isinstance(field.default, bool):
-        return str(field.default)
     return str(field.default)
 
 
@@ -213,10 +211,10 @@ def _short(doc: str) -> dict[str, str]:
 
 
 def _name(row: Row, field: Field, index: int) -> str:
-    """Name of a field that is its own in the whole definition."""
+    """Return a name for a field that is unique in the definition."""
     return f"{row.name}_{field.name or f'unused_{index}'}"
 
 
 def _identifier(text: str) -> str:
-    """Text as an XTCE name: no dots, slashes, colons or spaces."""
+    """Return text as an XTCE name, without dots, slashes, colons and spaces."""
     return "".join("_" if character in ".:/ " else character for character in text)

@@ -1,4 +1,4 @@
-"""What every transport is: start, send without blocking, close; counters; and how to come back after a loss."""
+"""Base classes of all transports: non-blocking send, counters, and reconnection after a loss."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ _LOGGER: Final = logging.getLogger("starhil.transport")
 Item = TypeVar("Item")
 
 Receive = Callable[[Item], None]
-Complain = Callable[[ProtocolError], None]
+ReportError = Callable[[ProtocolError], None]
 
 
 class TransportError(ProtocolError):
-    """A port or bus that cannot be had, or was lost; the text says which, why and the remedy."""
+    """A port or bus that is not available or was lost.
+
+    The text names it, the reason and the remedy.
+    """
 
 
 @dataclass(slots=True)
@@ -31,9 +34,9 @@ class Statistics:
     sent: int = 0
     received: int = 0
     dropped: int = 0
-    """Not sent because the peer does not read, or the port is gone."""
+    """Items not sent because the peer does not read or the port is gone."""
     errors: int = 0
-    """Failures that the error callback was told."""
+    """Failures reported to the error callback."""
     reconnects: int = 0
     """Times that a lost port or bus came back."""
 
@@ -43,16 +46,16 @@ class Transport(ABC, Generic[Item]):
 
     def __init__(self, description: str) -> None:
         self.description = description
-        """What was taken, as a specification that opens the same again; true once started."""
+        """Specification that opens the same port again; final once started."""
         self.statistics: Final = Statistics()
         self._on_receive: Receive[Item] | None = None
-        self._on_error: Complain | None = None
+        self._on_error: ReportError | None = None
 
-    async def start(self, on_receive: Receive[Item], on_error: Complain | None = None) -> None:
-        """Open the port and hand what arrives to `on_receive`.
+    async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
+        """Open the port and pass what arrives to `on_receive`.
 
-        Raises TransportError if the port cannot be had now; what happens later goes to `on_error`, while the
-        transport tries to come back by itself.
+        Raises TransportError if the port is not available now. Later failures go to `on_error`, and the transport
+        reconnects automatically.
         """
         self._on_receive = on_receive
         self._on_error = on_error
@@ -68,32 +71,32 @@ class Transport(ABC, Generic[Item]):
 
     @abstractmethod
     async def drain(self) -> None:
-        """Wait until what was queued has left."""
+        """Wait until the queue has been sent."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Give the port back; may be called twice."""
+        """Close the port; may be called twice."""
 
     def _receive(self, item: Item) -> None:
         if self._on_receive is not None:
             self._on_receive(item)
 
-    def _complain(self, text: str) -> None:
+    def _report_error(self, text: str) -> None:
         self.statistics.errors += 1
         if self._on_error is not None:
             self._on_error(TransportError(text))
 
 
-class ReturningTransport(Transport[Item]):
-    """A port or bus that may vanish: tells so once, then tries to get it back with growing pauses."""
+class ReconnectingTransport(Transport[Item]):
+    """A port or bus that may disappear: reports the loss once, then retries with growing pauses."""
 
-    what: ClassVar[str]
-    """Kind of port, the first word of every message."""
+    kind: ClassVar[str]
+    """Kind of port, the first word of every error text."""
 
     def __init__(self, description: str) -> None:
         super().__init__(description)
         self._closing = False
-        self._comeback: asyncio.Task[None] | None = None
+        self._reconnection: asyncio.Task[None] | None = None
 
     async def _open(self) -> None:
         await self._connect()
@@ -104,26 +107,26 @@ class ReturningTransport(Transport[Item]):
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Let go of the port and of what was waiting for it, whatever its state."""
+        """Release the port and drop its queue, in any state."""
 
     def _lost(self, why: str) -> None:
-        """Note that the port is gone."""
-        if self._closing or self._comeback is not None:
+        """Disconnect, report the loss once and start to reconnect."""
+        if self._closing or self._reconnection is not None:
             return
-        self._release()
-        self._complain(f"{self.what} {self.description}: lost: {why}; waiting for it to come back")
-        self._comeback = asyncio.get_running_loop().create_task(self._come_back())
+        self._disconnect_safely()
+        self._report_error(f"{self.kind} {self.description}: lost: {why}; waiting for it to come back")
+        self._reconnection = asyncio.get_running_loop().create_task(self._reconnect())
 
-    def _release(self) -> None:
-        """Disconnect; a port that is half gone may resist, which is reported."""
+    def _disconnect_safely(self) -> None:
+        """Disconnect; report a failure, which a half-lost port may cause."""
         try:
             self._disconnect()
-        except Exception as error:  # noqa: BLE001 (it is to be opened again, or left, all the same)
-            self._complain(
-                f"{self.what} {self.description}: closing: {type(error).__name__}: {reason(error)}"
+        except Exception as error:  # noqa: BLE001 (the port is opened again or abandoned in any case)
+            self._report_error(
+                f"{self.kind} {self.description}: closing: {type(error).__name__}: {reason(error)}"
             )
 
-    async def _come_back(self) -> None:
+    async def _reconnect(self) -> None:
         pause = Backoff()
         reported = ""
         while True:
@@ -132,37 +135,37 @@ class ReturningTransport(Transport[Item]):
                 await self._connect()
             except ProtocolError:
                 continue
-            except Exception as error:  # noqa: BLE001 (whatever it is, the port may come back)
-                self._release()
+            except Exception as error:  # noqa: BLE001 (after any failure the port may come back)
+                self._disconnect_safely()
                 text = f"{type(error).__name__}: {reason(error)}"
-                if text != reported:  # once, not with every try
+                if text != reported:  # once, not at every attempt
                     reported = text
-                    self._complain(f"{self.what} {self.description}: not back: {text}; still trying")
+                    self._report_error(f"{self.kind} {self.description}: not back: {text}; still trying")
                 continue
             self.statistics.reconnects += 1
-            self._comeback = None
-            _LOGGER.warning("%s %s: back", self.what, self.description)
+            self._reconnection = None
+            _LOGGER.warning("%s %s: back", self.kind, self.description)
             return
 
     async def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._closing = True
-        if self._comeback is not None:
-            self._comeback.cancel()
+        if self._reconnection is not None:
+            self._reconnection.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await self._comeback
-            self._comeback = None
-        self._release()
+                await self._reconnection
+            self._reconnection = None
+        self._disconnect_safely()
 
 
 class Backoff:
-    """Waiting times between tries: doubling from the first to the last."""
+    """Pauses between attempts: doubling from the first to the last."""
 
     def __init__(self, first_s: float = 0.05, last_s: float = 1.0) -> None:
         self._last_s = last_s
         self._next_s = first_s
 
     def next(self) -> float:
-        """Return the time to wait now (s)."""
+        """Return the next pause (s)."""
         wait, self._next_s = self._next_s, min(2 * self._next_s, self._last_s)
         return wait

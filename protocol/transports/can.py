@@ -1,11 +1,9 @@
-"""CAN transports by specification: kernel CAN, the TCP hub, and python-can's other buses."""
+"""Choice of the CAN transport: kernel CAN, the TCP hub, or another bus of python-can."""
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import fcntl
-import logging
 import socket
 import struct
 from functools import partial
@@ -15,13 +13,10 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.errors import ProtocolError
-from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT, CanHub
+from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT
 from starhil.protocol.transports.base import Transport, TransportError
-from starhil.protocol.transports.hub_client import HubTransport
+from starhil.protocol.transports.hub_client import AutoHubTransport, HubTransport
 from starhil.protocol.transports.python_can import OpenBus, PythonCanTransport
-
-_LOGGER: Final = logging.getLogger("starhil.transport")
 
 CanTransport = Transport[CanFrame]
 
@@ -37,7 +32,7 @@ _FORMS: Final = "auto, a kernel interface (vcan0), socketcand:HOST:PORT/BUS, vir
 
 
 def kernel_can_is_up(name: str) -> bool:
-    """Whether the kernel has CAN and this interface is up."""
+    """Return whether the kernel has CAN and this interface is up."""
     family = getattr(socket, "AF_CAN", None)
     if family is None:
         return False
@@ -57,7 +52,7 @@ def open_can(
     hub_host: str = DEFAULT_HOST,
     hub_port: int = DEFAULT_PORT,
 ) -> CanTransport:
-    """Make the CAN transport that a specification names; it is opened by `start`.
+    """Return the CAN transport that a specification names; `start` opens it.
 
     Parameters
     ----------
@@ -66,12 +61,12 @@ def open_can(
         answers there), a kernel interface such as `vcan0` or `socketcan:can0`, `socketcand:HOST:PORT/BUS`,
         `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only), or `slcan:PORT`.
     bitrate:
-        Bit rate (bit/s) of buses whose adapter is set by us (slcan).
+        Bit rate (bit/s) of adapters that the transport configures (slcan).
 
     Raises
     ------
     TransportError
-        The specification is none of these.
+        The specification is not one of these.
     """
     if spec == "auto":
         if kernel_can_is_up(DEFAULT_BUS):
@@ -110,12 +105,12 @@ def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusA
         return can.Bus(interface=interface, channel=channel, **options)
     _check_kernel(channel)
     bus = SocketcanBus(channel)
-    _widen(bus.socket)
+    _enlarge_receive_buffer(bus.socket)
     return bus
 
 
-def _widen(kernel_socket: socket.socket) -> None:
-    """Give a socket a buffer for a burst of some thousand frames, as far as we may: the kernel drops what overflows."""
+def _enlarge_receive_buffer(kernel_socket: socket.socket) -> None:
+    """Enlarge a socket's buffer, if permitted: the kernel drops what overflows."""
     try:
         kernel_socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
     except PermissionError:
@@ -123,7 +118,7 @@ def _widen(kernel_socket: socket.socket) -> None:
 
 
 def _check_kernel(channel: str) -> None:
-    """Say plainly why a kernel interface cannot be had."""
+    """Raise OSError with the reason and the remedy if a kernel interface is not available."""
     remedy = "name another, or use auto, which falls back to the TCP hub"
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -133,46 +128,3 @@ def _check_kernel(channel: str) -> None:
         raise OSError(errno.ENODEV, f"no such interface; {remedy}")
     if not kernel_can_is_up(channel):
         raise OSError(errno.ENETDOWN, f"interface is down; bring it up: ip link set {channel} up")
-
-
-class AutoHubTransport(HubTransport):
-    """Joins the hub at an address, and starts it in this process whenever nobody answers there.
-
-    Port 0 starts a hub of its own at a free port.
-    """
-
-    def __init__(self, host: str, port: int) -> None:
-        super().__init__(host, port, DEFAULT_BUS, self._ensure_hub)
-        self._hub: CanHub | None = None
-
-    async def _ensure_hub(self) -> None:
-        if self._hub is not None or (self._port and await self._answers()):
-            return
-        hub = CanHub(self._host, self._port)
-        try:
-            await hub.start()
-        except ProtocolError:
-            if not await self._answers():
-                raise
-            return
-        self._hub = hub
-        if self._comeback is not None:
-            _LOGGER.warning("CAN %s: the hub there has ended; this process serves it now", self.description)
-        self._port = hub.port
-        self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
-
-    async def _answers(self) -> bool:
-        """Whether somebody listens at the address."""
-        try:
-            _, writer = await asyncio.open_connection(self._host, self._port)
-        except OSError:
-            return False
-        writer.close()
-        return True
-
-    async def close(self) -> None:
-        """Leave the bus, and end the hub if it was started here."""
-        await super().close()
-        if self._hub is not None:
-            await self._hub.close()
-            self._hub = None

@@ -1,27 +1,30 @@
-"""A CAN bus over TCP: client of our hub, or of any socketcand server, that comes back when the server does."""
+"""A CAN bus over TCP: client of `CanHub` or any socketcand server, with reconnection."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Awaitable, Callable
 from typing import Final, cast
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.errors import reason
-from starhil.protocol.flow import WINDOW, TurnProtocol, limit_buffers
-from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.errors import ProtocolError, reason
+from starhil.protocol.flow import WINDOW, TurnProtocol, detect_lost_peer, limit_buffers
+from starhil.protocol.hub import DEFAULT_BUS, CanHub
 from starhil.protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
-from starhil.protocol.transports.base import ReturningTransport, TransportError
+from starhil.protocol.transports.base import ReconnectingTransport, TransportError
+
+_LOGGER: Final = logging.getLogger("starhil.transport")
 
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
-"""Bytes that wait for a hub that does not read at most."""
+"""Most bytes that wait for a hub that does not read."""
 
 HANDSHAKE_S: Final = 5.0
 """Longest time for the server's greeting and answers."""
 
 CLOSE_S: Final = 0.5
-"""Longest time at close for the hub to take what is waiting."""
+"""Longest time that close waits for the hub to read the queue."""
 
 EnsureServer = Callable[[], Awaitable[None]]
 
@@ -29,7 +32,7 @@ EnsureServer = Callable[[], Awaitable[None]]
 class _Connection(TurnProtocol):
     """One connection to a server: answers during the handshake, frames after it.
 
-    While the server does not take what is sent, nothing is read: replies to more requests would only wait.
+    While the server does not read, nothing is read from it either: replies to more requests would only wait.
     """
 
     def __init__(
@@ -45,11 +48,11 @@ class _Connection(TurnProtocol):
         self.transport: asyncio.Transport | None = None
         self.raw = False
         self.bad = 0
-        """Texts from the server that made no sense."""
+        """Invalid commands received from the server."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)
-        notice_a_lost_peer(transport, must_read=True)
+        detect_lost_peer(transport, must_read=True)
         limit_buffers(transport)
         self.transport.set_write_buffer_limits(high=0)
 
@@ -76,7 +79,7 @@ class _Connection(TurnProtocol):
             self.transport.pause_reading()
 
     def data_received(self, data: bytes) -> None:
-        """Take answers or frames."""
+        """Process answers and frames."""
         for command in self._splitter.feed(data):
             if command is None:
                 self.bad += 1
@@ -93,7 +96,7 @@ class _Connection(TurnProtocol):
                 self._answers.put_nowait(command)
 
     async def ask(self, command: str | None) -> bytes:
-        """Send a command and return the answer; with None wait for the greeting."""
+        """Send a command and return the answer; with None, wait for the greeting."""
         if command is not None:
             if self.transport is None:
                 return b""
@@ -101,11 +104,11 @@ class _Connection(TurnProtocol):
         return await self._answers.get()
 
     async def drain(self) -> None:
-        """Wait until the socket has taken all."""
+        """Wait until the socket has accepted everything."""
         await self._drained.wait()
 
 
-class HubTransport(ReturningTransport[CanFrame]):
+class HubTransport(ReconnectingTransport[CanFrame]):
     """Frames over a socketcand server.
 
     Parameters
@@ -113,10 +116,10 @@ class HubTransport(ReturningTransport[CanFrame]):
     host, port, bus:
         Server and name of the bus there.
     ensure_server:
-        Awaited before each connection; starts a server if none is there (used by `auto`).
+        Awaited before each connection; starts a server if there is none (used by `auto`).
     """
 
-    what = "CAN"
+    kind = "CAN"
 
     def __init__(self, host: str, port: int, bus: str, ensure_server: EnsureServer | None = None) -> None:
         super().__init__(f"socketcand:{host}:{port}/{bus}")
@@ -133,9 +136,9 @@ class HubTransport(ReturningTransport[CanFrame]):
         loop = asyncio.get_running_loop()
         try:
             _, connection = await loop.create_connection(
-                lambda: _Connection(self._take, self._ended), self._host, self._port
+                lambda: _Connection(self._on_frame, self._on_lost), self._host, self._port
             )
-        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+        except (OSError, ValueError) as error:  # an invalid host name raises ValueError
             raise TransportError(
                 f"CAN {self.description}: cannot connect: {reason(error)}; start `starhil hub --port {self._port}` first"
             ) from None
@@ -149,7 +152,7 @@ class HubTransport(ReturningTransport[CanFrame]):
             raise TransportError(
                 f"CAN {self.description}: no answer within {HANDSHAKE_S:g} s; is this a socketcand server?"
             ) from None
-        if connection.transport is None:  # gone after its last answer: `_ended` did not take it for ours
+        if connection.transport is None:  # lost after its last answer, before `_on_lost` could know it
             raise TransportError(f"CAN {self.description}: lost: the hub closed the connection")
         self._connection = connection
 
@@ -158,21 +161,21 @@ class HubTransport(ReturningTransport[CanFrame]):
             answer = await connection.ask(command)
             if answer != expected:
                 raise TransportError(
-                    f"CAN {self.description}: answer {answer[:40].decode(errors='replace')!r} where "
-                    f"{expected.decode()!r} is due; is this a socketcand server with bus {self._bus}?"
+                    f"CAN {self.description}: answer {answer[:40].decode(errors='replace')!r} instead of "
+                    f"{expected.decode()!r}; is this a socketcand server with bus {self._bus}?"
                 )
-        # a plain socketcand server refuses this; then there are no remote frames
+        # a plain socketcand server rejects this; there are no remote frames then
         await connection.ask("remote")
         answer = await connection.ask("rawmode")
         if answer != b"ok":
             raise TransportError(f"CAN {self.description}: the server refuses raw mode")
         connection.raw = True
 
-    def _take(self, frame: CanFrame) -> None:
+    def _on_frame(self, frame: CanFrame) -> None:
         self.statistics.received += 1
         self._receive(frame)
 
-    def _ended(self, connection: _Connection, why: str) -> None:
+    def _on_lost(self, connection: _Connection, why: str) -> None:
         if connection is self._connection:
             self._lost(why)
 
@@ -182,7 +185,7 @@ class HubTransport(ReturningTransport[CanFrame]):
             connection.transport.close()
 
     def send(self, item: CanFrame) -> bool:
-        """Queue a frame; all frames of one turn of the loop leave together."""
+        """Queue a frame; all frames of one turn of the loop are sent together."""
         connection = self._connection
         if (
             connection is None
@@ -192,12 +195,12 @@ class HubTransport(ReturningTransport[CanFrame]):
             self.statistics.dropped += 1
             return False
         if not self._outbox:
-            asyncio.get_running_loop().call_soon(self._flush)
+            asyncio.get_running_loop().call_soon(self._flush_outbox)
         self._outbox.append(format_send(item))
         self.statistics.sent += 1
         return True
 
-    def _flush(self) -> None:
+    def _flush_outbox(self) -> None:
         text = b"".join(self._outbox)
         count = len(self._outbox)
         self._outbox.clear()
@@ -208,15 +211,58 @@ class HubTransport(ReturningTransport[CanFrame]):
             self.statistics.dropped += count
 
     async def drain(self) -> None:
-        """Wait until the socket has taken all that was queued."""
+        """Wait until the socket has accepted the queue."""
         await asyncio.sleep(0)
         if self._connection is not None:
             await self._connection.drain()
 
     async def close(self) -> None:
-        """Leave the bus; what was queued is sent first if the hub reads."""
+        """Leave the bus; send the queue first if the hub reads it."""
         if self._outbox:
-            self._flush()
+            self._flush_outbox()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.drain(), CLOSE_S)
         await super().close()
+
+
+class AutoHubTransport(HubTransport):
+    """Joins the hub at an address, and starts it in this process whenever none answers there.
+
+    Port 0 starts a new hub at a free port.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(host, port, DEFAULT_BUS, self._ensure_hub)
+        self._hub: CanHub | None = None
+
+    async def _ensure_hub(self) -> None:
+        if self._hub is not None or (self._port and await self._is_served()):
+            return
+        hub = CanHub(self._host, self._port)
+        try:
+            await hub.start()
+        except ProtocolError:
+            if not await self._is_served():
+                raise
+            return
+        self._hub = hub
+        if self._reconnection is not None:
+            _LOGGER.warning("CAN %s: the hub there has ended; this process serves it now", self.description)
+        self._port = hub.port
+        self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
+
+    async def _is_served(self) -> bool:
+        """Return whether a server listens at the address."""
+        try:
+            _, writer = await asyncio.open_connection(self._host, self._port)
+        except OSError:
+            return False
+        writer.close()
+        return True
+
+    async def close(self) -> None:
+        """Leave the bus, and stop the hub if it runs in this process."""
+        await super().close()
+        if self._hub is not None:
+            await self._hub.close()
+            self._hub = None

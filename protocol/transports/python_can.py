@@ -1,4 +1,4 @@
-"""CAN buses of python-can as transports: socketcan, virtual, udp_multicast, slcan and whatever else it drives."""
+"""CAN buses of python-can as transports: socketcan, virtual, udp_multicast, slcan and others."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from typing import Final
 import can
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.transports.base import ReturningTransport, TransportError
+from starhil.protocol.transports.base import ReconnectingTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000
-"""Frames that wait for the bus at most."""
+"""Most frames that wait for the bus."""
 
 RETRY_S: Final = 0.001
-"""Time until the next try when the bus's transmit buffer is full."""
+"""Time until the next attempt when the bus's transmit buffer is full."""
 
 READ_TIMEOUT_S: Final = 0.2
-"""How long the reading thread waits at once (buses without a file descriptor)."""
+"""Longest wait of one read in the reader thread (buses without a file descriptor)."""
 
 READS_PER_TURN: Final = 256
-"""Frames read before the loop serves others."""
+"""Frames read per turn of the loop."""
 
 SENDS_PER_TURN: Final = 64
-"""Frames sent before the loop serves others."""
+"""Frames sent per turn of the loop."""
 
 ECHO_S: Final = 5.0
-"""How long an own frame is expected to come back on buses that echo."""
+"""Time within which a bus that echoes returns a sent frame."""
 
 ECHO_LIMIT: Final = 10_000
-"""Own frames that are expected to come back at most; the oldest is given up."""
+"""Most sent frames whose echo is awaited; beyond it the oldest is forgotten."""
 
 BUS_OFF: Final = 0x40
 """Flag of the kernel's error frames: the controller has left the bus."""
@@ -43,7 +43,7 @@ BUS_OFF: Final = 0x40
 OpenBus = Callable[[], can.BusABC]
 
 
-class PythonCanTransport(ReturningTransport[CanFrame]):
+class PythonCanTransport(ReconnectingTransport[CanFrame]):
     """Frames over a python-can bus.
 
     Parameters
@@ -51,12 +51,12 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
     description:
         Specification of the bus.
     open_bus:
-        Opens it; runs in a thread, since it may block.
+        Opens the bus; runs in a thread, since it may block.
     echoes:
-        The bus hands back what was sent on it (udp_multicast): the echo is taken out again.
+        The bus returns sent frames (udp_multicast); the transport removes these echoes.
     """
 
-    what = "CAN"
+    kind = "CAN"
 
     def __init__(self, description: str, open_bus: OpenBus, *, echoes: bool = False) -> None:
         super().__init__(description)
@@ -76,7 +76,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
         try:
             bus = await self._open_in_thread()
         except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
-            # not the system's words: those of python-can name the interface
+            # not the system's text: that of python-can names the interface
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise TransportError(f"CAN {self.description}: cannot open: {reason}") from None
         self._bus = bus
@@ -98,7 +98,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
         try:
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(_shut_down)
+            opening.add_done_callback(_close_unused_bus)
             raise
 
     def _readable(self) -> None:
@@ -113,8 +113,8 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
                 return
             if message is None:
                 return
-            self._take(message)
-        # what the bus object has buffered raises no event of its own
+            self._process_message(message)
+        # frames that the bus object has buffered raise no event
         asyncio.get_running_loop().call_soon(self._readable)
 
     def _read_in_thread(
@@ -128,7 +128,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
                     self._from_thread(loop, partial(self._lost, str(error)))
                 return
             if message is not None:
-                self._from_thread(loop, partial(self._take, message))
+                self._from_thread(loop, partial(self._process_message, message))
 
     @staticmethod
     def _from_thread(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
@@ -136,12 +136,14 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(call)
 
-    def _take(self, message: can.Message) -> None:
+    def _process_message(self, message: can.Message) -> None:
         if self._bus is None or message.is_fd:
             return
         if message.is_error_frame:
             if message.arbitration_id & BUS_OFF:
-                self._complain(f"CAN {self.description}: bus-off; check the wiring and restart the interface")
+                self._report_error(
+                    f"CAN {self.description}: bus-off; check the wiring and restart the interface"
+                )
             return
         frame = CanFrame(
             message.arbitration_id,
@@ -156,7 +158,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
         self._receive(frame)
 
     def _is_echo(self, frame: CanFrame) -> bool:
-        """Whether the frame is one of ours coming back; it is then no longer expected."""
+        """Return whether a frame is the echo of a sent one, which is then no longer awaited."""
         if self._echoes is None:
             return False
         now = time.monotonic()
@@ -170,18 +172,18 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
         return False
 
     def send(self, item: CanFrame) -> bool:
-        """Queue a frame, and send it at once if the bus takes it."""
+        """Queue a frame for the next turn of the loop."""
         if self._bus is None or len(self._queue) >= QUEUE_LIMIT:
             self.statistics.dropped += 1
             return False
         self._queue.append(item)
         if self._timer is None:
             self._idle.clear()
-            self._timer = asyncio.get_running_loop().call_soon(self._work)
+            self._timer = asyncio.get_running_loop().call_soon(self._send_queued)
         return True
 
-    def _work(self) -> None:
-        """Send what the bus takes, a few frames a turn: the kernel drops what nobody reads in between."""
+    def _send_queued(self) -> None:
+        """Send a few frames per turn; the kernel drops what is not read in between."""
         self._timer = None
         loop = asyncio.get_running_loop()
         for _ in range(SENDS_PER_TURN):
@@ -194,7 +196,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
                 if not _is_full(error):
                     self._lost(str(error))
                     return
-                self._timer = loop.call_later(RETRY_S, self._work)
+                self._timer = loop.call_later(RETRY_S, self._send_queued)
                 return
             self._queue.popleft()
             self.statistics.sent += 1
@@ -202,7 +204,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
                 bare = CanFrame(frame.id, frame.data, frame.extended, frame.remote)
                 self._echoes.append((time.monotonic(), bare))
         if self._queue:
-            self._timer = loop.call_soon(self._work)
+            self._timer = loop.call_soon(self._send_queued)
         else:
             self._idle.set()
 
@@ -223,7 +225,7 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
                 bus.shutdown()
 
     async def drain(self) -> None:
-        """Wait until the bus has taken all that was queued."""
+        """Wait until the bus has accepted the queue."""
         await self._idle.wait()
 
     async def close(self) -> None:
@@ -234,14 +236,14 @@ class PythonCanTransport(ReturningTransport[CanFrame]):
             await asyncio.to_thread(thread.join, 2 * READ_TIMEOUT_S)
 
 
-def _shut_down(opening: asyncio.Future[can.BusABC]) -> None:
-    """Give back a bus that came when nobody waited for it any more."""
+def _close_unused_bus(opening: asyncio.Future[can.BusABC]) -> None:
+    """Close a bus whose opening was cancelled."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().shutdown()
 
 
 def _descriptor(bus: can.BusABC) -> int:
-    """File descriptor that tells when the bus has frames, or -1: an interface may have none, nor slcan on a network port."""
+    """Return the descriptor that is readable when the bus has frames, or -1 if it has none."""
     try:
         return bus.fileno()
     except (NotImplementedError, OSError):
@@ -259,7 +261,7 @@ def _message(frame: CanFrame) -> can.Message:
 
 
 def _is_full(error: Exception) -> bool:
-    """Whether a failed send means only that the bus takes no more for the moment."""
+    """Return whether a send failed only because the transmit buffer is full."""
     if isinstance(error, can.CanTimeoutError):
         return True
     code = getattr(error, "error_code", None) or getattr(error, "errno", None)

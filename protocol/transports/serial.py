@@ -1,4 +1,4 @@
-"""Serial transports: an own pseudo-terminal, a real tty, and TCP sockets in place of one."""
+"""Choice of the serial transport by specification, and the transports over a tty and over TCP."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ import contextlib
 import errno
 import os
 import select
-import termios
-import tty
 from abc import abstractmethod
-from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -19,49 +15,40 @@ from urllib.parse import urlsplit
 import serial
 
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import TURN, TurnProtocol
-from starhil.protocol.keepalive import notice_a_lost_peer
+from starhil.protocol.flow import TURN, TurnProtocol, detect_lost_peer
 from starhil.protocol.serial_framing import PacingSchedule
-from starhil.protocol.transports.base import ReturningTransport, Transport, TransportError
-from starhil.protocol.transports.paced_writer import PacedWriter
-from starhil.protocol.transports.pty_peers import PtyPeers
+from starhil.protocol.transports.base import ReconnectingTransport, TransportError
+from starhil.protocol.transports.paced import PacedTransport, SerialTransport, termios_as_os_error, write_fd
+from starhil.protocol.transports.pty import PtyTransport
 
 STREAM_LIMIT: Final = 65536
-"""Bytes that wait in a TCP connection for a peer that does not read, above which no more are written."""
+"""Most bytes that wait in a TCP connection for a peer that does not read."""
 DEFAULT_BAUD: Final = 115200
 RATE_RETRY_S: Final = 0.002
-"""Time until the next look whether the kernel has sent all, before the bit rate changes."""
-
-
-class SerialTransport(Transport[bytes]):
-    """A serial port."""
-
-    @abstractmethod
-    def set_baud(self, baud: int) -> None:
-        """Go on at another bit rate as soon as all that was queued has left."""
+"""Time between checks whether the kernel has sent everything, before the bit rate changes."""
 
 
 def open_serial(
     spec: str = "auto", baud: int = DEFAULT_BAUD, *, symlink: Path | None = None, paced: bool | None = None
 ) -> SerialTransport:
-    """Make the serial transport that a specification names; it is opened by `start`.
+    """Return the serial transport that a specification names; `start` opens it.
 
     Parameters
     ----------
     spec:
-        `auto` or `pty` for an own pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
-        `listen://HOST:PORT` to wait for one peer (port 0: a free one, told by `description`).
+        `auto` or `pty` for a new pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
+        `listen://HOST:PORT` to wait for one peer (with port 0, `description` has the free port that was chosen).
     baud:
-        Bit rate, 8N1. It sets the pace of what is sent, and a real tty's hardware.
+        Bit rate, 8N1. It sets the pacing, and the hardware of a real tty.
     symlink:
-        Path that shall lead to the pseudo-terminal; made in one step, removed at close.
+        Path of a symlink to the pseudo-terminal; made atomically, removed at close.
     paced:
-        Whether bytes leave no faster than the bit rate. By default yes, except on a real tty, which does it itself.
+        Whether bytes are sent no faster than the bit rate; by default true, except on a real tty, whose hardware does it.
 
     Raises
     ------
     TransportError
-        The specification is none of these.
+        The specification is not one of these.
     """
     schedule = PacingSchedule(baud)
     pace = schedule if paced is None or paced else None
@@ -93,176 +80,10 @@ def _host_and_port(spec: str) -> tuple[str, int]:
     return host, port
 
 
-class _PacedTransport(SerialTransport):
-    """Common part: the paced writer in front of the port."""
+class _ReconnectingSerial(PacedTransport, ReconnectingTransport[bytes]):
+    """A serial port that may disappear."""
 
-    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
-        super().__init__(description)
-        self._schedule = schedule
-        self._writer: PacedWriter | None = None
-
-    def set_baud(self, baud: int) -> None:
-        if self._writer is None:
-            self._change_rate(baud)
-        else:
-            self._writer.when_idle(partial(self._change_rate, baud))
-
-    def _change_rate(self, baud: int) -> None:
-        """Take another bit rate into use; nothing is queued."""
-        if self._schedule is not None:
-            self._schedule = PacingSchedule(baud)
-            if self._writer is not None:
-                self._writer.schedule = self._schedule
-
-    @abstractmethod
-    def _write(self, data: bytes) -> int:
-        """Write without blocking; return how many bytes were taken."""
-
-    def _make_writer(self) -> None:
-        self._writer = PacedWriter(self._write, self._schedule, self.statistics)
-
-    def send(self, item: bytes) -> bool:
-        if self._writer is None:
-            self.statistics.dropped += len(item)
-            return False
-        return self._writer.send(item)
-
-    async def drain(self) -> None:
-        if self._writer is not None:
-            await self._writer.drain()
-
-    def _drop_writer(self) -> None:
-        if self._writer is not None:
-            self._writer.clear()
-            self._writer = None
-
-    def _take(self, data: bytes) -> None:
-        self.statistics.received += len(data)
-        self._receive(data)
-
-
-def _write_fd(fd: int, data: bytes) -> int:
-    try:
-        return os.write(fd, data)
-    except BlockingIOError:
-        return 0
-
-
-class PtyTransport(_PacedTransport):
-    """An own pseudo-terminal; the peer opens its slave side like any tty, as often as it wants.
-
-    As on a wire, what is sent while nobody has the slave side open is lost, and so is what a peer has left unread.
-    """
-
-    def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
-        super().__init__("pty", schedule)
-        self._symlink = symlink
-        self._path = ""
-        self._master = -1
-        self._peers: PtyPeers | None = None
-
-    async def _open(self) -> None:
-        try:
-            self._master, slave = os.openpty()
-        except OSError as error:
-            raise TransportError(
-                f"serial pty: the system gives no pseudo-terminal: {error.strerror}"
-            ) from None
-        try:
-            with _termios_as_os_error():
-                tty.setraw(slave)
-            os.set_blocking(self._master, False)
-            self._path = os.ttyname(slave)
-            if self._symlink is not None:
-                self._link(self._symlink, self._path)
-        except OSError as error:
-            self._close_master()
-            raise TransportError(f"serial pty: cannot be set up: {error.strerror}; try again") from None
-        except TransportError:
-            self._close_master()
-            raise
-        finally:
-            os.close(slave)  # the master hangs up while no peer has it open
-        self.description = str(self._symlink) if self._symlink is not None else self._path
-        self._make_writer()
-        self._peers = PtyPeers(self._master, self._path)
-        asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
-
-    def _link(self, link: Path, path: str) -> None:
-        try:
-            if link.exists() and not link.is_symlink():
-                raise TransportError(f"serial: {link} exists and is no symlink; choose another name")
-            fresh = link.with_name(f".{link.name}.{os.getpid()}")
-            fresh.symlink_to(path)
-            fresh.replace(link)
-        except OSError as error:
-            raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
-
-    def _readable(self) -> None:
-        if self._peers is None:
-            return
-        self._peers.acknowledge()
-        self._lose_unread(self._peers)
-        try:
-            data = os.read(self._master, TURN)
-        except BlockingIOError:
-            return
-        except OSError as error:
-            if error.errno != errno.EIO:  # that is: nobody has the slave side open
-                self._complain(f"serial {self.description}: {error.strerror}")
-            return
-        asyncio.get_running_loop().call_soon(self._readable)  # the wake-up came once for all there is
-        self._take(data)
-
-    def _lose_unread(self, peers: PtyPeers) -> None:
-        """Drop what a peer that left has not read, and what was still to be sent to it."""
-        if peers.all_left():
-            if self._writer is not None:
-                self._writer.clear()
-            peers.discard_unread()
-
-    def send(self, item: bytes) -> bool:
-        """Queue a message, whole or not at all; without a peer it is lost."""
-        if self._peers is not None:
-            self._lose_unread(self._peers)
-            if not self._peers.present:
-                self.statistics.dropped += len(item)
-                return False
-        return super().send(item)
-
-    def _write(self, data: bytes) -> int:
-        if self._peers is None:
-            raise OSError(errno.EBADF, "port is closed")
-        if self._peers.all_left():
-            self._peers.discard_unread()
-            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops what was to be sent to it
-        if not self._peers.present:
-            raise OSError(errno.ENOTCONN, "no peer")
-        return _write_fd(self._master, data)
-
-    async def close(self) -> None:
-        """Give the pseudo-terminal back and take away the symlink, if it still leads here."""
-        if self._peers is None:
-            return
-        asyncio.get_running_loop().remove_reader(self._peers.fileno())
-        self._drop_writer()
-        if self._symlink is not None:
-            with contextlib.suppress(OSError):
-                if str(self._symlink.readlink()) == self._path:
-                    self._symlink.unlink()
-        self._peers.close()
-        self._peers = None
-        self._close_master()
-
-    def _close_master(self) -> None:
-        os.close(self._master)
-        self._master = -1
-
-
-class _ReturningSerial(_PacedTransport, ReturningTransport[bytes]):
-    """A serial port that may vanish."""
-
-    what = "serial"
+    kind = "serial"
 
     async def _connect(self) -> None:
         await self._attach()
@@ -278,10 +99,10 @@ class _ReturningSerial(_PacedTransport, ReturningTransport[bytes]):
 
     @abstractmethod
     def _detach(self) -> None:
-        """Let go of the port, whatever its state."""
+        """Release the port, in any state."""
 
 
-class TtyTransport(_ReturningSerial):
+class TtyTransport(_ReconnectingSerial):
     """A tty opened by its path, through pyserial."""
 
     def __init__(self, path: str, baud: int, schedule: PacingSchedule | None) -> None:
@@ -294,10 +115,10 @@ class TtyTransport(_ReturningSerial):
         path = Path(self._path)
         if path.exists() and not path.is_char_device():
             raise TransportError(
-                f"serial {self._path}: is no tty; name a serial port such as /dev/ttyUSB0, or auto for a pseudo-terminal"
+                f"serial {self._path}: is not a tty; name a serial port such as /dev/ttyUSB0, or auto for a pseudo-terminal"
             )
         try:
-            with _termios_as_os_error():
+            with termios_as_os_error():
                 self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
             asyncio.get_running_loop().add_reader(self._port.fileno(), self._readable)
         except (OSError, ValueError) as error:
@@ -315,7 +136,7 @@ class TtyTransport(_ReturningSerial):
             self._lost(error.strerror or str(error))
             return
         if data:
-            self._take(data)
+            self._process_received(data)
         elif _hung_up(self._port.fileno()):
             self._lost("hung up")
 
@@ -323,28 +144,28 @@ class TtyTransport(_ReturningSerial):
         lost = ""
         if self._port is not None:
             try:
-                with _termios_as_os_error():
-                    if self._port.out_waiting:  # the kernel's buffer still leaves at the old rate
+                with termios_as_os_error():
+                    if self._port.out_waiting:  # the kernel still sends its buffer at the old rate
                         asyncio.get_running_loop().call_later(RATE_RETRY_S, self.set_baud, baud)
                         return
                     self._port.baudrate = baud
             except (OSError, ValueError) as error:
                 if isinstance(error, ValueError) or error.errno == errno.EINVAL:
-                    self._complain(
-                        f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} is kept"
+                    self._report_error(
+                        f"serial {self._path}: bit rate {baud} is not possible here; {self._baud} stays in use"
                     )
                     return
                 lost = error.strerror or str(error)
         self._baud = baud
         super()._change_rate(baud)
-        if lost:  # the port comes back at the new rate
+        if lost:  # it reopens at the new rate
             self._lost(lost)
 
     def _write(self, data: bytes) -> int:
         if self._port is None:
             raise OSError(errno.EIO, "port is closed")
         try:
-            return _write_fd(self._port.fileno(), data)
+            return write_fd(self._port.fileno(), data)
         except OSError as error:
             self._lost(error.strerror or str(error))
             raise
@@ -355,15 +176,6 @@ class TtyTransport(_ReturningSerial):
             with contextlib.suppress(OSError):
                 self._port.close()
             self._port = None
-
-
-@contextlib.contextmanager
-def _termios_as_os_error() -> Iterator[None]:
-    """Raise what the terminal settings refuse as the OSError that it is, which `termios.error` does not derive from."""
-    try:
-        yield
-    except termios.error as error:
-        raise OSError(*error.args) from None
 
 
 def _hung_up(fd: int) -> bool:
@@ -377,7 +189,7 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
     if isinstance(error, ValueError):
         return f"serial {path}: bit rate {baud} is not possible here"
     if number in (errno.EBUSY, errno.EAGAIN):
-        return f"serial {path}: busy, another program holds it; close that one"
+        return f"serial {path}: busy: another program has it open; close that program"
     if number == errno.ENOENT:
         return f"serial {path}: no such port; plug the adapter in, or name another (auto makes a pseudo-terminal)"
     if number == errno.EACCES:
@@ -386,7 +198,7 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
 
 
 class _StreamProtocol(TurnProtocol):
-    """Hands what a TCP connection brings to its transport."""
+    """Passes the data of a TCP connection to its transport."""
 
     def __init__(self, owner: _TcpTransport) -> None:
         super().__init__()
@@ -394,18 +206,18 @@ class _StreamProtocol(TurnProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         if isinstance(transport, asyncio.Transport):
-            notice_a_lost_peer(transport)
+            detect_lost_peer(transport)
             self._owner.attach(self, transport)
 
     def data_received(self, data: bytes) -> None:
-        self._owner.take(self, data)
+        self._owner.process(self, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._owner.ended(self, exc)
+        self._owner.on_lost(self, exc)
 
 
-class _TcpTransport(_ReturningSerial):
-    """Common part of both TCP forms."""
+class _TcpTransport(_ReconnectingSerial):
+    """Common base of both TCP transports."""
 
     def __init__(self, scheme: str, host: str, port: int, schedule: PacingSchedule | None) -> None:
         super().__init__(f"{scheme}://{host}:{port}", schedule)
@@ -415,19 +227,19 @@ class _TcpTransport(_ReturningSerial):
         self._protocol: _StreamProtocol | None = None
 
     def attach(self, protocol: _StreamProtocol, stream: asyncio.Transport) -> None:
-        """Take a connection into use; a second one beside it is refused."""
+        """Use a connection; a second one at the same time is rejected."""
         if self._stream is not None:
             stream.abort()
             return
         self._stream, self._protocol = stream, protocol
 
-    def take(self, protocol: _StreamProtocol, data: bytes) -> None:
-        """Take bytes of the connection in use."""
+    def process(self, protocol: _StreamProtocol, data: bytes) -> None:
+        """Process bytes of the connection in use."""
         if protocol is self._protocol:
-            self._take(data)
+            self._process_received(data)
 
-    def ended(self, protocol: _StreamProtocol, error: Exception | None) -> None:
-        """Note that a connection has ended."""
+    def on_lost(self, protocol: _StreamProtocol, error: Exception | None) -> None:
+        """Handle the end of a connection."""
         if protocol is self._protocol:
             self._stream = self._protocol = None
             self._peer_gone(str(error) if error else "closed by the peer")
@@ -460,7 +272,7 @@ class _ConnectTransport(_TcpTransport):
         loop = asyncio.get_running_loop()
         try:
             await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
-        except (OSError, ValueError) as error:  # a name that cannot be a host's is a ValueError
+        except (OSError, ValueError) as error:  # an invalid host name raises ValueError
             raise TransportError(
                 f"serial {self.description}: cannot connect: {reason(error)}; start the peer first"
             ) from None
@@ -470,7 +282,7 @@ class _ConnectTransport(_TcpTransport):
 
 
 class _ListenTransport(_TcpTransport):
-    """A TCP port that one peer at a time may connect to; without a peer, bytes vanish as on an open line."""
+    """A TCP port for one peer at a time; without a peer, bytes are lost as on an open line."""
 
     def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
         super().__init__("listen", host, port, schedule)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanIdentifier
+from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanId
 from starhil.protocol.messages import FaultKind, LinkFault, Request, RequestKind
 from tests.conformance.mutant_seams import (
     enter,
@@ -17,9 +17,9 @@ from tests.conformance.mutant_seams import (
 from tests.conformance.simulated import SimulatedUnit
 
 
-def _identified(**changes: Callable[[CanIdentifier], int]) -> Callable[[CanFrame], list[CanFrame]]:
+def _identified(**changes: Callable[[CanId], int]) -> Callable[[CanFrame], list[CanFrame]]:
     def change(frame: CanFrame) -> list[CanFrame]:
-        old = CanIdentifier.unpack(frame.id)
+        old = CanId.unpack(frame.id)
         new = dataclasses.replace(old, **{name: value(old) for name, value in changes.items()})
         return [CanFrame(new.pack(), frame.data)]
 

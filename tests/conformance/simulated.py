@@ -25,7 +25,7 @@ from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.protocol.icd import load_icd
 from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
-from starhil.protocol.transports.paced_writer import PacedWriter
+from starhil.protocol.transports.paced import PacedWriter
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
 

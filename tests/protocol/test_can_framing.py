@@ -14,7 +14,7 @@ from starhil.protocol.can_framing import (
     CanDeviceReceiver,
     CanFrame,
     CanHostReceiver,
-    CanIdentifier,
+    CanId,
     MessageType,
     encode_reply_frames,
     encode_request_frames,
@@ -256,7 +256,7 @@ def test_a_refusal_without_a_code_is_a_fault() -> None:
 
 def test_lost_first_segment_of_unsolicited_telemetry_is_noticed() -> None:
     frames = encode_reply_frames(Reply(ReplyKind.UNSOLICITED, 160, bytes(56), destination=OBC), DEVICE)
-    assert [CanIdentifier.unpack(one.id).type for one in frames] == [
+    assert [CanId.unpack(one.id).type for one in frames] == [
         MessageType.UNSOLICITED_FIRST, *[MessageType.UNSOLICITED_BODY] * 6, MessageType.UNSOLICITED_LAST,
     ]  # fmt: skip
     events = take(CanHostReceiver(OBC), frames[:3] + frames[4:])
@@ -271,16 +271,14 @@ def test_ten_thousand_random_frames_leave_the_receiver_sound() -> None:
         identifier = source.getrandbits(29)
         if number % 2:  # frames that look like the protocol, to this device
             kind = source.choice((1, 4, 7, 7, 7, source.getrandbits(5)))
-            identifier = CanIdentifier(
-                kind, source.choice((54, 230, source.getrandbits(8))), OBC, DEVICE
-            ).pack()
+            identifier = CanId(kind, source.choice((54, 230, source.getrandbits(8))), OBC, DEVICE).pack()
         data = source.randbytes(source.randrange(9))
         if len(data) == 8 and number % 3:
             data = data[:7] + bytes((source.randrange(4),))
         for event in receiver.feed(CanFrame(identifier, data), number * 1e-2):
             if isinstance(event, Request):
                 accepted += 1
-                parts = CanIdentifier.unpack(identifier)
+                parts = CanId.unpack(identifier)
                 assert parts.destination == DEVICE
                 assert (parts.type, event.id >= 128) in ((1, False), (4, True), (7, False))
                 if parts.type == MessageType.TELECOMMAND_EXTENDED:
@@ -299,13 +297,13 @@ def test_ten_thousand_random_frames_leave_the_receiver_sound() -> None:
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.integers(0, 0x1FFFFFFF))
 def test_identifiers_come_apart_and_together(raw: int) -> None:
-    assert CanIdentifier.unpack(raw).pack() == raw
+    assert CanId.unpack(raw).pack() == raw
 
 
 @pytest.mark.parametrize("parts", [(32, 0, 0, 0), (0, 256, 0, 0), (0, 0, -1, 0), (0, 0, 0, 300)])
 def test_parts_that_do_not_fit_an_identifier_are_refused(parts: tuple[int, int, int, int]) -> None:
     with pytest.raises(ProtocolError):
-        CanIdentifier(*parts).pack()
+        CanId(*parts).pack()
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_what_is_put_is_taken_or_counted_as_dropped(steps: list[tuple[int, list[
 
 
 async def join(hub: CanHub) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """A client in raw mode that speaks the text protocol by hand and reads nothing by itself."""
+    """A client in raw mode that sends raw text and reads only on request."""
     reader, writer = await asyncio.open_connection("127.0.0.1", hub.port)
     await reader.readuntil(b">")
     for command in (b"< open vcan0 >", b"< remote >", b"< rawmode >"):

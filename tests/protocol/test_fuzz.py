@@ -16,7 +16,7 @@ from starhil.protocol.can_framing import (
     CanDeviceReceiver,
     CanFrame,
     CanHostReceiver,
-    CanIdentifier,
+    CanId,
     encode_reply_frames,
     encode_request_frames,
 )
@@ -133,7 +133,7 @@ def test_can_device_receiver() -> None:
         frame = _frames_of(data, seeds, number)
         for event in receiver.feed(frame, number * 0.001):
             if isinstance(event, Request):
-                assert CanIdentifier.unpack(frame.id).destination == 4
+                assert CanId.unpack(frame.id).destination == 4
                 assert len(event.data) <= MAX_SIZE
         open_messages = receiver._assembler._open
         assert len(open_messages) <= MAX_OPEN_MESSAGES

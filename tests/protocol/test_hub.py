@@ -185,8 +185,8 @@ def test_a_flood_arrives_whole_and_in_order() -> None:
 
 def test_a_client_that_does_not_read_loses_frames_alone_and_memory_is_bounded() -> None:
     async def scenario(hub: CanHub) -> None:
-        one, two, deaf = await Peer.join(hub), await Peer.join(hub), await Peer.join(hub)
-        deaf.reader._transport.pause_reading()  # type: ignore[attr-defined]
+        one, two, unresponsive = await Peer.join(hub), await Peer.join(hub), await Peer.join(hub)
+        unresponsive.reader._transport.pause_reading()  # type: ignore[attr-defined]
         batch = format_send(CanFrame(0x1234567, bytes(8))) * 1000
         sent = 0
         while not hub.statistics.dropped and sent < 100 * BACKLOG_LIMIT:
@@ -284,7 +284,7 @@ def test_python_can_can_join_a_busy_bus() -> None:
     run(scenario)
 
 
-# -- the codec by itself -----------------------------------------------------------------------------------------------
+# -- the codec -----------------------------------------------------------------------------------------------
 
 frames = st.one_of(
     st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8), st.just(False)),  # noqa: FBT003
@@ -354,7 +354,7 @@ def test_a_full_disk_ends_the_log_and_nothing_else(
 
     run(scenario, log=Path("/dev/full"))
     assert [record.getMessage() for record in caplog.records] == [
-        "CAN hub: log /dev/full ends here: No space left on device; the bus goes on"
+        "CAN hub: log /dev/full ends here: No space left on device; the bus continues"
     ]
 
 

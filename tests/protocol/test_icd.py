@@ -422,7 +422,7 @@ BAD_DEFINITIONS = [
     ("unknown key of a field", HEAD + _row(fields='[{ name = "a", type = "u8", units = "m" }]'), r"row\.fields\.a\.units"),
     ("wrong type", HEAD + _row(fields='[{ name = "a", type = "u24" }]'), r"row\.fields\.a\.type"),
     ("wrong size", HEAD + _row(size=2), "row: size is 2 but the fields make 1"),
-    ("double id", HEAD + _row() + _row(name="other"), "other: id 200 is already that of row"),
+    ("double id", HEAD + _row() + _row(name="other"), "other: id 200 is already used by row"),
     ("double name", HEAD + _row() + _row(identifier=201), "row: name used twice"),
     ("double field", HEAD + _row(size=2, fields='[{ name = "a", type = "u8" }, { name = "a", type = "u8" }]'), "field a: name used twice"),
     ("telemetry below 128", HEAD + _row(identifier=5), "is not a telemetry id"),

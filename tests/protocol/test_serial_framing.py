@@ -153,7 +153,7 @@ def test_ten_thousand_random_byte_strings_leave_the_receiver_sound() -> None:
     receiver = DeviceReceiver()
     for number in range(10_000):
         noise = random_bytes.randbytes(random_bytes.randrange(1, 40))
-        if number % 3 == 0:  # noise that looks like the protocol
+        if number % 3 == 0:  # noise that resembles the protocol
             noise = bytes(random_bytes.choice(b"\x1f\x7f\xff\x01\x80") for _ in range(len(noise)))
         for event in receiver.feed(noise, float(number)):
             if isinstance(event, Request):

@@ -8,7 +8,7 @@ import pytest
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
-from starhil.protocol.can_framing import CanFrame, CanIdentifier, MessageType, encode_request_frames
+from starhil.protocol.can_framing import CanFrame, CanId, MessageType, encode_request_frames
 from starhil.protocol.hub import CanHub
 from starhil.protocol.messages import Request
 from starhil.protocol.transports import open_can
@@ -16,7 +16,7 @@ from tests.emulator.links.test_links import Wire
 
 BUS = "socketcand:127.0.0.1:1/test-of-addresses"
 REQUEST = encode_request_frames(Request.of(128), 1, 4)[0]
-REPLY = CanFrame(CanIdentifier(MessageType.TELEMETRY, 128, 4, 1).pack(), bytes(8))
+REPLY = CanFrame(CanId(MessageType.TELEMETRY, 128, 4, 1).pack(), bytes(8))
 
 
 def clashes(caplog) -> list[str]:

@@ -14,7 +14,7 @@ from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.protocol.can_framing import (
     CanFrame,
     CanHostReceiver,
-    CanIdentifier,
+    CanId,
     MessageType,
     encode_request_frames,
 )
@@ -241,7 +241,7 @@ def test_the_acknowledge_of_a_reset_waits_for_its_turn_and_leaves(bench):
         async with asyncio.timeout(10.0):
             while len(bus.sent) < 9:  # eight of the telemetry, one of the acknowledge
                 await asyncio.sleep(0.001)
-        assert CanIdentifier.unpack(bus.sent[-1].id).type == MessageType.TELECOMMAND_ACK
+        assert CanId.unpack(bus.sent[-1].id).type == MessageType.TELECOMMAND_ACK
         await link.close()
 
     in_loop(scenario())
@@ -297,11 +297,11 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
 
         bench.requests.handle = watched
         for _ in range(JUNK):
-            identifier = CanIdentifier(
+            identifier = CanId(
                 rng.randrange(32), rng.randrange(256), rng.randrange(256), rng.choice((4, 4, 4, 9))
             )
             linked.bus.arrive(CanFrame(identifier.pack(), rng.randbytes(rng.randint(0, 8))))
-        sent = [CanIdentifier.unpack(frame.id) for frame in linked.bus.take()]
+        sent = [CanId.unpack(frame.id) for frame in linked.bus.take()]
         assert {identifier.source for identifier in sent} <= set(range(256))
         assert {identifier.type for identifier in sent} <= {
             MessageType.TELECOMMAND_ACK, MessageType.TELECOMMAND_NACK, MessageType.TELEMETRY, MessageType.TELEMETRY_NACK,
@@ -320,7 +320,7 @@ def test_a_half_message_is_given_up_and_counted(bench, monkeypatch):
     async def scenario():
         linked = await Linked(bench).start()
         linked.uart.arrive(b"\x1f\x7f\x80")
-        frame = CanFrame(CanIdentifier(7, 37, 1, 4).pack(), bytes(7) + b"\x07")
+        frame = CanFrame(CanId(7, 37, 1, 4).pack(), bytes(7) + b"\x07")
         linked.bus.arrive(frame)
         bench.step(0.5)
         assert bench.device.counters.flags == set()

@@ -21,7 +21,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import (
     CanopenSlave,
     DeviceDictionary,
-    Picture,
+    GreyImage,
     StandInApplication,
     build_dictionary,
 )
@@ -31,7 +31,7 @@ NODE = 0x2C
 
 
 class Bench:
-    """One slave, a clock that is moved by hand, and what came out."""
+    """One slave, a manual clock, and the frames and events of the slave."""
 
     def __init__(self, node_id: int = NODE, storage: ParameterStorage | None = None, **options) -> None:
         self.dictionary: DeviceDictionary = build_dictionary()
@@ -120,7 +120,7 @@ class Bench:
 
     def show(self, pixels: bytes) -> bytes:
         """Give the application a frame of these pixels, in one row."""
-        self.application.images["frame"] = Picture(len(pixels), 1, 7, pixels)
+        self.application.images["frame"] = GreyImage(len(pixels), 1, 7, pixels)
         return pixels
 
     def events(self) -> list[tuple[str, float]]:
@@ -185,7 +185,7 @@ class SimulatedBus:
 
 @lru_cache(maxsize=16)
 def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
-    """Read a data sheet with the library."""
+    """Read an EDS with the library."""
     with io.StringIO(text) as file:
         file.name = "node.eds"
         return canopen.import_od(file, node_id)
@@ -224,7 +224,7 @@ def read_eds():
 
 @pytest.fixture(scope="session")
 def run_conformance():
-    """Run all cases against the node on a bus; identifiers by what came of them."""
+    """Run all cases against the node on a bus; return case ids by outcome."""
 
     def run(bus, eds: str) -> dict[str, set[str]]:
         probe = CanopenProbe(bus, NODE, import_eds(eds, NODE), eds)
@@ -238,7 +238,7 @@ def run_conformance():
 
 @pytest.fixture(scope="session")
 def mutants():
-    """The module beside this file with the mutants of the slave."""
+    """The module with the mutants of the slave."""
     path = Path(__file__).with_name("mutants.py")
     spec = importlib.util.spec_from_file_location("canopen_mutants", path)
     module = importlib.util.module_from_spec(spec)

@@ -1,7 +1,7 @@
-"""Mutants of the CANopen slave: one defect each, as a change of one place in one module.
+"""Mutants of the CANopen slave: one defect each, as one change in one module.
 
-A mutant is the whole package loaded anew under another name with that place changed; the text to be changed must stand in
-the module exactly once, so that a mutant cannot silently become the original.
+A mutant is the whole package loaded under another name with that text replaced. The text must occur in the module exactly
+once, so that a mutant cannot silently become the original.
 """
 
 from __future__ import annotations
@@ -113,12 +113,12 @@ MUTANTS = (
     Mutant("counter overflow changed while a period is set", "sync", "sync", "if self._period.number():", "if False:"),
     Mutant("SYNC counter begins at 0", "sync", "sync", "self._counter = self._counter % overflow + 1", "self._counter = (self._counter + 1) % overflow"),
     Mutant("SYNC produced in STOPPED", "sync", "sync", "        if not self._context.communicates:\n            return None\n        overflow", "        overflow"),
-    Mutant("restricted identifiers taken", "sync", "cob", "if any(first <= identifier <= last for first, last in RESTRICTED):", "if False:"),
-    Mutant("extended identifiers taken", "sync", "cob", "if cob_id & EXTENDED or identifier > 0x7FF:", "if False:"),
+    Mutant("restricted identifiers taken", "sync", "cob", "if any(first <= can_id <= last for first, last in RESTRICTED):", "if False:"),
+    Mutant("extended identifiers taken", "sync", "cob", "if cob_id & EXTENDED or can_id > 0x7FF:", "if False:"),
     Mutant("TIME moved while it is consumed", "time", "timestamp", "lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES)", "lives_before=False, lives_after=False"),
     Mutant("EMCY without the generic bit", "emcy", "emergency", "= bits | ErrorRegister.GENERIC", "= bits & ~ErrorRegister.GENERIC"),
     Mutant("EMCY repeated", "emcy", "emergency", "        if (code, key) in self._active:\n            return False\n", ""),
-    Mutant("EMCY of 7 bytes", "emcy", "emergency", 'data[:5].ljust(5, b"\\0")', 'data[:4].ljust(4, b"\\0")'),
+    Mutant("EMCY of 7 bytes", "emcy", "emergency", "construct.Padded(5, construct.GreedyBytes)", "construct.Padded(4, construct.GreedyBytes)"),
     Mutant("error register stays", "emcy", "emergency", "if self._active.pop((code, key), None) is None:", "if (code, key) not in self._active:"),
     Mutant("history oldest first", "emcy", "emergency", "self._history.insert(0, code |", "self._history.append(code |"),
     Mutant("history without end", "emcy", "emergency", "        del self._history[self._capacity :]\n", ""),

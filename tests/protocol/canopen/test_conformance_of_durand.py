@@ -129,9 +129,7 @@ def test_durand_fails_just_where_it_is_at_fault(scheduler, run_conformance):
     values[4] = Variable(DatatypeEnum.UNSIGNED32, "rw", value=6, name="d")
     od[0x2000] = values
     outcomes = run_conformance(bus, node.eds.content)
-    by_chance = {
-        "canopen.sdo-block.upload-big"
-    }  # fails if its data sheet happens to be a multiple of 7 bytes long
+    by_chance = {"canopen.sdo-block.upload-big"}  # fails if its EDS happens to be a multiple of 7 bytes long
     assert outcomes["failed"] - set(DURAND_FAULTS) - by_chance == set()
     assert set(DURAND_FAULTS) - outcomes["failed"] == set()
     assert len(outcomes["passed"]) >= 80

@@ -176,5 +176,5 @@ def test_layout_file_that_is_not_there(tmp_path):
 
 
 def test_object_of_two_kinds():
-    with pytest.raises(ValueError, match="just one of"):
+    with pytest.raises(ValueError, match="exactly one of"):
         layout(object=[{"index": 0x6000, "name": "x", "telemetry": "rates", "image": "frame"}])

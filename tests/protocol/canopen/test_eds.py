@@ -1,4 +1,4 @@
-"""The electronic data sheet: read by independent readers, and true to what the node serves."""
+"""The EDS: parsed by independent readers, and consistent with the node."""
 
 from __future__ import annotations
 

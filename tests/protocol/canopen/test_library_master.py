@@ -17,7 +17,7 @@ from starhil.protocol.canopen import build_eds
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
 PATIENCE_S = 20.0
 BOOT_UP, OPERATIONAL = 0, 5
-"""States as a heartbeat tells them."""
+"""NMT states as in a heartbeat."""
 
 
 def test_reads_and_writes_by_name(bench, master):

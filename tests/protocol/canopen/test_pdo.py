@@ -142,7 +142,7 @@ def test_event_timer(quiet):
     quiet.operational()
     start = quiet.now
     assert [round(time - start, 6) for time, _, _ in quiet.advance(0.25)] == [0.1, 0.2]
-    assert notify(quiet) == [MODE]  # an event starts the timer anew
+    assert notify(quiet) == [MODE]  # an event restarts the timer
     assert [round(time - start, 6) for time, _, _ in quiet.advance(0.12)] == [0.35]
 
 
@@ -230,7 +230,7 @@ def test_restricted_identifiers(quiet, identifier):
         (0x6042_0010, AbortCode.NOT_MAPPABLE),  # write-only
         (0x6040_0108, AbortCode.NOT_MAPPABLE),  # bulk data
         (0x6000_0010, AbortCode.NOT_MAPPABLE),  # another length
-        (0x0005_0008, AbortCode.NO_OBJECT),  # a TPDO has no place holders
+        (0x0005_0008, AbortCode.NO_OBJECT),  # a TPDO has no placeholders
         (0x6000_0008, 0),
         (0x1001_0008, 0),
         (0x0000_0000, 0),

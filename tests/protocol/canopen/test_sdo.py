@@ -458,7 +458,7 @@ def test_image_record(bench):
 
 @pytest.fixture
 def later(bench):
-    """A device that takes a mode command and tells its result later."""
+    """A device that accepts a mode command and reports its result later."""
     deferred = Deferred()
     bench.application.telecommand = Mock(return_value=deferred)
     return deferred

@@ -97,7 +97,7 @@ def all_entries(bench: Bench):
 
 
 def alive(bench: Bench) -> Bench:
-    """After a reset of the node it boots up and answers; a slave whose node-ID was changed is made anew."""
+    """After a node reset it boots up and answers; a slave whose node-ID changed is replaced."""
     bench.now += LONGEST_SILENCE_S
     bench.frame(0x000, bytes((0x81, NODE)))  # also puts a node-ID of LSS into force
     bench.advance(0.1)

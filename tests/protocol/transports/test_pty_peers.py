@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from starhil.protocol.transports import SerialTransport, open_serial, pty_peers
+from starhil.protocol.transports import SerialTransport, open_serial, pty
 from tests.protocol.transports.pairs import until
 
 MESSAGE = bytes(range(100))
@@ -83,7 +83,7 @@ def test_what_a_peer_has_left_unread_is_gone_for_the_next(
     watched: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not watched:
-        monkeypatch.setattr(pty_peers, "_watch", lambda _: -1)
+        monkeypatch.setattr(pty, "_watch", lambda _: -1)
 
     async def main() -> None:
         async with opened() as (line, heard):

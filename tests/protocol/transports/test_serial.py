@@ -15,7 +15,7 @@ import serial
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports import TransportError, open_serial
-from starhil.protocol.transports.paced_writer import BACKLOG_LIMIT
+from starhil.protocol.transports.paced import BACKLOG_LIMIT
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 
 
@@ -192,7 +192,7 @@ def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
     ("spec", "message"),
     [
         ("/dev/does-not-exist", "no such port"),
-        ("/etc/passwd", "is no tty"),
+        ("/etc/passwd", "is not a tty"),
         ("/dev/null", "cannot open"),
         ("socket://127.0.0.1:1", "cannot connect"),
         ("socket://127.0.0.1", "must be socket://HOST:PORT"),
@@ -228,7 +228,7 @@ def test_a_file_in_the_symlinks_place_is_not_overwritten(tmp_path: Path) -> None
         link = tmp_path / "precious"
         link.write_text("data")
         transport = open_serial("pty", symlink=link)
-        with pytest.raises(TransportError, match="is no symlink"):
+        with pytest.raises(TransportError, match="is not a symlink"):
             await transport.start(lambda _: None)
         await transport.close()
         assert link.read_text() == "data"
@@ -288,7 +288,7 @@ def test_a_bit_rate_that_a_tty_cannot_have_is_told_and_the_old_one_kept(tmp_path
         async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
             pair.two.set_baud(-1)
             await until(lambda: bool(pair.errors))
-            assert "bit rate -1 is not possible here; 19200 is kept" in str(pair.errors[0])
+            assert "bit rate -1 is not possible here; 19200 stays in use" in str(pair.errors[0])
             pair.two.send(b"alive")
             await until(lambda: bytes(pair.got_one) == b"alive")
 

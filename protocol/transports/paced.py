@@ -1,0 +1,226 @@
+"""Serial transports that send at the line's bit rate and never block."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import termios
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Final
+
+from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.transports.base import Statistics, Transport
+
+BACKLOG_LIMIT: Final = 64 * 1024
+"""Most bytes that wait for the line or for a peer that does not read."""
+
+TICK_S: Final = 0.002
+"""Time between two writes of a long message, which is sent in chunks as a line would carry it."""
+
+RETRY_S: Final = 0.005
+"""Time until the next attempt when the port is full."""
+
+
+class PacedWriter:
+    """Writes queued bytes to a port no faster than its line.
+
+    Parameters
+    ----------
+    write:
+        Writes without blocking and returns how many bytes it accepted (0 if the port is full). OSError means that the
+        port is lost; the bytes are dropped, as on a line without a peer.
+    schedule:
+        Byte times of the line, or None for no pacing.
+    """
+
+    def __init__(
+        self, write: Callable[[bytes], int], schedule: PacingSchedule | None, statistics: Statistics
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._write = write
+        self.schedule = schedule
+        self._statistics = statistics
+        self._queue: deque[tuple[float, bytes]] = deque()
+        """Messages with the time at which the first byte begins."""
+        self._written = 0
+        """Bytes of the first message that have been written."""
+        self._backlog = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self._idle_action: Callable[[], None] | None = None
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that wait."""
+        return self._backlog
+
+    def send(self, data: bytes) -> bool:
+        """Queue a message, whole or not at all."""
+        if self._backlog + len(data) > BACKLOG_LIMIT:
+            self._statistics.dropped += len(data)
+            return False
+        if data:
+            begin = self._loop.time()
+            if self.schedule is not None:
+                begin, _ = self.schedule.reserve(begin, len(data))
+            self._queue.append((begin, data))
+            self._backlog += len(data)
+            self._idle.clear()
+            if self._timer is None:
+                self._write_due()
+        return True
+
+    async def drain(self) -> None:
+        """Wait until the queue is empty."""
+        await self._idle.wait()
+
+    def when_idle(self, action: Callable[[], None]) -> None:
+        """Call `action` once the queue is empty; it replaces an earlier action."""
+        self._idle_action = action
+        if self._idle.is_set():
+            self._become_idle()
+
+    def _become_idle(self) -> None:
+        """Release `drain` and call the action of `when_idle`."""
+        self._idle.set()
+        action, self._idle_action = self._idle_action, None
+        if action is not None:
+            action()
+
+    def clear(self) -> None:
+        """Drop the queue and free the line."""
+        self._statistics.dropped += self._backlog
+        if self.schedule is not None:
+            self.schedule.release()
+        self._queue.clear()
+        self._backlog = self._written = 0
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._become_idle()
+
+    def _write_due(self) -> None:
+        """Write the bytes that are due and set the timer for the next ones."""
+        self._timer = None
+        now = self._loop.time()
+        due, next_time = self._due_bytes(now)
+        if due:
+            try:
+                accepted = self._write(due)
+            except OSError:
+                self.clear()
+                return
+            self._remove_written(accepted)
+            if accepted < len(due):
+                next_time = now + RETRY_S
+        if self._queue:
+            self._timer = self._loop.call_at(max(next_time, now), self._write_due)
+        else:
+            self._become_idle()
+
+    def _due_bytes(self, now: float) -> tuple[bytes, float]:
+        """Return the bytes whose stop bit has passed at `now`, and the time of the next check."""
+        if self.schedule is None:
+            whole = b"".join(data for _, data in self._queue)
+            return whole[self._written :], now
+        byte_s = self.schedule.seconds_per_byte
+        chunks: list[bytes] = []
+        written = self._written
+        for begin, data in self._queue:
+            ready = min(int((now - begin) / byte_s + 1e-6), len(data))
+            if ready > written:
+                chunks.append(data[written:ready])
+            if ready < len(data):
+                end = begin + len(data) * byte_s
+                return b"".join(chunks), min(max(begin + (ready + 1) * byte_s, now + TICK_S), end)
+            written = 0
+        return b"".join(chunks), now
+
+    def _remove_written(self, count: int) -> None:
+        self._statistics.sent += count
+        self._backlog -= count
+        count += self._written
+        while self._queue and count >= len(self._queue[0][1]):
+            count -= len(self._queue.popleft()[1])
+        self._written = count
+
+
+class SerialTransport(Transport[bytes]):
+    """A serial port."""
+
+    @abstractmethod
+    def set_baud(self, baud: int) -> None:
+        """Change the bit rate as soon as the queue has been sent."""
+
+
+class PacedTransport(SerialTransport):
+    """Common base: a port behind a paced writer."""
+
+    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
+        super().__init__(description)
+        self._schedule = schedule
+        self._writer: PacedWriter | None = None
+
+    def set_baud(self, baud: int) -> None:
+        """Change the bit rate once the queue is empty."""
+        if self._writer is None:
+            self._change_rate(baud)
+        else:
+            self._writer.when_idle(partial(self._change_rate, baud))
+
+    def _change_rate(self, baud: int) -> None:
+        """Change the bit rate; the queue is empty."""
+        if self._schedule is not None:
+            self._schedule = PacingSchedule(baud)
+            if self._writer is not None:
+                self._writer.schedule = self._schedule
+
+    @abstractmethod
+    def _write(self, data: bytes) -> int:
+        """Write without blocking; return how many bytes were accepted."""
+
+    def _make_writer(self) -> None:
+        self._writer = PacedWriter(self._write, self._schedule, self.statistics)
+
+    def send(self, item: bytes) -> bool:
+        """Queue a message, whole or not at all; without an open port it is dropped."""
+        if self._writer is None:
+            self.statistics.dropped += len(item)
+            return False
+        return self._writer.send(item)
+
+    async def drain(self) -> None:
+        """Wait until the queue is empty."""
+        if self._writer is not None:
+            await self._writer.drain()
+
+    def _drop_writer(self) -> None:
+        if self._writer is not None:
+            self._writer.clear()
+            self._writer = None
+
+    def _process_received(self, data: bytes) -> None:
+        self.statistics.received += len(data)
+        self._receive(data)
+
+
+def write_fd(fd: int, data: bytes) -> int:
+    """Write to a non-blocking descriptor; return how many bytes it accepted, 0 if it is full."""
+    try:
+        return os.write(fd, data)
+    except BlockingIOError:
+        return 0
+
+
+@contextlib.contextmanager
+def termios_as_os_error() -> Iterator[None]:
+    """Raise `termios.error`, which does not derive from OSError, as an OSError."""
+    try:
+        yield
+    except termios.error as error:
+        raise OSError(*error.args) from None

@@ -1,0 +1,236 @@
+"""Serial transport over a pseudo-terminal, and the detection of who has its slave side open.
+
+A wire keeps nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while nobody has the
+slave side open. inotify reports the openings and closings when one peer leaves and another comes at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import errno
+import os
+import select
+import struct
+import termios
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from starhil.protocol.flow import TURN
+from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
+
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
+_IN_CLOSE: Final = 0x08 | 0x10
+_IN_OPEN: Final = 0x20
+_EVENT: Final = struct.Struct("iIII")
+_EVENTS_SIZE: Final = 256 * _EVENT.size
+
+
+class PtyPeers:
+    """Watches the slave side of a pseudo-terminal, which this process must not hold open.
+
+    Parameters
+    ----------
+    master
+        File descriptor of the master side.
+    path
+        Path of the slave side.
+
+    Without inotify (the system has no more instances), a peer that leaves and is replaced at once goes unnoticed.
+    """
+
+    def __init__(self, master: int, path: str) -> None:
+        self._master = master
+        self._path = path
+        self._hang_up = select.poll()
+        self._hang_up.register(master, 0)
+        self._events = _watch(path)
+        self._wake = select.epoll()
+        self._wake.register(master, select.EPOLLIN | select.EPOLLET)  # a hang-up lasts: report it once
+        if self._events >= 0:
+            self._wake.register(self._events, select.EPOLLIN)
+        self._present = self.present
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when data wait or a peer came or left."""
+        return self._wake.fileno()
+
+    def acknowledge(self) -> None:
+        """Acknowledge a wake-up, so that the next event causes another."""
+        self._wake.poll(0)
+
+    @property
+    def present(self) -> bool:
+        """Whether a peer has the slave side open now."""
+        return not self._hang_up.poll(0)
+
+    def all_left(self) -> bool:
+        """Return whether all peers have left since the last call, if only for a moment."""
+        before, self._present = self._present, self.present
+        return _replaced(self._new_events()) or (before and not self._present)
+
+    def discard_unread(self) -> None:
+        """Drop what was written to the master and has not been read."""
+        termios.tcflush(self._master, termios.TCOFLUSH)  # on the way to the line discipline
+        with contextlib.suppress(PermissionError, BlockingIOError):
+            slave = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            try:
+                termios.tcflush(slave, termios.TCIFLUSH)  # in the line discipline
+            finally:
+                os.close(slave)
+        for (
+            _
+        ) in self._new_events():  # of this call, and of peers that came since, for whom nothing stale is left
+            pass
+        self._present = self.present
+
+    def close(self) -> None:
+        """Close the descriptors."""
+        self._wake.close()
+        if self._events >= 0:
+            os.close(self._events)
+            self._events = -1
+
+    def _new_events(self) -> Iterator[int]:
+        """Yield the masks of the events since the last call, oldest first."""
+        while self._events >= 0:
+            try:
+                data = os.read(self._events, _EVENTS_SIZE)
+            except BlockingIOError:
+                return
+            for _, mask, _, _ in _EVENT.iter_unpack(data):  # events of a watched file carry no names
+                yield mask
+
+
+def _replaced(events: Iterator[int]) -> bool:
+    """Return whether the file was opened after it had been closed."""
+    closed = replaced = False
+    for mask in events:
+        closed |= bool(mask & _IN_CLOSE)
+        replaced |= closed and bool(mask & _IN_OPEN)
+    return replaced
+
+
+def _watch(path: str) -> int:
+    """Return an inotify descriptor for a file's openings and closings, or -1 if none is left."""
+    events = int(_LIBC.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC))
+    if events >= 0 and _LIBC.inotify_add_watch(events, os.fsencode(path), _IN_OPEN | _IN_CLOSE) < 0:
+        os.close(events)
+        return -1
+    return events
+
+
+class PtyTransport(PacedTransport):
+    """A new pseudo-terminal; peers open its slave side like any tty, as often as they want.
+
+    As on a wire, bytes sent while no peer has the slave side open are lost, and so are those that a peer left unread.
+    """
+
+    def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
+        super().__init__("pty", schedule)
+        self._symlink = symlink
+        self._path = ""
+        self._master = -1
+        self._peers: PtyPeers | None = None
+
+    async def _open(self) -> None:
+        try:
+            self._master, slave = os.openpty()
+        except OSError as error:
+            raise TransportError(
+                f"serial pty: the system has no pseudo-terminal left: {error.strerror}"
+            ) from None
+        try:
+            with termios_as_os_error():
+                tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            self._path = os.ttyname(slave)
+            if self._symlink is not None:
+                self._make_symlink(self._symlink, self._path)
+        except OSError as error:
+            self._close_master()
+            raise TransportError(f"serial pty: cannot be set up: {error.strerror}; try again") from None
+        except TransportError:
+            self._close_master()
+            raise
+        finally:
+            os.close(slave)  # the master reports a hang-up while no peer has it open
+        self.description = str(self._symlink) if self._symlink is not None else self._path
+        self._make_writer()
+        self._peers = PtyPeers(self._master, self._path)
+        asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
+
+    def _make_symlink(self, link: Path, path: str) -> None:
+        try:
+            if link.exists() and not link.is_symlink():
+                raise TransportError(f"serial: {link} exists and is not a symlink; choose another name")
+            temporary = link.with_name(f".{link.name}.{os.getpid()}")
+            temporary.symlink_to(path)
+            temporary.replace(link)
+        except OSError as error:
+            raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
+
+    def _readable(self) -> None:
+        if self._peers is None:
+            return
+        self._peers.acknowledge()
+        self._drop_unread(self._peers)
+        try:
+            data = os.read(self._master, TURN)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            if error.errno != errno.EIO:  # EIO: no peer has the slave side open
+                self._report_error(f"serial {self.description}: {error.strerror}")
+            return
+        asyncio.get_running_loop().call_soon(self._readable)  # one wake-up stands for all waiting data
+        self._process_received(data)
+
+    def _drop_unread(self, peers: PtyPeers) -> None:
+        """Drop what a peer that left has not read, and what is queued for it."""
+        if peers.all_left():
+            if self._writer is not None:
+                self._writer.clear()
+            peers.discard_unread()
+
+    def send(self, item: bytes) -> bool:
+        """Queue a message, whole or not at all; without a peer it is dropped."""
+        if self._peers is not None:
+            self._drop_unread(self._peers)
+            if not self._peers.present:
+                self.statistics.dropped += len(item)
+                return False
+        return super().send(item)
+
+    def _write(self, data: bytes) -> int:
+        if self._peers is None:
+            raise OSError(errno.EBADF, "port is closed")
+        if self._peers.all_left():
+            self._peers.discard_unread()
+            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops its queue
+        if not self._peers.present:
+            raise OSError(errno.ENOTCONN, "no peer")
+        return write_fd(self._master, data)
+
+    async def close(self) -> None:
+        """Close the pseudo-terminal and remove the symlink if it still points to it."""
+        if self._peers is None:
+            return
+        asyncio.get_running_loop().remove_reader(self._peers.fileno())
+        self._drop_writer()
+        if self._symlink is not None:
+            with contextlib.suppress(OSError):
+                if str(self._symlink.readlink()) == self._path:
+                    self._symlink.unlink()
+        self._peers.close()
+        self._peers = None
+        self._close_master()
+
+    def _close_master(self) -> None:
+        os.close(self._master)
+        self._master = -1
