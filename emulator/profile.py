@@ -180,7 +180,7 @@ class Profile(Strict):
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the star identification algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
-    """Where the sensor really looks."""
+    """True attitude of the sensor."""
     device: DeviceConfig = DeviceConfig()
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()

@@ -233,7 +233,7 @@ def truth() -> str:
 
 
 def kind_of(model: type[BaseModel]) -> str:
-    """Return the value of a model's first key, by which it is told from its alternatives."""
+    """Return the value of a model's first key, which distinguishes it from its alternatives."""
     field = next(iter(model.model_fields.values()))
     return str(get_args(field.annotation)[0])
 
@@ -283,8 +283,7 @@ def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> li
         if field.name in (skipped or {}):
             continue
         low, high = _RANGES.get(field.name, (None, None))
-        free = low is None or abs(low) >= 1e5
-        allowed = "" if free else f"{number(low)} to {number(high)}"
+        allowed = "" if low is None or high is None or abs(low) >= 1e5 else f"{number(low)} to {number(high)}"
         value = "required" if field.default is dataclasses.MISSING else literal(field.default)
         rows.append((f"`{field.name}`", unit(field.name), allowed, value, texts[field.name]))
     return rows
@@ -294,10 +293,12 @@ def identifier() -> str:
     """Options of each algorithm, as the emulator accepts them in `[identifier]`."""
     import importlib
 
+    from starhil.emulator.profile import RunConfig
     from starid.interface import ALGORITHMS
 
     parts = []
-    for algorithm, (module, name) in ALGORITHMS.items():
+    for algorithm in get_args(RunConfig.model_fields["algorithm"].annotation):
+        module, name = ALGORITHMS[algorithm]
         solver = getattr(importlib.import_module(module), name)
         texts = documented_names(solver)
         for options in get_args(get_type_hints(solver.__init__).get("options")):
@@ -312,12 +313,12 @@ def identifier() -> str:
 def accepted_options(algorithm: str) -> list[str]:
     """Return the options that the emulator names when it rejects another."""
     from starhil.emulator.errors import EmulatorError
-    from starhil.emulator.pipeline.identifiers import IdentifierChoice
+    from starhil.emulator.pipeline.star_identifiers import StarIdentifierSetup
     from starid.camera import DEFAULT_CAMERA
     from starid.catalog import load_catalog
 
     try:
-        IdentifierChoice(algorithm, DEFAULT_CAMERA, 1.0, (("no_option", 1),)).make(load_catalog())
+        StarIdentifierSetup(algorithm, DEFAULT_CAMERA, 1.0, (("no_option", 1),)).make(load_catalog())
     except EmulatorError as error:
         return str(error).partition("known: ")[2].split(", ")
     raise SystemExit(f"{algorithm}: accepts an option that it does not have")

@@ -67,7 +67,7 @@ POWER_OFF: Final = 0x4321FEDC
 
 
 class GuestError(Exception):
-    """The guest cannot be had or did not do its work; carries the exit status to end with."""
+    """The guest is not available or failed; carries the exit status to end with."""
 
     def __init__(self, text: str, status: int) -> None:
         super().__init__(text)

@@ -141,7 +141,7 @@ def measure_centroids(
     sensor, camera : optional
         The defaults of the product unless given.
     progress : callable, optional
-        Told in a line what is being done.
+        Receives a line about each step.
 
     Returns
     -------

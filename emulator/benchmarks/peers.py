@@ -82,7 +82,7 @@ class Solver:
     track : callable or None
         Answers a scene near a predicted attitude, where it can.
     database_bytes : int or None
-        Size of its database, where it can be told.
+        Size of its database, if known.
     build_seconds : float or None
         Time that building the database took, where that was measured apart from anything else.
     """

@@ -86,7 +86,7 @@ class StarIdentifierSetup:
 def _known_options(algorithm: type) -> dict[str, str]:
     """Return the type of each option of an algorithm's class: its keywords, and the fields of `options`."""
     types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
-    for held in get_args(get_type_hints(vars(algorithm)["__init__"]).get("options")):
+    for held in get_args(get_type_hints(inspect.getattr_static(algorithm, "__init__")).get("options")):
         if is_dataclass(held):
             types |= {field.name: str(field.type) for field in fields(held)}
     return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}

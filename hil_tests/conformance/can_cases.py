@@ -260,7 +260,7 @@ def pause_between(probe: CanProbe) -> None:
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("anew", "a message may restart before its end", rule(8))
+@SEGMENTS.case("restart", "a message may restart before its end", rule(8))
 def restarted_message(probe: CanProbe) -> None:
     frames = _segment_frames(probe, UNKNOWN, LONG)
     _send(probe, frames[:2] + frames)

@@ -129,7 +129,7 @@ def _pdos(layout: CanopenModel) -> Section:
     rows += [("RPDO", number, pdo) for number, pdo in enumerate(layout.rpdo, 1)]
     return Section(
         "CANopen PDOs",
-        ("The mapping by default; all of them can be mapped anew while the node is running.",),
+        ("The mapping by default; all of them can be remapped while the node is running.",),
         ("PDO", "Name", "At start", "Transmission type", "Mapped"),
         tuple((f"{kind} {number}", *_pdo(pdo)) for kind, number, pdo in rows),
     )

@@ -9,7 +9,7 @@ rotates, so no circular shift is needed. Patterns are found by an index over the
 
 own choice: 200 elements over the diameter, pattern radius and buffer those of `starid.classic.grid`; an observed neighbour votes for a
 guide star that has one in the same element or the next, whose angle differs by at most 4°. (Position and angle together fix a neighbour's
-place, up to its mirror image at equal x', which the sign of the angle tells apart.)
+place, up to its mirror image at equal x', which the sign of the angle distinguishes.)
 own choice: the angle of a near neighbour is uncertain, so the allowed difference grows inversely with its distance from the pivot.
 """
 

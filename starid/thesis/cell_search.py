@@ -3,7 +3,7 @@
 The 8-bit vectors are sorted into the buckets of an implicit binary tree: each level halves the rank of one feature,
 so that a bucket is a prefix of interleaved bits and the tree needs no nodes. A search descends it depth first and cuts
 every branch whose box is farther than the best found. Full-precision answers come from the same tree: a stored code
-tells each feature to half a step, so that a cell can be passed over unless its box comes nearer than the best exact
+gives each feature to half a step, so that a cell can be passed over unless its box comes nearer than the best exact
 distance; only what is left is computed from the stars.
 """
 

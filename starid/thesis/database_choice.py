@@ -52,14 +52,14 @@ def given_database(path: Path, parameters: DatabaseParameters, stars: Collection
             f"{numbers[1]:.2f} px, not {parameters.focal_px:.2f} and {parameters.half_width_px:.2f}"
         )
     if made.direction != parameters.direction or made.full_field != parameters.full_field:
-        raise DatabaseError(f"database: {path} does not hold circles of the brightest stars; build it anew")
+        raise DatabaseError(f"database: {path} does not hold circles of the brightest stars; build it again")
     if made.band != parameters.band:
         raise DatabaseError(
             f"database: {path} is made of {made.band} magnitudes; a sensor needs one with --band {parameters.band}"
         )
     if database.catalog_identity not in stars:
         raise DatabaseError(
-            f"database: {path} belongs to another catalogue or epoch ({database.catalog_identity}); build it anew"
+            f"database: {path} belongs to another catalogue or epoch ({database.catalog_identity}); build it again"
         )
     return database
 
@@ -104,5 +104,5 @@ def _load(path: Path) -> FeatureDatabase | None:
             return None
         return load_database(path)
     except (OSError, DatabaseError) as error:
-        _log.warning("cache file %s is not usable (%s): built anew", path, error)
+        _log.warning("cache file %s is not usable (%s): built again", path, error)
         return None

@@ -63,7 +63,7 @@ class FilterResult:
 
 
 class FalseStarFilter(Protocol):
-    """What tells true stars from false ones in two successive frames."""
+    """What separates true stars from false ones in two successive frames."""
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
         """Compare two successive frames; with nothing to go by every object is taken for a false star."""

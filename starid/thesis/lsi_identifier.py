@@ -97,7 +97,7 @@ class LsiReport:
 
 @dataclass(frozen=True)
 class LsiOptions:
-    """What an LSI identifier can be told.
+    """Settings of an LSI identifier.
 
     Attributes
     ----------

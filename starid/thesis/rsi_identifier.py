@@ -1,6 +1,6 @@
 """The RSI algorithm for a real sensor: filter, motion, a region of search on the sphere, and LSI when that fails.
 
-It is the thesis's recursion with one difference: whether the region's answer is good enough is not told by ε_ψ, which on
+It is the thesis's recursion with one difference: whether the region's answer is good enough is not judged by ε_ψ, which on
 the sphere and with stars near the brightness limit says little, but by the verification that every answer has to pass.
 """
 
@@ -59,7 +59,7 @@ class RsiStatistics:
 
 @dataclass(frozen=True)
 class RsiOptions(LsiOptions):
-    """What an RSI identifier can be told: all that the LSI one can, and this.
+    """Settings of an RSI identifier: those of the LSI one, and these.
 
     Attributes
     ----------

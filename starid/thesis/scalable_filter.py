@@ -2,7 +2,7 @@
 
 Objects are followed from frame to frame in the frame that moves with the stars. Transient objects (radiation hits,
 glints) are not seen again; stationary ones (hot pixels) stay where the stars have moved on; drifting ones (debris, other
-satellites) leave the gate. Where the motion is so slow that the last two stay within it, they are told by their scatter
+satellites) leave the gate. Where the motion is so slow that the last two stay within it, they are recognised by their scatter
 about their place among the stars. All of it costs a few operations per pair of objects, where the list of the thesis
 grows with their fourth power.
 """
@@ -56,7 +56,7 @@ class TrackFilterSettings:
         Frames that a star may be missing before it is forgotten.
     confirm
         Sightings that make an object a true star, once that many frames have been seen. Two are enough where all
-        false stars are transient and positions are good; slow ones need three to be told.
+        false stars are transient and positions are good; slow ones need three to be recognised.
     """
 
     position_sigma_deg: float = 0.02

@@ -218,7 +218,7 @@ def sky_sequence(
 ) -> Iterator[SimulatedFrame]:
     """Frames of the flat sky in motion, for the recursive algorithm; every one has its noise.
 
-    The stars are drawn anew from the sky for each frame, so that stars enter as well as leave.
+    The stars are drawn again from the sky for each frame, so that stars enter as well as leave.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 While no star enters or leaves the frame, n, A and σ_A do not change with the boresight and r and σ_r are smooth functions
 of it: two equations for two unknowns. Newton's method from each of the k nearest cells therefore either lands on the
-frame itself or on a place whose features, computed there from the stars, do not fit; the residual of all five tells
+frame itself or on a place whose features, computed there from the stars, do not fit; the residual of all five shows
 which. What limits the thesis's form off the grid is thus named: the cell that looks nearest often has another star
 at its rim, and a combination of cells cannot undo that.
 """

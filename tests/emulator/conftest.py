@@ -43,7 +43,7 @@ STARS = (
 
 @dataclass
 class FakePipeline:
-    """Answers each request at once: the attitude is the truth, unless it is told to fail."""
+    """Answers each request at once: the attitude is the truth, unless it is set to fail."""
 
     requests: list[PipelineRequest] = field(default_factory=list)
     fail: str = ""
@@ -123,7 +123,7 @@ class Bench:
         return self
 
     def step(self, seconds: float) -> None:
-        """Let run time pass."""
+        """Let simulation time pass."""
         end_ns = self.clock.now_ns() + round(seconds * 1e9)
         while (event := self.device.scheduler.pop_due(end_ns)) is not None:
             self.clock.set_ns(max(event.due_ns, self.clock.now_ns()))
@@ -163,7 +163,7 @@ def bench() -> Bench:
 
 @pytest.fixture
 def make_bench() -> Callable[..., Bench]:
-    """Make devices of one's own."""
+    """Make devices with custom settings."""
     return Bench
 
 

@@ -29,7 +29,7 @@ ACCURACY_ARCSEC = 20.0
 ICD = load_icd()
 
 
-def told(errors: str) -> list[str]:
+def log_lines(errors: str) -> list[str]:
     """Lines on stderr, but for the one that asks for patience."""
     return [line for line in errors.splitlines() if "a first start compiles" not in line]
 
@@ -94,7 +94,7 @@ class Emulator:
         self.control.close()
         self.process.send_signal(number)
         _, errors = self.process.communicate(timeout=30)
-        return self.process.returncode, told(errors)
+        return self.process.returncode, log_lines(errors)
 
 
 @pytest.fixture(scope="module")
@@ -300,6 +300,6 @@ def test_bad_input_ends_in_one_line_and_status_2(arguments, said):
     done = subprocess.run(command, capture_output=True, text=True, timeout=READY_WITHIN_S, check=False)
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
-    (line,) = told(done.stderr)
+    (line,) = log_lines(done.stderr)
     assert line.startswith("starhil: ")
     assert said in line

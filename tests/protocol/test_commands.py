@@ -22,22 +22,22 @@ def starhil(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_export_writes_stdout_or_a_whole_file(tmp_path: Path) -> None:
-    told = starhil("icd", "export", "markdown")
-    assert (told.returncode, told.stderr) == (0, "")
+    done = starhil("icd", "export", "markdown")
+    assert (done.returncode, done.stderr) == (0, "")
     file = tmp_path / "icd.md"
     written = starhil("icd", "export", "markdown", "-o", str(file))
     assert (written.returncode, written.stdout, written.stderr) == (0, "", "")
-    assert file.read_text() == told.stdout
+    assert file.read_text() == done.stdout
     assert list(tmp_path.iterdir()) == [file]
 
 
 def test_list_tells_every_row_and_parameter() -> None:
-    told = json.loads(starhil("icd", "list", "--json").stdout)
+    done = json.loads(starhil("icd", "list", "--json").stdout)
     icd = load_icd()
-    assert [(row["id"], row["name"], row["size"]) for row in told["rows"]] == [
+    assert [(row["id"], row["name"], row["size"]) for row in done["rows"]] == [
         (r.id, r.name, r.size) for r in icd.rows
     ]
-    assert [parameter["name"] for parameter in told["parameters"]] == list(icd.parameters)
+    assert [parameter["name"] for parameter in done["parameters"]] == list(icd.parameters)
 
 
 @pytest.mark.parametrize(

@@ -297,8 +297,8 @@ frames = st.one_of(
 @given(frames)
 def test_frames_survive_both_directions(frame: CanFrame) -> None:
     assert parse_send(format_send(frame).strip(b"<> ")) == frame
-    told = parse_frame(format_frame(frame, b"1.250000").strip(b"<> "))
-    assert (told.id, told.data, told.extended, told.remote, told.timestamp) == (
+    parsed = parse_frame(format_frame(frame, b"1.250000").strip(b"<> "))
+    assert (parsed.id, parsed.data, parsed.extended, parsed.remote, parsed.timestamp) == (
         frame.id, frame.data, frame.extended, frame.remote, 1.25,
     )  # fmt: skip
 

@@ -48,7 +48,7 @@ _MEAN: Final = (
 )
 _SIDE: Final = "No reading of eq. 6.5 gives the published sides."
 _BEYOND: Final = "The published sides, and how the frames were chosen, are not known at this overlap."
-_MAP: Final = "Which frames the thesis's maps leave out at the rims of the flat plane cannot be told."
+_MAP: Final = "Which frames the thesis's maps leave out at the rims of the flat plane is not known."
 
 
 def _each(reason: str, *quantities: str) -> dict[str, KnownMiss]:

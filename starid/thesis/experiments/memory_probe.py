@@ -13,7 +13,7 @@ import numpy as np
 def peak_bytes() -> int:
     """Greatest resident size of this process so far.
 
-    Linux tells it apart from that of the process it was forked from, which `getrusage` does not.
+    Linux distinguishes it from that of the process it was forked from, which `getrusage` does not.
     """
     status = Path("/proc/self/status")
     if status.exists():

@@ -27,7 +27,7 @@ FIELDS: Final = (
 """What is kept of every frame: ε_f, ε_θ (degrees), ε_ψ, Γ (degrees), cells of the region, times, flags, μ_d, σ_d (degrees)."""
 
 SETTLING: Final = 5
-"""First frames left out of the statistics: false stars cannot be told yet."""
+"""First frames left out of the statistics: false stars cannot be recognised yet."""
 
 LSI_ONLY: Final = 0.0
 """In place of a threshold τ: every frame searches the whole database."""

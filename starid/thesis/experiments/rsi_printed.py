@@ -48,7 +48,7 @@ _WORDS: Final = {
 _STATISTICS: Final = ("f_mean", "f_sigma", "theta_mean", "theta_sigma", "psi_mean", "psi_sigma")
 
 _NOTE: Final = """The clean rows of tables H.1 and H.2 are compared on the frames of figure 6.1, moved off the grid, each searched in the region of
-table 6.8 about its true place: which frames the thesis's sequences held cannot be told. *As the author ran it* is MATLAB's `lasso` on five
+table 6.8 about its true place: which frames the thesis's sequences held is not known. *As the author ran it* is MATLAB's `lasso` on five
 features after a search with the polar angle as a sixth one; *as printed* is the search in five features and eq. 2.34, solved
 exactly. The tolerance is one published standard deviation, as the published means belong to other frames.
 

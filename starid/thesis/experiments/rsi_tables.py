@@ -236,7 +236,7 @@ def rsi_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
 _SETTING_NOTE: Final = f"""Sequences of frames of the flat sky that start at the published frame; from one frame to the next the boresight moves by
 U(−25, 25) px per axis and the frame turns by U(−2.5°, 2.5°). Stars enter and leave; the filter is the scalable one;
 the thesis's own stands in the experiment `rsi-as-printed`; objects are seen two degrees beyond the field of the features, so that a star about to
-enter is known by then. The first {SETTLING} frames, in which false stars cannot yet be told, are left out of the
+enter is known by then. The first {SETTLING} frames, in which false stars cannot yet be recognised, are left out of the
 statistics. "Noise × {EQUIVALENT:g}" is the noise that the published μ_d belongs to. All methods see the same frames."""
 
 _MEMORY_NOTE: Final = """**What makes the mean large, and what mends it.** Half of the answers of the algorithm as printed are within a few

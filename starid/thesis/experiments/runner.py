@@ -38,7 +38,7 @@ class Finished:
     Attributes
     ----------
     experiment, outcome
-        The experiment and what came of it.
+        The experiment and its outcome.
     quick
         Whether it ran with its quick parameters.
     seconds
@@ -189,7 +189,7 @@ def run(
     jobs
         Processes. Experiments that measure time run afterwards, one at a time.
     progress
-        Told of every part that ends.
+        Called with every part that ends.
 
     Raises
     ------

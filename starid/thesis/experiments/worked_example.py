@@ -71,7 +71,7 @@ weighted with a − min(a), the magnitudes counted from the brightest star of th
 deviations are roots of variances over n − 1 (eqs 2.6 and 2.8 print variances over n). The normalisation printed with eq. 5.1 is that of
 the database of p = 98 %; the example itself goes on with that of 96 %. From there the author's program was MATLAB's `lasso` on *six* features,
 the polar angle as θ/3.6 among them. The printed ω is ω/Σω, with which the boresight is F·ω, while the printed features T·ω are those of
-ω itself, brought back to their units. Which λ a cross-validation took cannot be told, as its folds are random: the printed weights, and within
+ω itself, brought back to their units. Which λ a cross-validation took is not known, as its folds are random: the printed weights, and within
 a few units of their last digit the printed reconstructions, are those of λ = 1.00 and 1.40. "As printed" is eq. 2.34 on five features, solved
 exactly, at the λ of the least error."""
 

@@ -140,7 +140,7 @@ def test_a_capture_is_done_though_frames_stop_before_the_next_one(bench, stop):
         bench.command("set_mode", mode="standby")
     else:
         bench.device.modes.fail("sensor")
-    bench.step(0.25)  # exposed anew, and stored
+    bench.step(0.25)  # exposed again, and stored
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
     (frame,) = bench.pipeline.frames[count:]
     assert not frame.solve

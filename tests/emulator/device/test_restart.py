@@ -47,7 +47,7 @@ def test_saved_parameters_survive_a_restart_and_others_do_not(make_bench, tmp_pa
 
 
 class LaterBackground:
-    """A writer that does nothing until it is told to, as a slow disk."""
+    """A writer that does nothing until it is released, as a slow disk."""
 
     def __init__(self):
         self.waiting = []
@@ -114,12 +114,12 @@ def test_a_save_that_fails_after_a_reset_takes_back_nothing_that_the_next_one_wr
     assert bench.device.parameters["exposure"] == 55
 
 
-def told_by(bench):
-    told = []
+def changes_of(bench):
+    reported = []
     bench.device.parameters.observe(
-        lambda names: told.append({name: bench.device.parameters[name] for name in names})
+        lambda names: reported.append({name: bench.device.parameters[name] for name in names})
     )
-    return told
+    return reported
 
 
 @pytest.mark.parametrize("restart", ["reset", "restore_parameters"])
@@ -127,10 +127,10 @@ def test_what_stays_as_it_is_saved_is_no_change(bench, restart):
     bench.device.parameters.set({"canopen_node": 45, "exposure": 55})
     bench.command("save_parameters")
     bench.device.parameters.set({"exposure": 77, "analog_gain": 2.0})
-    told = told_by(bench)
+    reported = changes_of(bench)
     bench.command(restart)
     bench.step(1.0)
-    assert told == [{"exposure": 55, "analog_gain": 1.0}]
+    assert reported == [{"exposure": 55, "analog_gain": 1.0}]
     assert bench.device.parameters["canopen_node"] == 45
 
 
@@ -171,9 +171,9 @@ def test_forgotten_parameters_are_defaults_after_the_next_restart(make_bench, tm
     bench = make_bench(store=FileStore(tmp_path)).start()
     bench.command("set_parameter", parameter=1, value=55.0)
     bench.command("save_parameters")
-    told = []
-    bench.device.forget_parameters(told.append)
-    assert told == [None]
+    reported = []
+    bench.device.forget_parameters(reported.append)
+    assert reported == [None]
     assert bench.device.parameters["exposure"] == 55
     assert bench.read("device_status")["parameters_changed"]
     bench.command("reset")

@@ -343,7 +343,7 @@ def test_bus_that_was_lost_and_is_back_is_an_emergency(linked):
 @given(st.floats(0.0, 1e9))
 def test_a_deadline_is_never_taken_for_a_time_before_it(deadline):
     due_ns = not_before(deadline)
-    assert due_ns / NANOSECONDS >= deadline  # as the link tells the time
+    assert due_ns / NANOSECONDS >= deadline  # as the link reports the time
     assert Fraction(due_ns - 1, NANOSECONDS) < Fraction(deadline)
 
 

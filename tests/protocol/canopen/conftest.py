@@ -198,12 +198,12 @@ def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
     class RestlessApplication(package.StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""
 
-        looks = 0
+        reads = 0
 
         def telemetry(self, row):
             if row.name == "precise_attitude":
-                self.looks += 1
-                self.rows[row.name] = {"frame_counter": self.looks}
+                self.reads += 1
+                self.rows[row.name] = {"frame_counter": self.reads}
             return super().telemetry(row)
 
     dictionary.application = RestlessApplication(dictionary.icd)

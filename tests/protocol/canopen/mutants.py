@@ -33,9 +33,9 @@ class Mutant:
 
 MUTANTS = (
     # SDO, expedited and segmented
-    Mutant("upload tells the wrong number of unused bytes", "sdo", "sdo", "bytes([0x43 | unused << 2])", "bytes([0x43])"),
-    Mutant("segmented upload tells no size", "sdo", "sdo", "bytes([0x41]) + multiplexer", "bytes([0x40]) + multiplexer"),
-    Mutant("segmented upload tells a wrong size", "sdo", "sdo", 'multiplexer + len(value).to_bytes(4, "little")]', 'multiplexer + (len(value) + 1).to_bytes(4, "little")]'),
+    Mutant("upload reports the wrong number of unused bytes", "sdo", "sdo", "bytes([0x43 | unused << 2])", "bytes([0x43])"),
+    Mutant("segmented upload reports no size", "sdo", "sdo", "bytes([0x41]) + multiplexer", "bytes([0x40]) + multiplexer"),
+    Mutant("segmented upload reports a wrong size", "sdo", "sdo", 'multiplexer + len(value).to_bytes(4, "little")]', 'multiplexer + (len(value) + 1).to_bytes(4, "little")]'),
     Mutant("download answered without its multiplexer", "sdo", "sdo", "return [bytes([0x60]) + data[1:4] + bytes(4)]", "return [bytes([0x60]) + bytes(7)]"),
     Mutant("upload toggle bit not checked", "sdo", "sdo_transfer", "if command >> 5 != 3:\n            return super().request(data)\n        if command & 0x10 != self._toggle:", "if command >> 5 != 3:\n            return super().request(data)\n        if False:"),
     Mutant("download toggle bit not checked", "sdo", "sdo_transfer", "if command >> 5 != 0:\n            return super().request(data)\n        if command & 0x10 != self._toggle:", "if command >> 5 != 0:\n            return super().request(data)\n        if False:"),
@@ -82,12 +82,12 @@ MUTANTS = (
     Mutant("high limit not checked", "od", "dictionary", "if variable.max is not None and value > variable.max:", "if False:"),
     Mutant("low limit off by one", "od", "dictionary", "value < variable.min:", "value < variable.min - 1:"),
     Mutant("values not kept", "od", "dictionary", "        entry.value = data\n        self.changed", "        self.changed"),
-    Mutant("a default that is not the data sheet's", "od", "dictionary", "if index in indices and entry.reader is None:", "if index in indices and entry.reader is None and index != 0x1017:"),
+    Mutant("a default that is not the EDS's", "od", "dictionary", "if index in indices and entry.reader is None:", "if index in indices and entry.reader is None and index != 0x1017:"),
     Mutant("default identifiers without the node-ID", "od", "dictionary", "        default += node_id\n", "        default += 0\n"),
     # NMT and error control
     Mutant("state is left by an error in PRE-OPERATIONAL only", "error-control", "slave", "behaviour == 0 and self.state is NmtState.OPERATIONAL", "behaviour == 0 and self.state is NmtState.PRE_OPERATIONAL"),
     Mutant("no boot-up message", "nmt", "slave", 'context.send(ERROR_CONTROL + context.node_id, b"\\0")', "pass"),
-    Mutant("boot-up message tells PRE-OPERATIONAL", "nmt", "slave", 'context.send(ERROR_CONTROL + context.node_id, b"\\0")', 'context.send(ERROR_CONTROL + context.node_id, b"\\x7f")'),
+    Mutant("boot-up message reports PRE-OPERATIONAL", "nmt", "slave", 'context.send(ERROR_CONTROL + context.node_id, b"\\0")', 'context.send(ERROR_CONTROL + context.node_id, b"\\x7f")'),
     Mutant("starts by itself", "nmt", "slave", "        context.state = NmtState.PRE_OPERATIONAL\n", "        context.state = NmtState.OPERATIONAL\n"),
     Mutant("commands to all nodes ignored", "nmt", "slave", "frame.data[1] not in {0, self.node_id}", "frame.data[1] != self.node_id"),
     Mutant("commands to other nodes obeyed", "nmt", "slave", "or frame.data[1] not in {0, self.node_id}", ""),
@@ -95,7 +95,7 @@ MUTANTS = (
     Mutant("stop and PRE-OPERATIONAL exchanged", "nmt", "slave", "2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL", "128: NmtState.STOPPED, 2: NmtState.PRE_OPERATIONAL"),
     Mutant("reset of communication ignored", "nmt", "slave", "elif command in {RESET_NODE, RESET_COMMUNICATION}:", "elif command == RESET_NODE:"),
     Mutant("reset does not restore parameters", "nmt", "slave", "        self.store.load(COMMUNICATION)\n", ""),
-    Mutant("heartbeat tells PRE-OPERATIONAL always", "error-control", "error_control", "bytes([self._context.state]))\n            self._next", "bytes([0x7F]))\n            self._next"),
+    Mutant("heartbeat reports PRE-OPERATIONAL always", "error-control", "error_control", "bytes([self._context.state]))\n            self._next", "bytes([0x7F]))\n            self._next"),
     Mutant("heartbeat at a tenth of its period", "error-control", "error_control", "self._producer.number() * 1e-3, now)", "self._producer.number() * 1e-4, now)"),
     Mutant("heartbeat not switched off", "error-control", "error_control", "period_ms * 1e-3 if period_ms else None\n\n    def _producer", "(period_ms or 50) * 1e-3\n\n    def _producer"),
     Mutant("guarding does not toggle", "error-control", "error_control", "self._toggle ^= 0x80", "pass"),
@@ -134,7 +134,7 @@ MUTANTS = (
     Mutant("acyclic TPDO at every SYNC", "tpdo", "pdo", "            if self._event:\n                self._send()\n            return", "            self._send()\n            return"),
     Mutant("SYNC start value ignored", "tpdo", "pdo", "if counter and counter != self.records.sync_start:", "if False:"),
     Mutant("event-driven TPDO at SYNC", "tpdo", "pdo", "if not self.active or not self._synchronous:\n            return", "if not self.active:\n            return\n        if not self._synchronous:\n            self._send()\n            return"),
-    Mutant("event timer not started anew", "tpdo", "pdo", "        self._event = False\n        self._restart_timer()\n        try:", "        self._event = False\n        self._event_at = None\n        try:"),
+    Mutant("event timer not restarted", "tpdo", "pdo", "        self._event = False\n        self._restart_timer()\n        try:", "        self._event = False\n        self._event_at = None\n        try:"),
     Mutant("inhibit time ignored", "tpdo", "pdo", "self._free_at = self._context.now + self.records.inhibit_s", "self._free_at = self._context.now"),
     Mutant("inhibit time in milliseconds", "tpdo", "pdo_mapping", "self._inhibit.number() * 1e-4", "self._inhibit.number() * 1e-3"),
     Mutant("no event at a write", "design", "slave", "            self.pdos.trigger(changed)\n", ""),
@@ -167,19 +167,19 @@ MUTANTS = (
     Mutant("LSS obeys while it waits", "lss", "lss", "        elif self.configuring:\n            self._configuration", "        elif True:\n            self._configuration"),
     Mutant("LSS takes any node-ID", "lss", "lss", "valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED", "valid = True"),
     Mutant("LSS node-ID never used", "lss", "slave", "        context.node_id = self.lss.pending_node_id\n", ""),
-    Mutant("LSS tells the pending node-ID", "lss", "lss", "self._send(command, bytes([self._context.node_id]))", "self._send(command, bytes([self.pending_node_id ^ 1]))"),
+    Mutant("LSS reports the pending node-ID", "lss", "lss", "self._send(command, bytes([self._context.node_id]))", "self._send(command, bytes([self.pending_node_id ^ 1]))"),
     Mutant("LSS takes reserved bit rates", "lss", "lss", "BIT_RATES.get(data[2]) if data[1] == 0 else None", "BIT_RATES.get(data[2], 125_000) if data[1] == 0 else None"),
     Mutant("LSS identify ignores ranges", "lss", "lss", "number <= own if step % 2 == 0 else number >= own", "True"),
     Mutant("LSS identify answered by another command", "lss", "lss", "    IDENTIFIED = 0x4F\n", "    IDENTIFIED = 0x47 + 1\n"),
     Mutant("configured node answers fastscan", "lss", "lss", "if not self._unconfigured or self.configuring:", "if self.configuring:"),
     Mutant("fastscan compares wrong bits", "lss", "lss", "if number >> bit != self._identity(part) >> bit:", "if number >> bit + 1 != self._identity(part) >> bit + 1:"),
     Mutant("fastscan does not end in configuration", "lss", "lss", "self.configuring = following < part", "self.configuring = False"),
-    # Data sheet
-    Mutant("data sheet with wrong defaults", "od", "eds", 'number = f"0x{item.default:X}" if item.default >= 0 else str(item.default)', 'number = f"0x{item.default ^ 1:X}"'),
-    Mutant("data sheet leaves out an object", "eds", "eds", '        lists[f"{kind}Objects"].append(index)\n', '        if index != 0x1005:\n            lists[f"{kind}Objects"].append(index)\n'),
-    Mutant("data sheet with another number of PDOs", "eds", "eds", '("NrOfTXPDO", str(int(information.nr_of_TXPDO or 0)))', '("NrOfTXPDO", "4")'),
-    Mutant("data sheet with high limits too low", "eds", "eds", "(key, str(int(limit)))", "(key, str(int(limit) // 1000))"),
-    Mutant("data sheet calls everything mappable", "tpdo", "eds", '("PDOMapping", str(int(item.pdo_mappable)))', '("PDOMapping", "1")'),
+    # EDS
+    Mutant("EDS with wrong defaults", "od", "eds", 'number = f"0x{item.default:X}" if item.default >= 0 else str(item.default)', 'number = f"0x{item.default ^ 1:X}"'),
+    Mutant("EDS leaves out an object", "eds", "eds", '        lists[f"{kind}Objects"].append(index)\n', '        if index != 0x1005:\n            lists[f"{kind}Objects"].append(index)\n'),
+    Mutant("EDS with another number of PDOs", "eds", "eds", '("NrOfTXPDO", str(int(information.nr_of_TXPDO or 0)))', '("NrOfTXPDO", "4")'),
+    Mutant("EDS with high limits too low", "eds", "eds", "(key, str(int(limit)))", "(key, str(int(limit) // 1000))"),
+    Mutant("EDS calls everything mappable", "tpdo", "eds", '("PDOMapping", str(int(item.pdo_mappable)))', '("PDOMapping", "1")'),
 )  # fmt: skip
 
 

@@ -16,12 +16,12 @@ from starhil.protocol.can_framing import CanFrame
 NODE = 0x2C
 
 DURAND_FAULTS = {
-    "canopen.eds.bit-rates": "its data sheet supports none",
+    "canopen.eds.bit-rates": "its EDS supports none",
     "canopen.nmt.reset-communication": "parameters are kept over a reset",
     "canopen.sdo.wrong-segment": "the upload goes on after its abort",
     "canopen.sdo.time-out": "none",
     "canopen.sdo.wrong-length": "an empty frame is answered",
-    "canopen.sdo-block.upload": "7 unused bytes told where there are none",
+    "canopen.sdo-block.upload": "7 unused bytes reported where there are none",
     "canopen.sdo-block.upload-sizes": "the same",
     "canopen.sdo-block.upload-without-crc": "the same",
     "canopen.sdo-block.upload-block-size": "checked at the beginning only",
@@ -29,7 +29,7 @@ DURAND_FAULTS = {
     "canopen.sdo-block.upload-order": "not checked",
     "canopen.sdo-block.upload-time-out": "none",
     "canopen.sdo-block.download-gap": "aborted instead of asked for again",
-    "canopen.od.defaults": "1800h:01h is not that of its data sheet",
+    "canopen.od.defaults": "1800h:01h is not that of its EDS",
     "canopen.od.no-sub-index": "1000h:01h answered",
     "canopen.sync.identifier": "not checked",
     "canopen.sync.length": "not reported",

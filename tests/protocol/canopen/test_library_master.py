@@ -159,19 +159,19 @@ def test_whole_session_over_a_bus(network):
     received = threading.Event()
     node.tpdo.read()
     node.tpdo[3].add_callback(lambda _: received.set())
-    told: list[int] = []
-    node.nmt.add_heartbeat_callback(told.append)
+    reported: list[int] = []
+    node.nmt.add_heartbeat_callback(reported.append)
     node.nmt.state = "OPERATIONAL"
-    until(lambda: OPERATIONAL in told)
+    until(lambda: OPERATIONAL in reported)
     assert received.wait(PATIENCE_S)
     with node.sdo["Frame"]["pixels"].open("rb", block_transfer=True) as file:
         assert file.read() == FRAME[:60_000]
     node.network.send_message(0x80, b"\x01")
     until(lambda: any(error.code == 0x8240 for error in node.emcy.log))
     assert [error.register for error in node.emcy.log if error.code == 0x8240] == [0x11]
-    assert BOOT_UP not in told
+    assert BOOT_UP not in reported
     node.nmt.state = "RESET"
-    until(lambda: BOOT_UP in told)
+    until(lambda: BOOT_UP in reported)
     assert bench.slave.node_id == 0x2C
 
 
