@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.thesis.experiments.comparison import Readings, agreement, shown
+from starid.thesis.experiments.comparison import Readings, agreement, same, shown
 from starid.thesis.experiments.experiment import Context, Results, Row, write_csv
 from starid.thesis.experiments.lsi_trials import OFF, ON
 from starid.thesis.experiments.plots import colours, figure, save
@@ -136,12 +136,20 @@ def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
                 if kept.size
                 else ""
             )
+            quantity = f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {_GRID_WORDS[grid]}"
+            remark = f"As the author ran it ε_ψ < 1 in {100.0 * kept.size / below.size:.0f} % of the frames{beyond}."
+            if grid == OFF:
+                rows.append(shown(quantity, **rank, remark=remark))
+                continue
             rows.append(
-                shown(
-                    f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {_GRID_WORDS[grid]}",
+                same(
+                    quantity,
                     published="positive",
-                    **rank,
-                    remark=f"As the author ran it ε_ψ < 1 in {100.0 * kept.size / below.size:.0f} % of the frames{beyond}.",
+                    author=f"{rank['author']:.2f}",
+                    printed=f"{rank['printed']:.2f}",
+                    matches=[rank["author"] > 0.0],
+                    target="> 0",
+                    remark=remark,
                 )
             )
     return rows
