@@ -201,11 +201,10 @@ def test_the_control_channel_answers_as_the_page_shows():
     assert len(pairs) == 2
     command = emulator_command(extra=["--control", "auto", "--clock", "stepped"])
     with EmulatorProcess(command) as emulator:
-        host, _, port = emulator.ready["control"].rpartition(":")
-        with (
-            socket.create_connection((host, int(port)), timeout=30) as channel,
-            channel.makefile("rw") as lines,
-        ):
+        with socket.socket(socket.AF_UNIX) as channel:
+            channel.settimeout(30)
+            channel.connect(emulator.ready["control"].removeprefix("unix:"))
+            lines = channel.makefile("rw")
             for request, answer in pairs:
                 lines.write(request + "\n")
                 lines.flush()

@@ -78,8 +78,8 @@ def command(
         raise EmulatorError(
             f"--rate {' '.join(f'{value:g}' for value in rate)}: must be at most {_FASTEST_DEG_S:g} degrees/s in total"
         )
-    prepare_output(output, "-o")
     image_suffix(output)
+    prepare_output(output, "-o")
     if fov is not None and not fov >= _NARROWEST_DEG:
         raise EmulatorError(f"--fov {fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
     scene = _scene(profile, fov, size, model)

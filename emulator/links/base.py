@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from abc import ABC, abstractmethod
+from collections import deque
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
@@ -85,6 +86,9 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self.transport: Final = transport
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
+        self._held_input: deque[Request | LinkFault] = deque()
+        """Input that arrived while a reply is pending: replies leave in the order of the requests."""
+        self._pending_request: Request | None = None
         self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
         requests.unsolicited_receivers.append(self._send_unsolicited)
         device.on_reset.append(self._reset_receiver)
@@ -121,9 +125,13 @@ class DeviceLink(ABC, Generic[Item, Style]):
         return self._device.clock.now_ns() / NANOSECONDS
 
     def _receive(self, item: Item) -> None:
-        for event in self._receiver.feed(item, self._now()):
-            self._dispatch(event)
+        self._held_input.extend(self._receiver.feed(item, self._now()))
+        self._dispatch_waiting()
         self._schedule_flush()
+
+    def _dispatch_waiting(self) -> None:
+        while self._held_input and self._pending_request is None:
+            self._dispatch(self._held_input.popleft())
 
     def _dispatch(self, event: Request | LinkFault) -> None:
         if isinstance(event, LinkFault):
@@ -131,11 +139,18 @@ class DeviceLink(ABC, Generic[Item, Style]):
             return
         style = self._reply_style()  # the answer to a change of format is still sent in the old one
 
-        def answer(reply: Reply) -> None:
+        def answer_later(reply: Reply) -> None:
             self._send(reply, style)
+            if self._pending_request is event:
+                self._pending_request = None
+                self._dispatch_waiting()
 
-        for reply in self._requests.handle(event, answer) or ():
-            answer(reply)
+        replies = self._requests.handle(event, answer_later)
+        if replies is None:
+            self._pending_request = event
+            return
+        for reply in replies:
+            self._send(reply, style)
 
     def _schedule_flush(self) -> None:
         """Schedule a flush while a message is incomplete."""
@@ -150,8 +165,10 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._schedule_flush()
 
     def _reset_receiver(self) -> None:
-        """Discard incomplete input, as the device has restarted."""
+        """Discard input that is incomplete or waits, as the device has restarted."""
         self._receiver = self._new_receiver()
+        self._held_input.clear()
+        self._pending_request = None
 
     def _log_transport_error(self, error: ProtocolError) -> None:
         log.warning("%s", error)

@@ -83,8 +83,10 @@ def image_suffix(path: Path) -> str:
     Raises
     ------
     StaridError
-        The suffix is not that of a supported format.
+        The suffix is not that of a supported format, or the path is a folder.
     """
+    if path.is_dir():
+        raise StaridError(f"image {path}: is a folder; name a file in it")
     suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
     if suffix not in _SUFFIXES:
         raise StaridError(f"image {path}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")

@@ -1,4 +1,4 @@
-"""Readings of eq. 6.5, the side of the region of search, and of the distances that it is made of."""
+"""Readings of the side of the region of search, and of the distances it depends on."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def side_as_printed(mean_distance_deg: float, sigma_distance_deg: float, gamma_min_deg: float) -> float:
-    """Eq. 6.5 with the number 110 in it, degrees; it falls as the distances grow."""
+    """Side with the printed factor 110, degrees; it falls as the distances grow."""
     power: float = 110.0 ** (-0.5 * math.log10(mean_distance_deg)) * 110.0 ** (
         -0.5 * math.log10(sigma_distance_deg)
     )
@@ -17,7 +17,7 @@ def side_as_printed(mean_distance_deg: float, sigma_distance_deg: float, gamma_m
 
 
 def nearest_distances(transformed: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance of each transformed object, (n, 2), to the nearest that is seen, (m, 2): the "min" of eq. 3.11."""
+    """Distance of each transformed object, (n, 2), to the nearest that is seen, (m, 2): the "min" in the definition of the distances."""
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(seen).query(transformed)

@@ -23,7 +23,7 @@ UNREADABLE = (
         "72C# (IndexError",
     ),
     (
-        Mutant("EMCY of 2 bytes", "emcy", "emergency", 'code.to_bytes(2, "little") + bytes([self._bits()]) + data[:5].ljust(5, b"\\0")', 'code.to_bytes(2, "little")'),
+        Mutant("EMCY of 2 bytes", "emcy", "emergency", "MESSAGE.build(fields)", "MESSAGE.build(fields)[:2]"),
         "canopen.emcy.history-order",
         "(IndexError",
     ),

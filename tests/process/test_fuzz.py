@@ -194,7 +194,7 @@ async def exchange_frames(
     """Send frames and a marking request; return the replies up to that to the mark."""
     link = client.core.link
     watch = BusWatch(mark.id >> 8 & 0xFF)
-    link.on_raw = watch.take
+    link.on_raw = watch.on_frame
     try:
         for frame in [*frames, mark]:
             link.send(frame)

@@ -115,10 +115,14 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
 
 
 def test_an_interrupted_start_ends_the_emulator():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background job
     process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
     timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
     timer.start()
-    with pytest.raises(KeyboardInterrupt), process:
-        pass
+    try:
+        with pytest.raises(KeyboardInterrupt), process:
+            pass
+    finally:
+        signal.signal(signal.SIGINT, before)
     timer.join()
     assert not process.running

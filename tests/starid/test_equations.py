@@ -22,8 +22,8 @@ PRINTED = (
 
 def docstrings():
     for path in sorted(Path(starid.__file__).parent.rglob("*.py")):
-        if "experiments" in path.parts:
-            continue
+        if "experiments" in path.parts or path.name == "reference.py":
+            continue  # these repeat equations whose home is the code that they check
         body = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(body):
             if (

@@ -73,7 +73,7 @@ def test_spherical_features_say_their_unit():
     [
         (("features",), "--ra and --dec"),
         (("features", "--ra", "1", "--dec", "95"), "declination"),
-        (("features", "--ra", "1", "--dec", "5", "--geometry", "round"), "planar, spherical"),
+        (("features", "--ra", "1", "--dec", "5", "--geometry", "round"), "planar or spherical"),
         (("database", "build", "--overlap", "0.995"), "percent"),
         (("database", "info", "no-such-file"), "cannot be read"),
     ],

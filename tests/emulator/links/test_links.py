@@ -21,6 +21,7 @@ from starhil.protocol.can_framing import (
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
 from starhil.protocol.transports.base import Transport
+from tests.process.reference import bodies_in
 
 SEED = 20260101
 JUNK = 10_000
@@ -112,6 +113,36 @@ def test_a_save_is_answered_on_its_link_when_the_disk_is_done(bench, fails):
         waiting.pop()(error)
         assert linked.uart.take()
         assert linked.bus.take() == []
+
+    in_loop(scenario())
+
+
+def test_replies_keep_the_order_of_the_requests_while_a_save_is_pending(bench):
+    async def scenario():
+        linked = await Linked(bench).start()
+        waiting = []
+        bench.device._background = lambda _work, done: waiting.append(done)
+        save = encode_request(Request.of(bench.icd.telecommands["save_parameters"].id))
+        linked.uart.arrive(save + encode_request(Request.of(128)) + save)
+        assert linked.uart.take() == []
+        waiting.pop()(None)
+        assert [len(body) for body in bodies_in(b"".join(linked.uart.take()))] == [1, 8]
+        waiting.pop()(None)
+        assert [len(body) for body in bodies_in(b"".join(linked.uart.take()))] == [1]
+        assert len(linked.over_serial(128)) == 1
+
+    in_loop(scenario())
+
+
+def test_a_restart_ends_the_wait_for_a_pending_save(bench):
+    async def scenario():
+        linked = await Linked(bench).start()
+        waiting = []
+        bench.device._background = lambda _work, done: waiting.append(done)
+        linked.over_serial(bench.icd.telecommands["save_parameters"].id)
+        assert linked.over_serial(128) == []
+        bench.device.reset("command")
+        assert len(linked.over_serial(128)) == 1
 
     in_loop(scenario())
 
