@@ -18,6 +18,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import DeviceError
 from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.raw_traffic import send_and_listen
 from starhil.protocol.can_framing import CanFrame
 from tests.process.conftest import FAST_BAUD
 from tests.process.reference import frame_request
@@ -59,7 +60,7 @@ def own(tmp_path):
 
 def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp_path):
     rng = random.Random(5)
-    emulator = own(settings=["device.boot_s=0"])
+    emulator = own(settings=["device.boot_s=0", "parameters.update_rate=0.2"])
     allowed = {100}
     for turn in range(5):
         with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
@@ -68,19 +69,13 @@ def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp
             assert obc.telemetry("boot_status")["boot_count"] == turn + 1
             for value in range(1000 + 100 * turn, 1003 + 100 * turn):
                 obc.set_parameter("exposure", value)
-                obc.command("save_parameters")
-                # the acknowledge on the link says that the work has begun; this row says that it is done
-                obc.wait_for(
-                    "acknowledge",
-                    lambda reading: bool(reading["processed"]),
-                    within_s=PATIENCE_S,
-                    every_s=0.002,
-                )
+                obc.command("save_parameters")  # answered when it is done
                 kept = value
             obc.set_parameter("exposure", 2000 + turn)
-            obc.command("save_parameters")
-            time.sleep(rng.random() * 0.01)  # the cut comes before, while or after the last one is stored
-            allowed = {kept, 2000 + turn}
+            save = frame_request(obc.icd.telecommands["save_parameters"].id).hex()
+            # the cut comes before, while or after the last one is stored
+            (answered,) = send_and_listen(obc, (save,), rng.random() * 0.01)
+            allowed = {2000 + turn} if answered else {kept, 2000 + turn}
         emulator.restart(signal.SIGKILL)
     emulator.stop()
     files = sorted(path for path in (tmp_path / "state").iterdir() if path.is_file())
