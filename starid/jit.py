@@ -199,7 +199,7 @@ class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
         data = path.read_bytes()
         size = hashlib.sha256().digest_size
         if hashlib.sha256(data[size:]).digest() != data[:size]:
-            _log.warning("%s: damaged, removed; compiled again", path)
+            _log.info("%s: damaged or of another version, removed; compiled again", path)
             path.unlink(missing_ok=True)
             raise FileNotFoundError(path)
         return data[size:]
