@@ -80,8 +80,8 @@ def _tcp_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
 class FairQueue:
     """Lines that wait for one receiver; their senders take turns, one line each.
 
-    Lines of one sender keep their order. When the queue is full, the sender with the most waiting bytes loses its newest
-    line.
+    Lines of one sender keep their order. When the queue is full, the sender with the most waiting bytes loses its oldest
+    line: the stalest one.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class FairQueue:
         dropped = 0
         while self.size > self._limit:
             longest = max(self._sizes, key=lambda each: self._sizes[each])
-            self._note_removed(longest, self._lines[longest].pop())
+            self._note_removed(longest, self._lines[longest].popleft())
             dropped += 1
         return dropped
 
