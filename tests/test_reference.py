@@ -200,16 +200,15 @@ def test_the_control_channel_answers_as_the_page_shows():
     pairs = re.findall(r"^→ (.*)\n← (.*)$", text, re.MULTILINE)
     assert len(pairs) == 2
     command = emulator_command(extra=["--control", "auto", "--clock", "stepped"])
-    with EmulatorProcess(command) as emulator:
-        with socket.socket(socket.AF_UNIX) as channel:
-            channel.settimeout(30)
-            channel.connect(emulator.ready["control"].removeprefix("unix:"))
-            lines = channel.makefile("rw")
-            for request, answer in pairs:
-                lines.write(request + "\n")
-                lines.flush()
-                given = lines.readline().strip()
-                begin, _, end = answer.partition("…")
-                assert json.loads(given)["ok"] is json.loads(answer)["ok"]
-                assert given.startswith(begin), given
-                assert given.endswith(end), given
+    with EmulatorProcess(command) as emulator, socket.socket(socket.AF_UNIX) as channel:
+        channel.settimeout(30)
+        channel.connect(emulator.ready["control"].removeprefix("unix:"))
+        lines = channel.makefile("rw")
+        for request, answer in pairs:
+            lines.write(request + "\n")
+            lines.flush()
+            given = lines.readline().strip()
+            begin, _, end = answer.partition("…")
+            assert json.loads(given)["ok"] is json.loads(answer)["ok"]
+            assert given.startswith(begin), given
+            assert given.endswith(end), given

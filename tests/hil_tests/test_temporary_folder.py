@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from hil_tests.scratch import scratch_folder
+from starhil.hil_tests.temporary_folder import temporary_folder
 
 OWNER = """
 import sys, time
 from pathlib import Path
-from hil_tests.scratch import scratch_folder
-with scratch_folder("run-", base=Path(sys.argv[1])) as folder:
+from starhil.hil_tests.temporary_folder import temporary_folder
+with temporary_folder("run-", base=Path(sys.argv[1])) as folder:
     (folder / "state").write_text("content")
     print(folder, flush=True)
     time.sleep(600)
@@ -29,10 +29,10 @@ def test_the_folder_of_a_killed_owner_is_removed_and_that_of_a_living_one_stays(
     command = [sys.executable, "-c", OWNER, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
         theirs = owner.stdout.readline().strip().rpartition("/")[2]
-        with scratch_folder("run-", base=tmp_path) as mine:
+        with temporary_folder("run-", base=tmp_path) as mine:
             assert names() == {"run-notes", theirs, mine.name}
         assert names() == {"run-notes", theirs}
         owner.kill()
-    with scratch_folder("run-", base=tmp_path) as mine:
+    with temporary_folder("run-", base=tmp_path) as mine:
         assert names() == {"run-notes", mine.name}
     assert names() == {"run-notes"}
