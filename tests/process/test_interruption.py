@@ -117,7 +117,8 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
 def test_an_interrupted_start_ends_the_emulator():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background job
     process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
-    timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
+    main = threading.main_thread().ident  # the timer's own thread would not wake the one that waits
+    timer = threading.Timer(1.0, signal.pthread_kill, [main, signal.SIGINT])
     timer.start()
     try:
         with pytest.raises(KeyboardInterrupt), process:
