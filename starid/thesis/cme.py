@@ -64,15 +64,14 @@ class CameraMotion:
 
 
 @compiled
-def rigid_fit(
+def _mean_positions(
     before: NDArray[np.float64],
     now: NDArray[np.float64],
     chosen: NDArray[np.bool_],
-    motion: NDArray[np.float64],
-) -> bool:
-    """Least-squares rotation and translation of the chosen stars into `motion` (cos, sin, x, y); False below two."""
+    centre: NDArray[np.float64],
+) -> int:
+    """Fill in the mean positions (x, y before; x, y now) of the chosen stars; return how many there are."""
     count = 0
-    centre = np.zeros(4)
     for i in range(chosen.size):
         if chosen[i]:
             count += 1
@@ -80,9 +79,22 @@ def rigid_fit(
             centre[1] += before[i, 1]
             centre[2] += now[i, 0]
             centre[3] += now[i, 1]
-    if count < 2:
+    if count > 0:
+        centre /= count
+    return count
+
+
+@compiled
+def rigid_fit(
+    before: NDArray[np.float64],
+    now: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    motion: NDArray[np.float64],
+) -> bool:
+    """Least-squares rotation and translation of the chosen stars into `motion` (cos, sin, x, y); False below two."""
+    centre = np.zeros(4)
+    if _mean_positions(before, now, chosen, centre) < 2:
         return False
-    centre /= count
     along = 0.0
     across = 0.0
     for i in range(chosen.size):
@@ -112,18 +124,9 @@ def affine_fit(
     matrix: NDArray[np.float64],
 ) -> bool:
     """Least-squares affine transformation of the chosen stars into `matrix` (2, 3); False below three, or in a line."""
-    count = 0
     centre = np.zeros(4)
-    for i in range(chosen.size):
-        if chosen[i]:
-            count += 1
-            centre[0] += before[i, 0]
-            centre[1] += before[i, 1]
-            centre[2] += now[i, 0]
-            centre[3] += now[i, 1]
-    if count < _AFFINE_SAMPLE:
+    if _mean_positions(before, now, chosen, centre) < _AFFINE_SAMPLE:
         return False
-    centre /= count
     xx = xy = yy = xu = yu = xv = yv = 0.0
     for i in range(chosen.size):
         if chosen[i]:
