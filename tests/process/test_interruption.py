@@ -23,6 +23,17 @@ SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\n
 SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGINT)
 
 
+@pytest.fixture(autouse=True)
+def signals_that_are_not_ignored():
+    """Processes inherit an ignored signal: SIGHUP from `nohup`, SIGINT from a shell's background job."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 def descendants(pid: int) -> set[int]:
     """Processes that a process has started, and those that these have."""
     parents = {}
@@ -115,15 +126,11 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
 
 
 def test_an_interrupted_start_ends_the_emulator():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background job
     process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
     main = threading.main_thread().ident  # the timer's own thread would not wake the one that waits
     timer = threading.Timer(1.0, signal.pthread_kill, [main, signal.SIGINT])
     timer.start()
-    try:
-        with pytest.raises(KeyboardInterrupt), process:
-            pass
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt), process:
+        pass
     timer.join()
     assert not process.running
