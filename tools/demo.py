@@ -194,7 +194,7 @@ def main() -> int:
     good = report(comparisons, console)
     plot(comparisons, out / "error.png")
     console.print(
-        f"Images: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_1024.png; logs in the same folders."
+        f"Images: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_512.png; logs in the same folders."
     )
     return 0 if good else 1
 
