@@ -97,10 +97,11 @@ class Bench:
         profile: Profile | None = None,
         store: StateStore | None = None,
         truth: TruthSource | None = None,
+        unit: str = "cubestar",
     ) -> None:
         self.clock = SteppedClock()
         self.pipeline = FakePipeline()
-        self.icd = load_unit()
+        self.icd = load_unit(unit)
         self.store = store or MemoryStore()
         self.later: list[Reply] = []
         """Answers that came when a telecommand was done."""
