@@ -35,6 +35,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--starhil-dialect", default="b", metavar="a|b|c", help="form of serial replies (default b)"
     )
+    group.addoption(
+        "--starhil-unit",
+        default=None,
+        metavar="UNIT",
+        help="name or folder of the unit's definition (default: that of the profile, or cubestar)",
+    )
     group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator")
     group.addoption(
         "--starhil-seed", default=1, type=int, metavar="N", help="seed of the emulator (default 1)"
@@ -60,6 +66,7 @@ def starhil_emulator(
     with PrivateCanBus() as channel:
         command = emulator_command(
             profile=request.config.getoption("--starhil-profile"),
+            unit=request.config.getoption("--starhil-unit"),
             serial="auto",
             can=channel,
             seed=request.config.getoption("--starhil-seed"),
@@ -73,16 +80,15 @@ def starhil_emulator(
 def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
     from starhil.hil_tests.client import ObcClient
 
-    spec = request.config.getoption(f"--starhil-{link}")
+    spec, unit = request.config.getoption(f"--starhil-{link}"), request.config.getoption("--starhil-unit")
     if spec is None:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
-        spec = emulator.ready[link]
+        spec, unit = emulator.ready[link], emulator.unit
     timeout_s = request.config.getoption("--starhil-timeout")
+    common = {"unit": unit or "cubestar", "timeout_s": timeout_s}
     if link == "can":
-        return ObcClient.open(can=spec, timeout_s=timeout_s)
-    return ObcClient.open(
-        serial=spec, dialect=request.config.getoption("--starhil-dialect"), timeout_s=timeout_s
-    )
+        return ObcClient.open(can=spec, **common)
+    return ObcClient.open(serial=spec, dialect=request.config.getoption("--starhil-dialect"), **common)
 
 
 @pytest.fixture

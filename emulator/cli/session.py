@@ -17,6 +17,7 @@ from starhil.emulator.cli.options import (
     JunitFile,
     SerialDialect,
     SerialPort,
+    UnitChoice,
 )
 
 
@@ -24,6 +25,7 @@ def command(
     script: Annotated[
         Path, typer.Argument(help="Session script (TOML), or the name of one that ships with starhil.")
     ],
+    unit: UnitChoice = None,
     serial: SerialPort = None,
     can: CanChannel = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,
@@ -64,6 +66,7 @@ def command(
     )
     request = SessionRequest(
         script=script,
+        unit=unit,
         options=options,
         start=start,
         profile=profile,
