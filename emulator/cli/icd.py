@@ -25,27 +25,31 @@ class Format(StrEnum):
     XTCE = "xtce"
     COSMOS = "cosmos"
     C = "c"
+    COSMOS_PLUGIN = "cosmos-plugin"
 
 
 @group.command()
 def export(
     format_: Annotated[
-        Format, typer.Argument(metavar="FORMAT", help="markdown, html, dbc, eds, xtce, cosmos or c.")
+        Format,
+        typer.Argument(metavar="FORMAT", help="markdown, html, dbc, eds, xtce, cosmos, c or cosmos-plugin."),
     ],
     output: Annotated[
         Path | None,
         typer.Option(
             "--output",
             "-o",
-            help=output_help("File to write; default: stdout. For c: the folder of its files."),
+            help=output_help(
+                "File to write; default: stdout. For c and cosmos-plugin: the folder of their files."
+            ),
         ),
     ] = None,
     unit: Unit = DEFAULT_UNIT,
 ) -> None:
     """Export the interface definition in another format.
 
-    markdown and html are for readers, dbc for CAN tools, eds for CANopen masters, xtce and
-    cosmos for ground software, c for flight software.
+    markdown and html are for readers, dbc for CAN tools, eds for CANopen masters, xtce, cosmos
+    and cosmos-plugin for ground software, c for flight software.
     """
     from starhil.emulator.errors import EmulatorError
     from starhil.protocol import export as formats

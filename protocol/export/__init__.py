@@ -25,6 +25,7 @@ FORMATS: Final[Mapping[str, str]] = MappingProxyType(
 FOLDER_FORMATS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "c": "C99 codec and serial link, header and source",
+        "cosmos-plugin": "plugin of OpenC3 COSMOS: target, interface and protocol of the serial line",
     }
 )
 """Description of each format of several files, by name."""

@@ -20,22 +20,34 @@ ID_BITS: Final = 8
 
 def render(icd: InterfaceDefinition) -> str:
     """Return commands and telemetry as one text."""
-    return "\n".join(_lines(icd)) + "\n"
+    head = (f"# {icd.name} {icd.version}: {icd.doc}", "# Made from the interface definition; do not edit.")
+    return "\n".join((*head, *commands(icd, TARGET), *telemetry(icd, TARGET))) + "\n"
 
 
-def _lines(icd: InterfaceDefinition) -> Iterator[str]:
-    yield f"# {icd.name} {icd.version}: {icd.doc}"
-    yield "# Made from the interface definition; do not edit."
+def commands(icd: InterfaceDefinition, target: str) -> Iterator[str]:
+    """Yield the telecommands, and a command that requests each telemetry row."""
     for row in icd.rows:
-        yield ""
+        name = row.name if row.kind == "telecommand" else f"request_{row.name}"
+        doc = row.doc if row.kind == "telecommand" else f"Request {row.name}."
+        yield from ("", f"COMMAND {target} {name.upper()} LITTLE_ENDIAN {_quoted(doc)}")
+        yield f'  APPEND_ID_PARAMETER {IDENTIFIER} {ID_BITS} UINT {row.id} {row.id} {row.id} "Identifier"'
         if row.kind == "telecommand":
-            yield f"COMMAND {TARGET} {row.name.upper()} LITTLE_ENDIAN {_quoted(row.doc)}"
-            yield f'  APPEND_ID_PARAMETER {IDENTIFIER} {ID_BITS} UINT {row.id} {row.id} {row.id} "Identifier"'
-        else:
-            yield f"TELEMETRY {TARGET} {row.name.upper()} LITTLE_ENDIAN {_quoted(row.doc)}"
-            yield f'  APPEND_ID_ITEM {IDENTIFIER} {ID_BITS} UINT {row.id} "Identifier"'
-        for index, field in enumerate(row.fields):
-            yield from _field(row, field, index)
+            yield from _fields(row)
+
+
+def telemetry(icd: InterfaceDefinition, target: str) -> Iterator[str]:
+    """Yield the telemetry rows."""
+    for row in icd.rows:
+        if row.kind == "telecommand":
+            continue
+        yield from ("", f"TELEMETRY {target} {row.name.upper()} LITTLE_ENDIAN {_quoted(row.doc)}")
+        yield f'  APPEND_ID_ITEM {IDENTIFIER} {ID_BITS} UINT {row.id} "Identifier"'
+        yield from _fields(row)
+
+
+def _fields(row: Row) -> Iterator[str]:
+    for index, field in enumerate(row.fields):
+        yield from _field(row, field, index)
 
 
 def _field(row: Row, field: Field, index: int) -> Iterator[str]:

@@ -290,7 +290,9 @@ def test_the_cosmos_text_has_every_row_once_and_no_overlap() -> None:
             seen[current] = []
         elif match := re.match(r"  (?:PARAMETER|ITEM) (\w+) (\d+) (\d+) ", line):
             seen[current].append((int(match[2]), int(match[3])))
-    assert seen.keys() == {row.name for row in ICD.rows}
+    assert seen.keys() == {row.name for row in ICD.rows} | {f"request_{row.name}" for row in TELEMETRY}
+    for row in TELEMETRY:
+        assert seen[f"request_{row.name}"] == []
     for row in ICD.rows:
         places = sorted(seen[row.name])
         assert sum(size for _, size in places) == 8 * row.size
