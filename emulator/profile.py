@@ -192,6 +192,8 @@ class Profile(Strict):
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)
     """Notes that `starhil calibrate` writes for people; not used."""
+    health: dict[str, float] = Field(default_factory=dict)
+    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit; 0 unless given."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Defaults of device parameters, named as in the interface definition."""
 

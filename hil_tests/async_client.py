@@ -84,7 +84,7 @@ class AsyncObcClient:
         NackError, NoReplyError, BadReplyError, LinkLostError
         """
         row = self.icd.telemetry[name]
-        request = Request(RequestKind.TELEMETRY, row.id)
+        request = self.icd.request(row)
         reply, latency = await self.transact(
             request, row.name, row.size, timeout_s=timeout_s, retries=retries
         )
@@ -131,7 +131,7 @@ class AsyncObcClient:
     ) -> Ack:
         """Send a telecommand with its parameters as bytes, well-formed or not."""
         row = self.icd.telecommands[name]
-        request = Request(RequestKind.TELECOMMAND, row.id, data)
+        request = self.icd.request(row, data)
         _reply, latency = await self.transact(request, row.name, 0, timeout_s=timeout_s, retries=retries)
         return Ack(row.name, latency)
 

@@ -30,7 +30,7 @@ from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import Reply, Request, RequestKind
+from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.values import MessageError, Value
 
@@ -106,7 +106,7 @@ class DeviceApplication:
                 refusal = abort
             self._finish_write(deferred, refusal)
 
-        replies = self._requests.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
+        replies = self._requests.handle(self._device.icd.request(row, payload), done)
         if replies is None:
             return deferred
         for reply in replies[:1]:

@@ -20,7 +20,14 @@ from starhil.protocol.canopen.communication import (
     variable,
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from starhil.protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, read_layout
+from starhil.protocol.canopen.layout import (
+    CanopenModel,
+    PackedField,
+    PdoModel,
+    PlacedMember,
+    PlacedObject,
+    read_layout,
+)
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, Value, to_f32
@@ -131,8 +138,12 @@ class DeviceDictionary(Dictionary):
             self._place_image(objects, placed, placed.image)
         elif placed.packed:
             self._place_packed(objects, placed)
+        elif placed.members:
+            self._place_members(objects, placed)
         else:
-            self._place_value(objects, placed)
+            key = (placed.index, 0)
+            objects.add_object(self._value_variable(placed.name, key, placed.value, placed.telecommand))
+            self._names[f"{placed.index:04x}"] = key
 
     def _place_requests(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         members: list[ODVariable] = []
@@ -159,48 +170,63 @@ class DeviceDictionary(Dictionary):
             members.append(member)
         add_record(objects, placed.name, members)
 
-    def _place_value(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        key = (placed.index, 0)
-        if placed.telecommand is not None:
-            member = self._telecommand_variable(placed.name, key, self.icd.telecommands[placed.telecommand])
-        if placed.value is not None:
-            row, slot, fields = self._slot_of(placed.value)
-            if placed.telecommand is None:
-                member = variable(placed.name, *key, DATA_TYPES[slot.type], "ro", mappable=True)
+    def _value_variable(self, name: str, key: Key, value: str | None, telecommand: str | None) -> ODVariable:
+        """Return the variable that reads a field, executes a telecommand when written, or both."""
+        if telecommand is not None:
+            member = self._telecommand_variable(name, key, self.icd.telecommands[telecommand])
+        if value is not None:
+            row, slot, fields = self._slot_of(value)
+            if telecommand is None:
+                member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
                 _describe(member, fields)
             elif member.data_type != DATA_TYPES[slot.type]:
-                raise IcdError(
-                    f"canopen.toml: {placed.index:04X}h: {placed.value} and {placed.telecommand} differ in type"
-                )
+                raise IcdError(f"canopen.toml: {key[0]:04X}h: {value} and {telecommand} differ in type")
             else:
                 member.access_type = "rw"
-            self._bind_reader(key, row, "", partial(self._read_slot, row, slot))
-        objects.add_object(member)
-        self._names[f"{placed.index:04x}"] = key
+            self._bind_reader(key, row, name, partial(self._read_slot, row, slot))
+        return member
+
+    def _place_members(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        members: list[ODVariable] = []
+        subindex = 0
+        for model in placed.members:
+            subindex = subindex + 1 if model.subindex is None else model.subindex
+            members.append(self._member_variable(model, (placed.index, subindex)))
+            self._names[f"{placed.index:04x}.{model.name.lower()}"] = (placed.index, subindex)
+        add_record(objects, placed.name, members)
+
+    def _member_variable(self, model: PlacedMember, key: Key) -> ODVariable:
+        if model.parameter is None:
+            return self._value_variable(model.name, key, model.value, model.telecommand)
+        return self._parameter_variable(model.name, key, self.icd.parameters[model.parameter])
 
     def _place_parameters(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         members: list[ODVariable] = []
         for number, parameter in sorted(self.icd.parameters_by_id.items()):
             key = (placed.index, number)
-            default = parameter.to_number(parameter.default)
-            if parameter.type not in {"f32", "f64"}:
-                default = int(default)
-            data_type = DATA_TYPES[parameter.type]
-            member = variable(parameter.name, *key, data_type, "rw", default, mappable=True)
-            low, high = parameter.minimum, parameter.maximum
-            if parameter.type == "f32":
-                low, high = min(low, to_f32(low)), max(high, to_f32(high))
-            set_limits(member, low, high)
-            member.unit = parameter.unit
-            member.description = parameter.doc
-            if parameter.enum is not None:
-                member.value_descriptions = dict(parameter.enum.names)
             self._names[f"{placed.index:04x}.{parameter.name}"] = key
-            self.parameters[parameter.name] = key
-            self._readers[key] = partial(self._read_parameter, parameter, data_type)
-            self._writers[key] = partial(self._write_parameter, parameter, data_type)
-            members.append(member)
+            members.append(self._parameter_variable(parameter.name, key, parameter))
         add_record(objects, placed.name, members)
+
+    def _parameter_variable(self, name: str, key: Key, parameter: Parameter) -> ODVariable:
+        """Return the variable that reads and sets a parameter."""
+        default = parameter.to_number(parameter.default)
+        if parameter.type not in {"f32", "f64"}:
+            default = int(default)
+        data_type = DATA_TYPES[parameter.type]
+        member = variable(name, *key, data_type, "rw", default, mappable=True)
+        low, high = parameter.minimum, parameter.maximum
+        if parameter.type == "f32":
+            low, high = min(low, to_f32(low)), max(high, to_f32(high))
+        set_limits(member, low, high)
+        member.unit = parameter.unit
+        member.description = parameter.doc
+        if parameter.enum is not None:
+            member.value_descriptions = dict(parameter.enum.names)
+        self.parameters[parameter.name] = key
+        self._readers[key] = partial(self._read_parameter, parameter, data_type)
+        self._writers[key] = partial(self._write_parameter, parameter, data_type)
+        return member
 
     def _read_parameter(self, parameter: Parameter, data_type: int) -> bytes:
         return encode(data_type, parameter.to_number(self.application.parameter(parameter.name)))
@@ -308,6 +334,7 @@ class DeviceDictionary(Dictionary):
         return PdoDefault(
             name=model.name,
             enabled=model.enabled,
+            can_id=model.can_id,
             transmission_type=model.transmission_type,
             inhibit=round(model.inhibit_ms * 10),
             event_ms=model.event_ms,

@@ -31,6 +31,23 @@ class PackedField(_Model):
     """Keep the lowest bits of a counter instead of clipping it."""
 
 
+class PlacedMember(_Model):
+    """One entry of a record: a field to read, a telecommand to write, or both; or a parameter."""
+
+    subindex: Annotated[int, Field(ge=1, le=254)] | None = None
+    """One more than that of the entry before unless given."""
+    name: str
+    value: str | None = None
+    telecommand: str | None = None
+    parameter: str | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> PlacedMember:
+        if (self.parameter is not None) == (self.value is not None or self.telecommand is not None):
+            raise ValueError("needs value and/or telecommand, or parameter")
+        return self
+
+
 class PlacedObject(_Model):
     """One object of the application and its content."""
 
@@ -43,6 +60,7 @@ class PlacedObject(_Model):
     parameters: bool = False
     image: Literal["frame", "stored"] | None = None
     packed: list[PackedField] = []
+    members: list[PlacedMember] = []
 
     @model_validator(mode="after")
     def _one_kind(self) -> PlacedObject:
@@ -53,10 +71,12 @@ class PlacedObject(_Model):
             self.parameters,
             self.image is not None,
             bool(self.packed),
+            bool(self.members),
         ]
         if sum(kinds) != 1:
             raise ValueError(
-                "needs exactly one of requests, telemetry, value and/or telecommand, parameters, image, packed"
+                "needs exactly one of requests, telemetry, value and/or telecommand, parameters, image, packed, "
+                "members"
             )
         return self
 
@@ -66,6 +86,8 @@ class PdoModel(_Model):
 
     name: str
     enabled: bool = False
+    can_id: Annotated[int, Field(ge=0x181, le=0x57F)] | None = None
+    """CAN ID, to which the node-ID is added; the predefined one of the first four PDOs unless given."""
     transmission_type: Annotated[int, Field(ge=0, le=255)] = 255
     inhibit_ms: Annotated[float, Field(ge=0, le=6553.5)] = 0
     event_ms: Annotated[int, Field(ge=0, le=0xFFFF)] = 0

@@ -124,7 +124,7 @@ def test_texts_for_people_have_the_convention(name):
 
 def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
     (tmp_path / "a.toml").write_text(
-        'definition = { name = "x", version = "1", doc = "x" }\n'
+        'unit = { name = "x", version = "1", doc = "x" }\n'
         '[[section]]\nheading = "Frames"\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
     )
     with pytest.raises(IcdError, match="section Frames: row 2 has 1 cells, must have 2"):

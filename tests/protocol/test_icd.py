@@ -314,7 +314,7 @@ def test_a_row_names_the_fields_that_it_would_clip() -> None:
     ],
 )
 def test_wrapping_is_for_unsigned_counters(tmp_path: Path, field: str, said: str) -> None:
-    text = """[definition]
+    text = """[unit]
 name = "x"
 version = "1"
 doc = "x"
@@ -402,7 +402,7 @@ def test_every_default_survives_the_wire(parameter: object) -> None:
 
 # -- bad definitions ---------------------------------------------------------------------------------------------------
 
-HEAD = '[definition]\nname = "x"\nversion = "1"\ndoc = "d"\n'
+HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\nfirst_telemetry_id = 128\n'
 
 
 def _row(
@@ -437,12 +437,11 @@ BAD_DEFINITIONS = [
     ("unknown include", HEAD + '[[telemetry]]\nid = 200\nname = "r"\ndoc = ""\nprovenance = "ours"\nsize = 0\ninclude = ["x"]', "no row named 'x'"),
     ("no fields", HEAD + '[[telemetry]]\nid = 200\nname = "r"\ndoc = ""\nprovenance = "ours"\nsize = 0', "either `fields` or `include`"),
     ("bytes without size", HEAD + _row(fields='[{ name = "a", type = "bytes" }]'), "needs a size"),
-    ("unit unlike the parameter's", HEAD + '[[parameter]]\nid = 1\nname = "p"\ntype = "u8"\nunit = "m"\nmin = 0\nmax = 1\ndefault = 0\ndoc = "d"\n'
-     + _row(fields='[{ name = "a", type = "u8", unit = "s", parameter = "p" }]'), "they must agree"),
-    ("default outside", HEAD + '[[parameter]]\nid = 1\nname = "p"\ntype = "u8"\nmin = 0\nmax = 1\ndefault = 2\ndoc = "d"\n', "default: p: 2 is outside"),
-    ("parameter limits", HEAD + '[[parameter]]\nid = 1\nname = "p"\ntype = "u8"\nmin = 0\nmax = 1000\ndefault = 2\ndoc = "d"\n', "do not fit type u8"),
+    ("unit unlike the parameter's", HEAD + _row(fields='[{ name = "a", type = "u8", unit = "s", parameter = "exposure" }]'), "they must agree"),
+    ("default outside", HEAD + '[[parameter]]\nid = 1\nname = "window_width"\ndefault = 2\n', "default: window_width: 2 is outside"),
+    ("parameter limits", HEAD + '[[parameter]]\nid = 1\nname = "window_width"\nmax = 1000\n', "do not fit type u8"),
     ("enum numbers", HEAD + '[[enum]]\nname = "e"\ndoc = "d"\nvalues = { a = 1, b = 1 }\n', "two names have one number"),
-    ("no head", _row(), r"no \[definition\]"),
+    ("no head", _row(), r"no \[unit\]"),
     ("no TOML", "[[[", "not valid TOML"),
 ]  # fmt: skip
 

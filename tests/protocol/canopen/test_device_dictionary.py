@@ -153,7 +153,7 @@ def test_layouts_that_do_not_fit_the_definition(changes, text):
         DeviceDictionary(ICD, layout(**changes))
 
 
-UNIT_HEAD = '[definition]\nname = "x"\nversion = "1"\ndoc = "x"\n'
+UNIT_HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'
 
 
 @pytest.mark.parametrize(
