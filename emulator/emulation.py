@@ -222,7 +222,8 @@ class Emulation:
         stepped = isinstance(
             self.clock, SteppedClock
         )  # no time passes between two frames or bytes of one event
-        if links.serial.port != "off":
+        self._check_links()
+        if links.serial.port != "off" and self.icd.link.serial is not None:
             from starhil.protocol.transports.serial import open_serial
 
             baud = int(device.parameters["serial_baud"])
@@ -233,8 +234,9 @@ class Emulation:
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(requests, transport, seed)
             self.ready_fields["serial"] = await self.serial.start()
-            self.ready_fields["dialect"] = str(device.parameters["serial_dialect"])
-        if links.can.channel != "off":
+            if self.serial.dialect is not None:
+                self.ready_fields["dialect"] = self.serial.dialect.value
+        if links.can.channel != "off" and self.icd.link.can is not None:
             from starhil.protocol.transports.can import open_can
 
             self.can = CanLink(
@@ -243,6 +245,21 @@ class Emulation:
             self.ready_fields["can"] = await self.can.start()
         if links.canopen.node:
             await self._open_canopen(requests)
+
+    def _check_links(self) -> None:
+        """Check that the unit has the links that the profile asks for by more than `auto`, and any at all."""
+        links, has = self.profile.links, self.icd.link
+        for key, wanted, there in (
+            ("serial.port", links.serial.port not in ("off", "auto"), has.serial is not None),
+            (
+                "can.channel",
+                links.can.channel not in ("off", "auto") and not links.canopen.node,
+                has.can is not None,
+            ),
+            ("canopen.node", bool(links.canopen.node), self.icd.canopen is not None),
+        ):
+            if wanted and not there:
+                raise EmulatorError(f"links.{key}: unit {self.icd.name} has no such link")
 
     async def _open_canopen(self, requests: Requests) -> None:
         """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""

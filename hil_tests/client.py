@@ -91,12 +91,13 @@ class ObcClient:
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
 
+        icd = load_unit(unit) if isinstance(unit, str) else unit
+
         def make_link() -> HostLink[Any]:
             if serial is not None:
-                return SerialHostLink(serial, dialect=Dialect(dialect), baud=baud, log=log)
+                return SerialHostLink(icd, serial, dialect=Dialect(dialect), baud=baud, log=log)
             return CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
 
-        icd = load_unit(unit) if isinstance(unit, str) else unit
         return cls(make_link, icd, timeout_s=timeout_s, retries=retries)
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
@@ -167,8 +168,9 @@ class ObcClient:
 
     def request(self, identifier: int, data: bytes = b"", *, timeout_s: float | None = None) -> Reply:
         """Send a request by row ID with raw parameters; return the reply."""
-        request = Request.of(identifier, data)
         row = self.icd.row_by_id(identifier)
+        kind = self.icd.kind_of_id(identifier)
+        request = Request(kind, identifier, data, klass="" if row is None else row.klass)
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
         return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
 

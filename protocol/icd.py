@@ -14,6 +14,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.device_model import DeviceModel, device_model
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.link_schema import LinkModel
 from starhil.protocol.messages import ErrorCode, MessageClass, Request, RequestKind
 from starhil.protocol.plugin import Plugin
 from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
@@ -82,8 +83,8 @@ class InterfaceDefinition:
     """Documentation that accompanies the rows, such as conventions."""
     canopen: RawTable | None = None
     """Layout of the rows in the object dictionary, if the unit has CANopen."""
-    link: RawTable | None = None
-    """The table `[link]`."""
+    link: LinkModel = field(default_factory=LinkModel)
+    """The links of the unit."""
     conventions: Conventions = field(default_factory=Conventions)
     classes: tuple[MessageClass, ...] = ()
     errors: Mapping[str, int] = field(default_factory=dict)
@@ -147,6 +148,11 @@ class InterfaceDefinition:
         if name in self.errors:
             return self.errors[name]
         return 0 if code is ErrorCode.OK else self.errors.get(OTHER_ERROR, int(code))
+
+    def error_name(self, number: int) -> str:
+        """Return the name of an error by the number in which the unit reports it."""
+        numbers = self.errors or {code.name.lower(): int(code) for code in ErrorCode}
+        return next((name for name, known in numbers.items() if known == number), "unpublished code")
 
     def enum(self, name: str) -> EnumDefinition:
         """Return an enumeration of the unit, else that of the device model."""

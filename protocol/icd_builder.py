@@ -17,8 +17,10 @@ from starhil.protocol.device_model import DeviceModel, device_model, did_you_mea
 from starhil.protocol.icd import InterfaceDefinition, Names, RawTable
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import Layout
+from starhil.protocol.link_schema import LinkModel
 from starhil.protocol.messages import ErrorCode, MessageClass, RequestKind
 from starhil.protocol.plugin import Plugin, load_plugin
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
@@ -159,7 +161,18 @@ class _Builder:
         telemetry = self._build_rows("telemetry", rows)
         for row in telecommands:
             self._attempt(self._check_answers, row, rows)
-        return self._definition(conventions, telecommands, telemetry)
+        definition = self._definition(conventions, telecommands, telemetry)
+        self._attempt(self._check_link, definition)
+        return definition
+
+    def _check_link(self, definition: InterfaceDefinition) -> None:
+        """Check that the parts of the links fit one another and the rows."""
+        if definition.link.serial is None:
+            return
+        try:
+            build_serial_stack(definition)
+        except IcdError as error:
+            raise IcdError(f"{self._tables['link'][0]}: {error}") from None
 
     def _definition(
         self, conventions: Conventions, telecommands: list[Row], telemetry: list[Row]
@@ -167,6 +180,7 @@ class _Builder:
         unit = self._unit
         self._attempt(self._check_errors)
         errors = self._tables.get("errors", (self._path, {}))[1]
+        link = self._tables.get("link", (self._path, None))[1]
         enums = {
             **{name: enum for name, enum in self._model.enums.items() if name in self._used_enums},
             **self._enums,
@@ -182,7 +196,7 @@ class _Builder:
             device_parameters=Names("parameter", {**self._device_parameters, **self._parameters}.items()),
             sections=tuple(self._sections),
             canopen=self._raw_table("canopen"),
-            link=self._raw_table("link"),
+            link=link if isinstance(link, LinkModel) else LinkModel(),
             conventions=conventions,
             classes=tuple(self._classes.values()),
             errors=errors if isinstance(errors, dict) else {},
@@ -395,8 +409,9 @@ class _Builder:
         if first is not None and (row.id >= first) != (row.kind == "telemetry"):
             side = f"{first} and up" if row.kind == "telemetry" else f"below {first}"
             raise IcdError(f"{where}: id {row.id} is not a {row.kind} id ({side})")
-        if "link" not in self._tables and row.id > HIGHEST_ID:
-            raise IcdError(f"{where}: id {row.id} is above {HIGHEST_ID}")
+        highest = self._highest_id
+        if row.id > highest:
+            raise IcdError(f"{where}: id {row.id} is above {highest}")
         if row.name in rows:
             raise IcdError(f"{where}: name used twice")
         code = self._code(row)
@@ -405,6 +420,17 @@ class _Builder:
         )
         if same is not None:
             raise IcdError(f"{where}: id {row.id} is already used by {same}")
+
+    @property
+    def _highest_id(self) -> int:
+        """Highest id that the link can carry."""
+        link = self._tables.get("link", (self._path, None))[1]
+        if not isinstance(link, LinkModel) or link.serial is None:
+            return HIGHEST_ID
+        header = link.serial.request_header
+        widths = [bit.width for item in header for bit in item.bits if bit.role == "id"]
+        widths += [int(item.type[1:]) for item in header if item.role == "id"]
+        return (1 << widths[0]) - 1 if widths else HIGHEST_ID
 
     def _code(self, row: Row) -> int | None:
         return self._classes[row.klass].code if row.klass else None

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from starhil.protocol.link_schema import LinkModel
+
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Provenance = Literal["confirmed", "proxy", "ours"]
 ScalarType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
@@ -191,7 +193,7 @@ class FileModel(_Model):
     telemetry: list[RowModel] = []
     parameter: list[ParameterModel] = []
     section: list[SectionModel] = []
-    link: dict[str, object] | None = None
+    link: LinkModel | None = None
     canopen: dict[str, object] | None = None
     """The CANopen mapping, read by `starhil.protocol.canopen.layout`."""
 

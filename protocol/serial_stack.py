@@ -25,6 +25,7 @@ from starhil.protocol.framings import (
     Receiving,
     Slip,
 )
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
     CustomFraming,
@@ -596,3 +597,35 @@ def build_stack(
     if isinstance(link.framing, CubeSpaceFraming):
         return CubeSpaceStack(link)
     return ComposedStack(link, classes, rows, byte_order, framings=framings, checks=checks)
+
+
+def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
+    """Return the serial link of a unit's definition.
+
+    Raises
+    ------
+    IcdError
+        The unit has none, or its parts do not fit one another.
+    """
+    link = icd.link.serial
+    if link is None:
+        raise IcdError(f"unit {icd.name}: has no serial link")
+    shapes = [
+        RowShape(
+            row.klass,
+            row.id,
+            RequestKind(row.kind),
+            row.size if row.kind == "telecommand" else 0,
+            row.size if row.kind == "telemetry" else 0,
+            row.answers,
+        )
+        for row in icd.rows
+    ]
+    return build_stack(
+        link,
+        icd.classes,
+        shapes,
+        icd.conventions.byte_order,
+        framings=icd.plugin.framings,
+        checks=icd.plugin.checks,
+    )

@@ -349,9 +349,11 @@ def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Va
         The table names an unknown parameter.
     """
     links = profile.links
+    serial, unit_serial = links.serial, icd.link.serial
+    baud = serial.baud if unit_serial is None or "baud" in serial.model_fields_set else unit_serial.baud
     of_links: dict[str, Value] = {
         "serial_dialect": links.serial.dialect,
-        "serial_baud": links.serial.baud,
+        "serial_baud": baud,
         "can_address": links.can.address,
         "host_address": links.can.host_address,
     }
