@@ -239,6 +239,8 @@ class ComposedStack(SerialStack):
         self.framing: Final = _build_framing(link, framings or {})
         self.check: Final = build_check(link.check, byte_order, checks)
         self.classes: Final = _Classes(classes)
+        self.rows: Final = tuple(rows)
+        self.byte_order: Final = byte_order
         self._rows = {(row.klass, row.id): row for row in rows}
         self._rows_by_id: dict[int, RowShape] = {}
         for row in rows:

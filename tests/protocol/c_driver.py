@@ -15,10 +15,10 @@ from typing import Any, Self
 import pytest
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.export import export_folder
-from starhil.protocol.export.c import prefix_of
+from starhil.protocol.export.c import files, prefix_of
 from starhil.protocol.export.c.rows import member_name
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial_stack import ComposedStack, SerialStack, build_serial_stack
 from starhil.protocol.values import Value
 
 FLAGS = [
@@ -70,26 +70,30 @@ static void print_message(const unit_message_t *message)
         printf("%d 0 0 - ", (int)message->kind);
         return;
     }
-    printf("%d %u %u", (int)message->kind, (unsigned)message->id, (unsigned)message->code);
+    printf("%d %lu %lu", (int)message->kind, (unsigned long)message->id, (unsigned long)message->code);
     print_hex(message->data, message->size);
     printf(" ");
 }
 
 static void decode(const char *row, const uint8_t *data, size_t size)
 {
+    (void)row, (void)data, (void)size;
     @decode@
 }
 
 static void encode(const char *row)
 {
     uint8_t data[4096];
+    (void)row, (void)data;
     @encode@
 }
 
 static unit_receiver_t receiver;
 static int port = -1;
 
-static void ask(uint8_t id)
+@variant@
+
+static void ask(uint32_t id)
 {
     static uint8_t data[4096], frame[UNIT_REQUEST_CAPACITY(4096)];
     unit_message_t message;
@@ -120,7 +124,7 @@ static void open_port(const char *path)
     line.c_cflag = CS8 | CREAD | CLOCAL;
     (void)cfsetispeed(&line, B38400);
     (void)cfsetospeed(&line, B38400);
-    unit_receiver_init(&receiver, (unit_dialect_t)atoi(word()));
+    @init@(word());
     printf("%d", port < 0 ? -1 : tcsetattr(port, TCSANOW, &line));
 }
 
@@ -140,15 +144,15 @@ int main(void)
             encode(first);
         } else if (strcmp(verb, "frame") == 0) {
             size = hex(bytes);
-            const size_t needed = unit_frame_request((uint8_t)atoi(first), bytes, size, frame, sizeof frame);
-            printf("%d", (int)unit_frame_request((uint8_t)atoi(first), bytes, size, frame, needed - 1u));
-            print_hex(frame, unit_frame_request((uint8_t)atoi(first), bytes, size, frame, needed));
+            const size_t needed = @needed@;
+            printf("%d", (int)unit_frame_request((uint32_t)atol(first), bytes, size, frame, needed - 1u));
+            print_hex(frame, unit_frame_request((uint32_t)atol(first), bytes, size, frame, needed));
         } else if (strcmp(verb, "receive") == 0) {
             const int pending = atoi(word());
             size = hex(bytes);
-            unit_receiver_init(&receiver, (unit_dialect_t)atoi(first));
+            @init@(first);
             if (pending >= 0) {
-                unit_expect(&receiver, (uint8_t)pending);
+                unit_expect(&receiver, (uint32_t)pending);
             }
             for (i = 0u; i < size; ++i) {
                 if (unit_receive(&receiver, bytes[i], &message) != UNIT_NONE) {
@@ -159,7 +163,7 @@ int main(void)
         } else if (strcmp(verb, "open") == 0) {
             open_port(first);
         } else {
-            ask((uint8_t)atoi(first));
+            ask((uint32_t)atol(first));
         }
         printf("\n");
         (void)fflush(stdout);
@@ -167,6 +171,35 @@ int main(void)
     return 0;
 }
 """
+
+
+_VARIANTS = {
+    False: """
+static void init_receiver(const char *dialect)
+{
+    unit_receiver_init(&receiver, (unit_dialect_t)atoi(dialect));
+}
+
+static size_t needed_capacity(uint32_t id, const uint8_t *data, size_t size, uint8_t *frame)
+{
+    return unit_frame_request((uint8_t)id, data, size, frame, UNIT_REQUEST_CAPACITY(size));
+}
+""",
+    True: """
+static void init_receiver(const char *dialect)
+{
+    (void)dialect;
+    unit_receiver_init(&receiver);
+}
+
+static size_t needed_capacity(uint32_t id, const uint8_t *data, size_t size, uint8_t *frame)
+{
+    (void)id, (void)data, (void)frame;
+    return UNIT_REQUEST_CAPACITY(size);
+}
+""",
+}
+"""The two kinds of links: that of the CubeSpace family, with its dialects, and those that are composed."""
 
 
 def _printed(field: Field) -> str:
@@ -208,7 +241,7 @@ def _cases(icd: InterfaceDefinition, body: str, do: Any) -> Iterator[str]:
             yield f'if (strcmp(row, "{row.name}") == 0) {{ {_name(row)}_t values; {text} return; }}'
 
 
-def driver_source(icd: InterfaceDefinition) -> str:
+def driver_source(icd: InterfaceDefinition, *, composed: bool) -> str:
     """Return the program for a definition."""
     decode = _cases(
         icd,
@@ -222,6 +255,10 @@ def driver_source(icd: InterfaceDefinition) -> str:
         _read,
     )
     text = _MAIN.replace("@decode@", "\n    ".join(decode)).replace("@encode@", "\n    ".join(encode))
+    text = text.replace("@init@", "init_receiver").replace(
+        "@needed@", "needed_capacity((uint32_t)atol(first), bytes, size, frame)"
+    )
+    text = text.replace("@variant@", _VARIANTS[composed])
     prefix = prefix_of(icd)
     return (
         text.replace("unit_", f"{prefix}_")
@@ -233,12 +270,13 @@ def driver_source(icd: InterfaceDefinition) -> str:
 class CDriver:
     """The compiled program of a definition, as a process; a context manager."""
 
-    def __init__(self, icd: InterfaceDefinition, folder: Path) -> None:
+    def __init__(self, icd: InterfaceDefinition, folder: Path, stack: SerialStack | None = None) -> None:
         if COMPILER is None:
             pytest.skip("no C compiler (cc, gcc or clang) here: the exported C is not compiled")
-        for name, text in export_folder(icd, "c").items():
+        stack = stack or build_serial_stack(icd)
+        for name, text in files(icd, stack).items():
             (folder / name).write_text(text)
-        (folder / "driver.c").write_text(driver_source(icd))
+        (folder / "driver.c").write_text(driver_source(icd, composed=isinstance(stack, ComposedStack)))
         self._program = folder / "driver"
         sources = [folder / "driver.c", folder / f"{prefix_of(icd)}.c"]
         done = subprocess.run(

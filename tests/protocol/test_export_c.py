@@ -123,7 +123,7 @@ def test_the_receiver_of_the_c_reads_streams_as_ours(c: CDriver, dialect: Dialec
         stream = b""
         for _ in range(rng.randrange(4)):
             row = rng.choice(rows)
-            kind = rng.choice(list(ReplyKind))
+            kind = rng.choice([kind for kind in ReplyKind if kind is not ReplyKind.ECHO])
             reply = Reply(
                 kind,
                 119 if kind is ReplyKind.BURST else rng.choice([row.id, pending or 1]),

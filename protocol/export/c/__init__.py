@@ -12,17 +12,33 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.export.c import rows
+from starhil.protocol.export.c.composed import link_parts
+from starhil.protocol.export.row_key import key_of
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial_stack import ComposedStack, SerialStack, build_serial_stack
 
 _FUNCTION: Final = re.compile(r"^static .*?\b(\w+)\(", re.MULTILINE)
 
 
 def render_folder(icd: InterfaceDefinition) -> Mapping[str, str]:
-    """Return header and source by file name."""
+    """Return header and source by file name.
+
+    Raises IcdError for a unit without a serial link, and for one whose link is code of a plugin.
+    """
+    return files(icd, build_serial_stack(icd))
+
+
+def files(icd: InterfaceDefinition, stack: SerialStack) -> Mapping[str, str]:
+    """Return header and source of a definition with a serial link."""
     prefix = prefix_of(icd)
-    link_header, link_source = (_part(f"cubespace.{kind}") for kind in "hc")
+    if isinstance(stack, ComposedStack):
+        link_header, helpers, link_source = link_parts(stack)
+        key_type = "uint32_t"
+    else:
+        link_header, helpers, link_source = _part("cubespace.h"), "", "\0" + _part("cubespace.c")
+        key_type = "uint8_t"
     header = "\n".join(_header(icd, prefix, link_header))
-    source = "\n".join(_source(icd, prefix, link_source))
+    source = "\n".join(_source(icd, prefix, helpers, link_source, key_type))
     return {f"{prefix}.h": _named(header, prefix), f"{prefix}.c": _named(source, prefix)}
 
 
@@ -37,22 +53,26 @@ def _header(icd: InterfaceDefinition, prefix: str, link: str) -> Iterator[str]:
     yield "#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n"
     yield '#ifdef __cplusplus\nextern "C" {\n#endif\n'
     yield _part("codec.h")
-    for enum in icd.enums.values():
-        yield from rows.enumeration(enum)
+    for name, enum in rows.enumerations(icd).items():
+        yield from rows.enumeration(name, enum)
     for row in icd.rows:
-        yield from rows.declaration(row)
+        yield from rows.declaration(row, key_of(icd, row))
     yield link
     yield "#ifdef __cplusplus\n}\n#endif\n\n#endif"
     yield ""
 
 
-def _source(icd: InterfaceDefinition, prefix: str, link: str) -> Iterator[str]:
+def _source(
+    icd: InterfaceDefinition, prefix: str, link_helpers: str, link: str, key_type: str
+) -> Iterator[str]:
+    head, _, link_code = link.partition("\0")
     code = [line for row in icd.rows for line in rows.definition(row)]
-    code += [*rows.telemetry_size(icd.telemetry.values()), link]
-    helpers = [_part("codec.c"), *(rows.membership(enum) for enum in icd.enums.values())]
+    code += [*rows.telemetry_size(icd.telemetry.values(), key_type), link_code]
+    members = (rows.membership(name, enum) for name, enum in rows.enumerations(icd).items())
     yield rows.comment(f"{icd.name} {icd.version}: codec and serial link. Made by starhil; do not edit.")
     yield f'#include "{prefix}.h"\n\n#include <float.h>\n#include <string.h>\n'
-    yield from _used("\n".join(helpers), "\n".join(code))
+    yield head
+    yield from _used("\n\n".join((_part("codec.c"), *members, link_helpers)), "\n".join(code))
     yield from code
 
 

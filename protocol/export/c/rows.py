@@ -10,6 +10,7 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.export.describe import meaning
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, Value, to_f32
 
 _WIDTH: Final = 110
@@ -19,6 +20,8 @@ _KEYWORDS: Final = re.compile(
     "class|delete|new|private|public|this|try|catch|template|operator|virtual|namespace"
 )
 """Reserved in C or C++."""
+MAP: Final = "map"
+"""Name of every enumeration that a field has by its `map`."""
 
 
 def comment(*paragraphs: str) -> str:
@@ -33,28 +36,47 @@ def comment(*paragraphs: str) -> str:
     return "\n".join(("/* " + lines[0], *(f" * {line}".rstrip() for line in lines[1:]), " */"))
 
 
-def enumeration(enum: EnumDefinition) -> Iterator[str]:
+def enumerations(icd: InterfaceDefinition) -> dict[str, EnumDefinition]:
+    """Return the enumerations of a definition and of its rows' fields, by their name in C."""
+    of_fields = (
+        (enum_name(row, field), field.enum)
+        for row in icd.rows
+        for field in row.fields
+        if field.enum is not None
+    )
+    return {**icd.enums, **dict(of_fields)}
+
+
+def enum_name(row: Row, field: Field) -> str:
+    """Return the name of a field's enumeration; one that the field alone has is named after it."""
+    if field.enum is None or field.enum.name == MAP:
+        return f"{row.name}_{field.name}"
+    return field.enum.name
+
+
+def enumeration(name: str, enum: EnumDefinition) -> Iterator[str]:
     """Yield the constants of an enumeration."""
-    yield comment(enum.doc)
-    yield "enum {"
-    yield ",\n".join(f"    {_constant(enum, name)} = {value}" for name, value in enum.values.items())
-    yield "};\n"
+    if enum.doc:
+        yield comment(enum.doc)
+    for member, value in enum.values.items():
+        yield f"#define {_constant(name, member)} {_integer(value, signed=value < 0)}"
+    yield ""
 
 
-def membership(enum: EnumDefinition) -> str:
+def membership(name: str, enum: EnumDefinition) -> str:
     """Return a function that tests whether a number is in an enumeration."""
-    cases = "\n".join(f"    case {value}u:" for value in enum.values.values())
+    cases = "\n".join(f"    case {value}:" for value in enum.values.values())
     return (
-        f"static bool is_{enum.name}(uint64_t value)\n{{\n    switch (value) {{\n{cases}\n        return true;\n"
-        "    default:\n        return false;\n    }\n}\n\n"
+        f"static bool is_{name}(int64_t value)\n{{\n    switch (value) {{\n{cases}\n        return true;\n"
+        "    default:\n        return false;\n    }\n}"
     )
 
 
-def declaration(row: Row) -> Iterator[str]:
+def declaration(row: Row, key: int) -> Iterator[str]:
     """Yield identifier, size, structure and functions of a row."""
     name = _name(row)
     yield comment(f"{row.kind.capitalize()} {row.id}. {row.doc}")
-    yield f"#define {name.upper()}_ID {row.id}u"
+    yield f"#define {name.upper()}_ID {key}u"
     yield f"#define {name.upper()}_SIZE {row.size}u"
     if row.named_fields:
         yield "typedef struct {"
@@ -65,7 +87,7 @@ def declaration(row: Row) -> Iterator[str]:
         yield f"}} {name}_t;"
         if row.kind == "telecommand":
             values = ", ".join(
-                f".{member_name(field)} = {_initial(field, row.example()[key])}"
+                f".{member_name(field)} = {_initial(row, field, row.example()[key])}"
                 for key, field in row.named_fields.items()
             )
             yield f"#define {name.upper()}_INIT {{ {values} }}"
@@ -104,9 +126,9 @@ def definition(row: Row) -> Iterator[str]:
     yield f"    return {checked if checks and row.kind == 'telecommand' else 'UNIT_OK'};\n}}\n"
 
 
-def telemetry_size(telemetry: Iterable[Row]) -> Iterator[str]:
+def telemetry_size(telemetry: Iterable[Row], key_type: str) -> Iterator[str]:
     """Yield a function that returns the size of a telemetry row."""
-    yield "int unit_telemetry_size(uint8_t id)\n{\n    switch (id) {"
+    yield f"int unit_telemetry_size({key_type} id)\n{{\n    switch (id) {{"
     for row in telemetry:
         yield f"    case {_name(row).upper()}_ID:\n        return (int){_name(row).upper()}_SIZE;"
     yield "    default:\n        return -1;\n    }\n}\n"
@@ -116,8 +138,8 @@ def _name(row: Row) -> str:
     return f"unit_{'tc' if row.kind == 'telecommand' else 'tlm'}_{row.name}"
 
 
-def _constant(enum: EnumDefinition, name: str) -> str:
-    return f"UNIT_{enum.name}_{name}".upper()
+def _constant(enum: str, member: str) -> str:
+    return re.sub(r"\W", "_", f"UNIT_{enum}_{member}").upper()
 
 
 def _bits(field: Field) -> int:
@@ -147,9 +169,9 @@ def _declarator(field: Field) -> str:
             return f"{'int' if _signed(field) else 'uint'}{size}_t {member}"
 
 
-def _initial(field: Field, value: Value) -> str:
+def _initial(row: Row, field: Field, value: Value) -> str:
     if field.enum is not None and isinstance(value, str):
-        return _constant(field.enum, value)
+        return _constant(enum_name(row, field), value)
     match value:
         case bool():
             return str(value).lower()
@@ -183,7 +205,7 @@ def _check(row: Row, field: Field, index: int) -> Iterator[str]:
     test = ""
     match field.kind:
         case "enum" if field.enum is not None:
-            test = f"!is_{field.enum.name}({value})"
+            test = f"!is_{enum_name(row, field)}({value})"
         case "float":
             test = _check_float(row, field, value)
         case "integer" | "bits" if field.scaled:
@@ -255,12 +277,16 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
 
 
 def _put(slot: Slot, value: str) -> str:
-    return f"put_le(data + {slot.offset}, {slot.size}u, {value});"
+    return f"put_{_suffix(slot)}(data + {slot.offset}, {slot.size}u, {value});"
+
+
+def _suffix(slot: Slot) -> str:
+    return "le" if slot.order == "little" else "be"
 
 
 def _decode(field: Field) -> str:
     value = f"values->{member_name(field)}"
-    raw = f"get_le(data + {field.offset}, {field.size}u)"
+    raw = f"get_{_suffix(field.slot)}(data + {field.offset}, {field.size}u)"
     if field.kind == "bytes":
         return f"memcpy({value}, data + {field.offset}, {field.size}u);"
     if field.kind == "text":

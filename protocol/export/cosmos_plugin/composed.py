@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from pprint import pformat
-from typing import Any, Final
+from typing import Any
 
 from starhil.protocol.envelope import Header
+from starhil.protocol.export.row_key import CLASS_SHIFT, row_key
 from starhil.protocol.link_schema import (
     CrcCheck,
     CustomCheck,
@@ -21,17 +22,12 @@ from starhil.protocol.link_schema import (
     XorCheck,
     XxHashCheck,
 )
-from starhil.protocol.messages import MessageClass, RequestKind
-from starhil.protocol.serial_stack import ComposedStack, RowShape
+from starhil.protocol.messages import RequestKind
+from starhil.protocol.serial_stack import ComposedStack
 from starhil.protocol.values import IcdError
 
-CLASS_SHIFT: Final = 8
-"""Position of the class's code in the identifier of a packet."""
 
-
-def link_text(
-    stack: ComposedStack, classes: Sequence[MessageClass], rows: Sequence[RowShape], byte_order: str
-) -> str:
+def link_text(stack: ComposedStack) -> str:
     """Return the text of a link: constants, check, framing and the class Link.
 
     Raises IcdError for a framing or check from a plugin, which is not data.
@@ -44,7 +40,7 @@ def link_text(
             )
     kind = "counted" if framing.kind in ("length", "fixed") else framing.kind
     constants = {
-        **_framing(stack), **_check(stack, byte_order), **_headers(stack, classes), "ROWS": dict(_rows(classes, rows)),
+        **_framing(stack), **_check(stack), **_headers(stack), "ROWS": dict(_rows(stack)),
         "LONGEST": 2 * stack.max_size + 16,
     }  # fmt: skip
     functions = (_snippet("checks", check.kind), _snippet("framings", kind), _part("composed_link"))
@@ -57,11 +53,6 @@ def link_text(
         f"{name} = {pformat(value, width=110, sort_dicts=False)}\n" for name, value in used.items()
     )
     return "\n\n".join((head, *(text.strip("\n") + "\n" for text in functions)))
-
-
-def packet_key(item: MessageClass | None, row_id: int) -> int:
-    """Return the identifier of a row's packet: the code of its class, if the link carries one, and its id."""
-    return ((item.code or 0) << CLASS_SHIFT if item is not None else 0) | row_id
 
 
 def _framing(stack: ComposedStack) -> dict[str, Any]:
@@ -85,11 +76,11 @@ def _framing(stack: ComposedStack) -> dict[str, Any]:
     return constants
 
 
-def _check(stack: ComposedStack, byte_order: str) -> dict[str, Any]:
+def _check(stack: ComposedStack) -> dict[str, Any]:
     model = stack.link.check
     constants: dict[str, Any] = {"CHECK_SIZE": stack.check.size, "CHECK_COVERS": sorted(stack.check.covers)}
     if not isinstance(model, NoCheck):
-        constants["CHECK_ORDER"] = model.order or byte_order
+        constants["CHECK_ORDER"] = model.order or stack.byte_order
     match model:
         case SumCheck():
             constants["COMPLEMENT"] = model.complement
@@ -109,7 +100,8 @@ def _check(stack: ComposedStack, byte_order: str) -> dict[str, Any]:
     return constants
 
 
-def _headers(stack: ComposedStack, classes: Sequence[MessageClass]) -> dict[str, Any]:
+def _headers(stack: ComposedStack) -> dict[str, Any]:
+    classes = stack.classes.classes
     codes = {item.name: item.code or 0 for item in classes}
     coded = [item for item in classes if item.code is not None]
     reply = {(item.code if item.reply is None else item.reply): item.code for item in coded}
@@ -140,11 +132,10 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
         }
 
 
-def _rows(classes: Sequence[MessageClass], rows: Sequence[RowShape]) -> Iterator[tuple[int, dict[str, Any]]]:
-    by_name = {item.name: item for item in classes}
-    for row in rows:
+def _rows(stack: ComposedStack) -> Iterator[tuple[int, dict[str, Any]]]:
+    for row in stack.rows:
         yield (
-            packet_key(by_name.get(row.klass), row.id),
+            row_key(stack.classes.classes, row.klass, row.id),
             {
                 "telemetry": row.kind is RequestKind.TELEMETRY,
                 "request_size": row.request_size,
