@@ -34,6 +34,7 @@ from starhil.emulator.truth.live import LiveFeed, LiveTruth
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
+from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.values import Value
 
 log = logging.getLogger("starhil.run")
@@ -67,6 +68,9 @@ class Emulation:
     ) -> None:
         self.profile = profile
         self.icd = load_unit(profile.unit_source)
+        missing = unbound(self.icd)
+        if missing:
+            raise EmulatorError(missing[0])
         self.clock: Clock = make_clock(profile.run.clock)
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None

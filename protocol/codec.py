@@ -113,6 +113,8 @@ class Field:
     """Name of the action's argument that a telecommand field gives."""
     const: int | float | None = None
     """The only value of the field."""
+    telecommand: str | None = None
+    """Telecommand whose last accepted value a telemetry field reports."""
     aliases: Mapping[str, str] = dataclass_field(default_factory=dict)
     """Values of the quantity that go out as another member of the enumeration."""
 

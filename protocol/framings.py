@@ -16,6 +16,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, SlipFraming
 from starhil.protocol.messages import FaultKind, LinkFault, check_receiver_limits
 from starhil.protocol.serial_framing import Deframer as EscapeDeframer
+from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
 
@@ -141,7 +142,7 @@ class Slip(Framing):
         self._escaped_escape = self.escape + bytes((substitutes[1],))
         self._originals = {substitutes[0]: self.end, substitutes[1]: self.escape}
         if len(self._originals) < 2 or model.end == model.escape or self.end[0] in self._originals:
-            raise ProtocolError("link.serial.framing: end, escape and substitutes must differ")
+            raise IcdError("link.serial.framing: end, escape and substitutes must differ")
 
     def encode(self, body: bytes) -> bytes:
         """Return `end`, the body with its end and escape bytes substituted, and `end`."""
@@ -216,7 +217,7 @@ class Escaped(Framing):
 
     def __init__(self, model: EscapedFraming) -> None:
         if len({model.escape, model.start, model.end}) < 3:
-            raise ProtocolError("link.serial.framing: escape, start and end must differ")
+            raise IcdError("link.serial.framing: escape, start and end must differ")
         self._model = model
         self._escape = bytes((model.escape,))
         self.start = bytes((model.escape, model.start))

@@ -46,7 +46,7 @@ def unbound(icd: InterfaceDefinition) -> list[str]:
         "a field without a name is sent as zeros"
         for row in icd.telemetry.values()
         for field in row.named_fields.values()
-        if field.value is None and field.const is None and field.parameter is None and field.default is None
+        if (field.value, field.const, field.parameter, field.default, field.telecommand) == (None,) * 5
     ]
     return missing
 

@@ -69,11 +69,14 @@ class Layout:
         self.size = 0
 
     def include(self, row: Row) -> None:
-        """Append the fields of another row."""
+        """Append the fields of another row; telemetry reports those of a telecommand as they were last accepted."""
         moved = {slot.index: self._slot(slot.type, slot.size, slot.order) for slot in row.slots}
         for item in row.fields:
             field = replace(item, slot=moved[item.slot.index])
-            self._append(field if row.kind == self._kind else replace(field, value=None, argument=None))
+            if row.kind != self._kind:
+                source = row.name if field.parameter is None and field.const is None else None
+                field = replace(field, value=None, argument=None, telecommand=source)
+            self._append(field)
 
     def add(self, model: FieldModel) -> None:
         """Append a field, a series of numbered fields, a repeated group, or the bits of a bit field."""

@@ -211,7 +211,7 @@ class SerialLinkModel(_Model):
 class CubeSpaceCanModel(_Model):
     """`[link.can]`: the CAN IDs and segments of the CubeSpace family."""
 
-    kind: Literal["cubespace", "cubespace2"]
+    kind: Literal["cubespace"]
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
 
 

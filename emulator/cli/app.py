@@ -29,6 +29,7 @@ USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
 
 COMMANDS: Final[dict[str, str]] = {
     "icd": "icd",
+    "unit": "unit",
     "run": "run",
     "bench": "bench",
     "render": "render",

@@ -16,7 +16,7 @@ from starhil.protocol.device_model import PARAMETER
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd_bindings import quantity_of
 from starhil.protocol.icd_layout import text_of
-from starhil.protocol.messages import Reply
+from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import Value
 
@@ -48,6 +48,8 @@ class TelemetryBinding:
 
 def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
     """Return the function that gives a field's value in its unit, or None for a field that is not bound."""
+    if field.telecommand is not None:
+        return _accepted(field.telecommand, field.name)
     name = field.value if field.parameter is None else PARAMETER + field.parameter
     if name is None:
         return None
@@ -58,6 +60,11 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
     if scale not in (None, 1.0):
         getter = _scaled(getter, float(scale or 1.0))
     return getter if field.enum is None else _named(getter, field)
+
+
+def _accepted(telecommand: str, name: str) -> Getter:
+    """Return the getter of a value with which a telecommand was last accepted."""
+    return lambda shot: shot.device.accepted.get(telecommand, {}).get(name)
 
 
 def _scaled(getter: Getter, scale: float) -> Getter:
@@ -95,6 +102,9 @@ class TelecommandBinding:
         own = icd.plugin.actions.get(name)
         self._action: Action = ACTIONS[name] if own is None else _plugin_action(own)
         self.answered_when_done = name in ANSWERED_WHEN_DONE
+        self._reported = any(
+            field.telecommand == row.name for other in icd.telemetry.values() for field in other.fields
+        )
         model = icd.model.actions.get(name)
         declared = {} if model is None else {item.name: item for item in model.arguments}
         self._fixed: dict[str, Any] = {
@@ -128,11 +138,14 @@ class TelecommandBinding:
             arguments[argument] = convert(values[name])
         arguments[PARAMETERS] = {parameter: values[name] for name, parameter in self._parameters}
         try:
-            return self._action(device, arguments, acknowledge)
+            replies = self._action(device, arguments, acknowledge)
         except Refused as refused:
             if refused.argument is not None:
                 refused.index = self._index.get(refused.argument, 0)
             raise
+        if self._reported:
+            device.accepted[self.row.name] = values
+        return replies
 
 
 def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any], Any]:
@@ -145,7 +158,12 @@ def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any
 
 
 def _plugin_action(function: Callable[[Any, Mapping[str, Any]], Any]) -> Action:
+    """Return a plugin's function as an action; bytes that it returns are the data of the answer, or of each of them."""
+
     def action(device: Device, arguments: Mapping[str, Any], _acknowledge: Acknowledge) -> list[Reply]:
-        return list(function(device, arguments) or ())
+        return [
+            Reply(ReplyKind.ACK, None, item) if isinstance(item, bytes) else item
+            for item in function(device, arguments) or ()
+        ]
 
     return action

@@ -138,10 +138,14 @@ class Device:
         self.reported_quaternion: Quaternion = IDENTITY
         """The last valid quaternion that was reported, for the sign of the next."""
         self.selected_parameter = next(iter(icd.parameters_by_id), 0)
+        self.accepted: dict[str, Mapping[str, Value]] = {}
+        """Values with which telecommands were last accepted, of those that telemetry reports."""
         self.boot_count = 0
         self.reset_cause = "power_on"
         self.mode_changes = 0
         self.frames_valid = 0
+        self.valid_in_a_row = 0
+        """Frames with a valid attitude since the last without one."""
         self.started_ns = clock.now_ns()
         self.warm = False
         """Whether the pipeline is ready."""
@@ -191,8 +195,9 @@ class Device:
         self.started_ns = self.clock.now_ns()
         self.time.offset_ns = round(self.profile.run.start_unix_s * NANOSECONDS) - self.started_ns
         self.time.was_set = False
+        self.accepted.clear()
         self.modes.reset()
-        self.mode_changes = self.frames_valid = 0
+        self.mode_changes = self.frames_valid = self.valid_in_a_row = 0
         for name in self.parameters.restore(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
         for observer in self.on_start:
@@ -296,6 +301,7 @@ class Device:
     def _frame_published(self, measurement: Measurement) -> None:
         self.latest = measurement
         self.frames_valid += measurement.valid
+        self.valid_in_a_row = self.valid_in_a_row + 1 if measurement.valid else 0
         self.modes.solved(
             valid=measurement.valid,
             tracked=measurement.mode is Mode.TRACKING,

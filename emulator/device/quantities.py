@@ -65,6 +65,7 @@ for _axis, _letter in enumerate("xyz"):
     _reported(f"rate.{_letter}", "rate_rad_s", _axis)
 
 QUANTITIES["attitude.valid"] = lambda shot: bool(shot.frame is not None and shot.frame.valid)
+QUANTITIES["attitude.stable"] = lambda shot: shot.device.valid_in_a_row
 QUANTITIES["attitude.reason"] = lambda shot: str(shot.reported.reason)
 QUANTITIES["attitude.sigma_cross"] = lambda shot: _if_valid(shot, "sigma_cross_arcsec")
 QUANTITIES["attitude.sigma_roll"] = lambda shot: _if_valid(shot, "sigma_roll_arcsec")
@@ -212,6 +213,9 @@ QUANTITIES["boot.count"] = lambda shot: shot.device.boot_count
 QUANTITIES["boot.program"] = lambda _shot: 1
 QUANTITIES["counters.telecommands"] = lambda shot: shot.device.counters.telecommands
 QUANTITIES["counters.telemetry"] = lambda shot: shot.device.counters.telemetry
+QUANTITIES["counters.requests"] = lambda shot: (
+    shot.device.counters.telecommands + shot.device.counters.telemetry
+)
 QUANTITIES["counters.frames"] = lambda shot: shot.device.cycle.published
 QUANTITIES["counters.frames_valid"] = lambda shot: shot.device.frames_valid
 for _name in ("node_type", "interface_version", "firmware_major", "firmware_minor"):

@@ -82,8 +82,11 @@ class Requests:
         device.counters.telecommands = (device.counters.telecommands + 1) & 0xFFFF
         code, replies = self._execute(request, row)
         if code is not None:
-            answered = self._replies(request, row, self._answer(request, code))
-            return answered + [replace(reply, destination=request.source) for reply in replies]
+            answered = self._answers_with_data(request, replies) or self._replies(
+                request, row, self._answer(request, code)
+            )
+            following = [replace(item, destination=request.source) for item in replies if item.id is not None]
+            return answered + following
         if later is not None:
             device.acknowledge.on_end = partial(self._answer_later, request, row, later)
         return None
@@ -133,6 +136,14 @@ class Requests:
                 )
                 replies.append(self._answer_telemetry(as_request, other))
         return [replace(item, final=item is replies[-1]) for item in replies]
+
+    def _answers_with_data(self, request: Request, replies: Sequence[Reply]) -> list[Reply]:
+        """Return the answers whose data an action of a plugin has made; no id says that they are answers."""
+        data = [reply.data for reply in replies if reply.id is None]
+        return [
+            replace(self._reply(request, ReplyKind.ACK, item), final=number == len(data))
+            for number, item in enumerate(data, 1)
+        ]
 
     def _answer_telemetry(self, request: Request, row: Row | None) -> Reply:
         if row is None:

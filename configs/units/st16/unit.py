@@ -6,12 +6,9 @@ Layout of the result: `sinclair_stt_result_operational` in hsfl/cosmos-core, lib
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from starhil.emulator.device.quantities import getter_of
-from starhil.emulator.device.refusal import Refused
-from starhil.emulator.device.snapshot import Snapshot
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.plugin import action
 
@@ -30,18 +27,28 @@ LARGEST_FRAME = 256
 """Bytes of the result in one frame (ours)."""
 
 
-def result(device: Any) -> bytes:
-    """Return the result structure of the last measurement."""
+def reader(device: Any) -> Callable[[str], float]:
+    """Return a function that reads quantities of the device by name; 0 where there is no value."""
+    # Imported here: whoever only reads the definition needs no emulator.
+    from starhil.emulator.device.quantities import getter_of
+    from starhil.emulator.device.snapshot import Snapshot
+
     shot = Snapshot(device)
 
     def value(name: str) -> float:
-        return float(getter_of(name)(shot) or 0.0)
+        found = getter_of(name)(shot)
+        return float(found) if isinstance(found, (int, float)) else 0.0
 
-    valid = bool(getter_of("attitude.valid")(shot))
+    return value
+
+
+def result(device: Any) -> bytes:
+    """Return the result structure of the last measurement."""
+    value = reader(device)
     head = struct.pack(
         "<II4d3dd",
         int(value("frame.counter")),
-        VALID if valid else FAILED,
+        VALID if value("attitude.valid") else FAILED,
         *(value(f"attitude.{axis}") for axis in "xyzw"),
         *(value(f"rate.{axis}") for axis in "xyz"),
         value("frame.time"),
@@ -53,10 +60,10 @@ def result(device: Any) -> bytes:
 
 def edac(device: Any) -> bytes:
     """Return the memory that is read in flight: analog values, and the length of the result."""
-    shot = Snapshot(device)
+    value = reader(device)
     names = ("mcu_current", "bus_voltage", "core_voltage", "mcu_voltage", "io_voltage", "mcu_temperature",
              "supervisor_voltage", "detector_voltage")  # fmt: skip
-    analog = struct.pack("<8f", *(float(getter_of(f"health.{name}")(shot) or 0.0) for name in names))
+    analog = struct.pack("<8f", *(value(f"health.{name}") for name in names))
     memory = bytearray(EDAC_SIZE)
     memory[ANALOG_ADDRESS : ANALOG_ADDRESS + len(analog)] = analog
     memory[LENGTH_ADDRESS:] = struct.pack("<I", RESULT_SIZE)
@@ -65,6 +72,8 @@ def edac(device: Any) -> bytes:
 
 def placed(memory: bytes, address: int, count: int) -> bytes:
     """Return the address and the bytes at it."""
+    from starhil.emulator.device.refusal import Refused
+
     if address + count > len(memory):
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="address")
     return struct.pack("<H", address) + memory[address : address + count]
