@@ -247,8 +247,15 @@ class Emulation:
                 requests, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
             )
             self.ready_fields["can"] = await self.can.start()
-        if links.canopen.node:
+        if self._canopen_wanted:
             await self._open_canopen(requests)
+
+    @property
+    def _canopen_wanted(self) -> bool:
+        """Whether a node is asked for, or CANopen is the only link that the unit has."""
+        links, has = self.profile.links, self.icd.link
+        only = self.icd.canopen is not None and has.serial is None and has.can is None
+        return bool(links.canopen.node) or (only and links.can.channel != "off")
 
     def _check_links(self) -> None:
         """Check that the unit has the links that the profile asks for by more than `auto`, and any at all."""
@@ -258,7 +265,7 @@ class Emulation:
             (
                 "can.channel",
                 links.can.channel not in ("off", "auto") and not links.canopen.node,
-                has.can is not None,
+                has.can is not None or self.icd.canopen is not None,
             ),
             ("canopen.node", bool(links.canopen.node), self.icd.canopen is not None),
         ):

@@ -37,6 +37,8 @@ class CubeSpaceFraming(_Model):
     """Framing of the CubeSpace family with its three reply dialects; it has no header and no check."""
 
     kind: Literal["cubespace"]
+    dialect: Literal["a", "b", "c"] | None = None
+    """The only dialect of the unit; that of the parameter `serial_dialect` unless given."""
 
 
 class EscapedFraming(_Model):

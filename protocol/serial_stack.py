@@ -127,12 +127,20 @@ class SerialStack(ABC):
 
 
 class CubeSpaceStack(SerialStack):
-    """The serial link of the CubeSpace family; its style is the reply dialect, b unless given."""
+    """The serial link of the CubeSpace family; its style is the reply dialect, b unless given.
+
+    Attributes
+    ----------
+    dialect
+        The only dialect of the unit, whatever the style; None if it has all.
+    """
 
     def __init__(self, link: SerialLinkModel) -> None:
         self.baud = link.baud
         self._timeout_s = link.timeout
         self._max_size = link.max_size or DEFAULT_MAX_SIZE
+        given = link.framing.dialect if isinstance(link.framing, CubeSpaceFraming) else None
+        self.dialect: Final = None if given is None else Dialect(given)
 
     def device(self) -> DeviceReceiver:
         """Return a receiver for the device's end."""
@@ -140,11 +148,11 @@ class CubeSpaceStack(SerialStack):
 
     def host(self, style: Dialect | None = None) -> HostReceiver:
         """Return a receiver for the OBC's end, in a dialect."""
-        return HostReceiver(style or Dialect.B, max_size=self._max_size, timeout_s=self._timeout_s)
+        return HostReceiver(self._style(style), max_size=self._max_size, timeout_s=self._timeout_s)
 
     def supports_unsolicited(self, style: Dialect | None = None) -> bool:
         """Return whether unsolicited telemetry can be sent in this dialect."""
-        return (style or Dialect.B).supports_unsolicited
+        return self._style(style).supports_unsolicited
 
     def encode_request(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
@@ -152,7 +160,10 @@ class CubeSpaceStack(SerialStack):
 
     def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:
         """Return a reply as bytes on the line, in a dialect."""
-        return encode_cubespace_reply(reply, style or Dialect.B)
+        return encode_cubespace_reply(reply, self._style(style))
+
+    def _style(self, style: Dialect | None) -> Dialect:
+        return self.dialect or style or Dialect.B
 
 
 @dataclass

@@ -69,7 +69,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         """The present dialect of replies; None for a unit that has no dialects."""
         if not isinstance(self._stack, CubeSpaceStack):
             return None
-        return Dialect(str(self._device.parameters["serial_dialect"]))
+        return self._stack.dialect or Dialect(str(self._device.parameters["serial_dialect"]))
 
     def _reply_style(self) -> Dialect | None:
         return self.dialect

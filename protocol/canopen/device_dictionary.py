@@ -288,7 +288,7 @@ class DeviceDictionary(Dictionary):
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
             _describe(member, fields)
-            self._writers[key] = partial(self._execute, row)
+            self._writers[key] = partial(self._execute_scalar, row)
         else:
             member = variable(name, *key, datatypes.OCTET_STRING, "wo")
             self._sizes[key] = row.size
@@ -305,11 +305,14 @@ class DeviceDictionary(Dictionary):
             raise abort_of(error) from None
         return self.application.telecommand(row, payload)
 
+    def _execute_scalar(self, row: Row, payload: bytes) -> Deferred | None:
+        return self._execute(row, _in_order(row.slots[0], payload))
+
     def _execute_without_data(self, row: Row, _data: bytes) -> Deferred | None:
         return self._execute(row, b"")
 
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
-        return self.row_bytes(row)[_span(slot)]
+        return _in_order(slot, self.row_bytes(row)[_span(slot)])
 
     def _bind_reader(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
         self._readers[key] = reader
@@ -363,7 +366,7 @@ class _Packer:
     def __call__(self) -> bytes:
         data = self._dictionary.row_bytes(self._row)
         if self._field is None:
-            raw = int.from_bytes(data[_span(self._slot)], "little")
+            raw = int.from_bytes(data[_span(self._slot)], self._slot.order)
         else:
             value = self._row.decode(data)[self._field.name]
             number = value if isinstance(value, int | float) else self._raw(value)
@@ -418,6 +421,11 @@ def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
 
 def _span(slot: Slot) -> slice:
     return slice(slot.offset, slot.offset + slot.size)
+
+
+def _in_order(slot: Slot, data: bytes) -> bytes:
+    """Change bytes between the order of a slot and that of CANopen, little-endian."""
+    return data[::-1] if slot.order == "big" and slot.type != "bytes" else data
 
 
 def _describe(member: ODVariable, fields: list[Field]) -> None:
