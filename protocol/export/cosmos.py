@@ -114,6 +114,10 @@ def _limits(field: Field) -> str:
         return f" 0 {2**field.width - 1 if field.width else 0} {int(bool(field.default))}"
     if field.kind == "float" and (field.minimum is None or field.maximum is None):
         return " MIN MAX 0"
+    if field.kind in ("integer", "bits") and not field.scaled:
+        low, high = field.raw_limits  # whole numbers of any size, which a float could not hold
+        default = int(field.default) if isinstance(field.default, (int, float)) else min(max(0, low), high)
+        return f" {low} {high} {default}"
     low_limit, high_limit = field.physical_limits
     default_value = (
         field.default if isinstance(field.default, (int, float)) else min(max(0.0, low_limit), high_limit)
