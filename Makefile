@@ -3,7 +3,7 @@
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
-# make cosmos      the COSMOS export, read by OpenC3's own reader (installed apart, 220 MB)
+# make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 220 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
@@ -63,7 +63,7 @@ cosmos: $(VENV)/.developer
 	$(PYTHON) -m venv out/cosmos
 	out/cosmos/bin/pip install --quiet openc3
 	PYTHONPATH=$$(out/cosmos/bin/python -c 'import site; print(site.getsitepackages()[0])') \
-		$(BIN)/python -m pytest tests/protocol/test_export.py -k cosmos
+		$(BIN)/python -m pytest -k cosmos tests/protocol/test_export.py tests/process/test_cosmos_plugin.py
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -161,7 +161,7 @@ class Field:
         return (low, high) if self.scale > 0.0 else (high, low)
 
     @cached_property
-    def _divisor(self) -> int | None:
+    def divisor(self) -> int | None:
         """1/scale if that is an integer: division by it gives the nearest decimal."""
         inverse = round(1.0 / self.scale)
         return inverse if inverse and abs(inverse * self.scale - 1.0) < 1e-12 else None
@@ -239,7 +239,7 @@ class Field:
             case _:
                 if not self.scaled:
                     return int(raw)
-                value = raw / self._divisor if self._divisor else raw * self.scale
+                value = raw / self.divisor if self.divisor else raw * self.scale
                 return float(value + self.bias)
 
     def check_raw(self, raw: Any, where: str, index: int) -> None:

@@ -250,6 +250,8 @@ class ComposedStack(SerialStack):
         self.framing: Final = _build_framing(link, framings or {})
         self.check: Final = build_check(link.check, byte_order, checks)
         self.classes: Final = _Classes(classes)
+        self.rows: Final = tuple(rows)
+        self.byte_order: Final = byte_order
         self._rows = {(row.klass, row.id): row for row in rows}
         self._rows_by_id: dict[int, RowShape] = {}
         for row in rows:
@@ -268,7 +270,7 @@ class ComposedStack(SerialStack):
             for head in (self.request_header, self.reply_header)
             for name in ("", *self.classes.by_name)
         )
-        self._max_size = link.max_size or max(DEFAULT_MAX_SIZE, longest + header + self.check.size)
+        self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest + header + self.check.size)
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
@@ -312,7 +314,7 @@ class ComposedStack(SerialStack):
         interpret: Callable[[bytes], _Message | LinkFault | None],
         measure: Callable[[bytes], int | None],
     ) -> Receiving[_Message]:
-        return Receiving(interpret, measure, self._max_size, self.link.timeout)
+        return Receiving(interpret, measure, self.max_size, self.link.timeout)
 
     def encode_request(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""

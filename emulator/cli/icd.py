@@ -24,28 +24,45 @@ class Format(StrEnum):
     EDS = "eds"
     XTCE = "xtce"
     COSMOS = "cosmos"
+    C = "c"
+    COSMOS_PLUGIN = "cosmos-plugin"
 
 
 @group.command()
 def export(
     format_: Annotated[
-        Format, typer.Argument(metavar="FORMAT", help="markdown, html, dbc, eds, xtce or cosmos.")
+        Format,
+        typer.Argument(metavar="FORMAT", help="markdown, html, dbc, eds, xtce, cosmos, c or cosmos-plugin."),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help=output_help("File to write; default: stdout.")),
+        typer.Option(
+            "--output",
+            "-o",
+            help=output_help(
+                "File to write; default: stdout. For c and cosmos-plugin: the folder of their files."
+            ),
+        ),
     ] = None,
     unit: Unit = DEFAULT_UNIT,
 ) -> None:
     """Export the interface definition in another format.
 
-    markdown and html are for readers, dbc for CAN tools, eds for CANopen masters, xtce and
-    cosmos for ground software.
+    markdown and html are for readers, dbc for CAN tools, eds for CANopen masters, xtce, cosmos
+    and cosmos-plugin for ground software, c for flight software.
     """
-    from starhil.protocol.export import export as render
+    from starhil.emulator.errors import EmulatorError
+    from starhil.protocol import export as formats
     from starhil.protocol.icd import load_unit
 
-    text = render(load_unit(unit), format_.value)
+    definition, name = load_unit(unit), format_.value
+    if name in formats.FOLDER_FORMATS:
+        if output is None or output.is_file():
+            raise EmulatorError(f"icd export {name}: makes several files; name their folder with -o")
+        for path, text in formats.export_folder(definition, name).items():
+            _write(output / path, text)
+        return
+    text = formats.export(definition, name)
     if output is None:
         print_text(text)
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import Final, cast
 
 from starhil.protocol.errors import ProtocolError
@@ -20,15 +20,35 @@ FORMATS: Final[Mapping[str, str]] = MappingProxyType(
         "cosmos": "command and telemetry definition of OpenC3 COSMOS",
     }
 )
-"""Description of each format by name."""
+"""Description of each format of one text, by name."""
+
+FOLDER_FORMATS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "c": "C99 codec and serial link, header and source",
+        "cosmos-plugin": "plugin of OpenC3 COSMOS: target, interface and protocol of the serial line",
+    }
+)
+"""Description of each format of several files, by name."""
 
 
 def export(icd: InterfaceDefinition, name: str) -> str:
-    """Return the interface definition in the named format.
+    """Return the interface definition in a format of one text.
 
-    Raises ProtocolError for an unknown name.
+    Raises ProtocolError for an unknown name, and for a definition that the format cannot hold.
     """
-    if name not in FORMATS:
-        raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(FORMATS)}")
-    module = import_module(f"starhil.protocol.export.{name}")
-    return cast("Callable[[InterfaceDefinition], str]", module.render)(icd)
+    return cast("Callable[[InterfaceDefinition], str]", _exporter(name, FORMATS).render)(icd)
+
+
+def export_folder(icd: InterfaceDefinition, name: str) -> Mapping[str, str]:
+    """Return the interface definition in a format of several files: texts by path within the folder.
+
+    Raises ProtocolError for an unknown name, and for a definition that the format cannot hold.
+    """
+    render = _exporter(name, FOLDER_FORMATS).render_folder
+    return cast("Callable[[InterfaceDefinition], Mapping[str, str]]", render)(icd)
+
+
+def _exporter(name: str, formats: Mapping[str, str]) -> ModuleType:
+    if name not in formats:
+        raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(formats)}")
+    return import_module(f"starhil.protocol.export.{name.replace('-', '_')}")

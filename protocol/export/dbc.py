@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
-from starhil.protocol.codec import Field, Row
+from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import EnumDefinition, IcdError
 
 EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""
@@ -35,9 +37,11 @@ class _Message:
 
 
 def render(icd: InterfaceDefinition) -> str:
-    """Return the text of the database."""
-    host = int(icd.parameters["host_address"].default)
-    device = int(icd.parameters["can_address"].default)
+    """Return the text of the database. Raises IcdError for a unit without a CAN link."""
+    if icd.link.can is None:
+        raise IcdError(f"unit {icd.name}: has no CAN link ([link.can]), and a DBC holds messages of CAN only")
+    host = int(icd.device_parameters["host_address"].default)
+    device = int(icd.device_parameters["can_address"].default)
     messages = [message for row in icd.rows for message in _messages(row, icd, host, device)]
     return "\n".join(_lines(icd, messages)) + "\n"
 
@@ -74,8 +78,7 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     to_device = (row.id, host, device)
     to_host = (row.id, device, host)
     signals = tuple(replace(field, doc=meaning(row, field)) for field in row.named_fields.values())
-    error = tuple(field for field in icd.telemetry["acknowledge"].fields if field.name == "error")
-    code = tuple(_at_start(field) for field in error)
+    code = (Field("error", "enum", Slot(0, "u8", 0, 1), enum=_error_codes(icd), doc="Error code."),)
     long = row.size > MAX_FRAME_DATA
     if row.kind == "telemetry":
         request_type, reply_type = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
@@ -97,10 +100,10 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     yield _Message(_id(nack_type, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
 
 
-def _at_start(field: Field) -> Field:
-    """Return the field as the first byte of a separate message."""
-    slot = type(field.slot)(0, field.slot.type, 0, field.slot.size)
-    return Field(field.name, field.kind, slot, enum=field.enum, provenance=field.provenance, doc=field.doc)
+def _error_codes(icd: InterfaceDefinition) -> EnumDefinition:
+    """Return the numbers of refusals: the unit's enumeration, else the published ones."""
+    published = {code.name.lower(): int(code) for code in ErrorCode}
+    return icd.enums.get("error_code") or EnumDefinition("error_code", "", published)
 
 
 def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:
@@ -114,10 +117,14 @@ def _signals(field: Field, receiver: str) -> Iterator[str]:
             yield f' SG_ {field.name}_{index} : {start + 8 * index}|8@1+ (1,0) [0|255] "" {receiver}'
         return
     width = field.width or 8 * field.size
+    first, order = start + field.shift, 1
+    if field.slot.order == "big":  # counted to the most significant bit, byte by byte
+        top = 8 * field.size - 1 if not field.width else field.shift + field.width - 1
+        first, order = start + 8 * (field.size - 1 - top // 8) + top % 8, 0
     sign = "-" if field.slot.type in _SIGNED or field.kind == "float" else "+"
     low, high = _limits(field)
     yield (
-        f" SG_ {field.name} : {start + field.shift}|{width}@1{sign} ({number(field.scale)},{number(field.bias)}) "
+        f" SG_ {field.name} : {first}|{width}@{order}{sign} ({number(field.scale)},{number(field.bias)}) "
         f'[{number(low)}|{number(high)}] "{_text(field.unit)}" {receiver}'
     )
 

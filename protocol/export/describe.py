@@ -12,8 +12,7 @@ from starhil.protocol.values import EnumDefinition, Parameter
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
 PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
 
-INTRODUCTION: Final = (
-    "Multi-byte fields are little-endian. Identifiers below 128 are telecommands, from 128 on telemetry.",
+_BEHAVIOUR: Final = (
     (
         "A telecommand with a value outside its range is refused with invalid_parameter and changes nothing. A number in telemetry "
         "that is beyond its range is carried as the nearest limit (clipped) or by its lowest bits (wraps), as the range says; a "
@@ -23,16 +22,19 @@ INTRODUCTION: Final = (
         "Source of a row or field: confirmed (public flight software or a manual has it, named at the row), proxy (public for "
         "another unit of the same family) or ours (no public source; chosen here)."
     ),
-    (
-        "The confirmed rows are those by which the CubeComputer takes commands and re-publishes star-tracker data. The stand-alone "
-        "unit's own table of identifiers is not public, so a confirmed row need not be one that such a unit answers."
-    ),
-    (
-        "Sources by name: AlbertaSat ex2_adcs is github.com/AlbertaSat/ex2_adcs_software, CTS is "
-        "github.com/CalgaryToSpace/CTS-SAT-1-OBC-Firmware, RADSAT-SK is github.com/USST-RADSAT-SK/software-and-command."
-    ),
 )
-"""Paragraphs before the tables."""
+
+
+def introduction(icd: InterfaceDefinition) -> Iterator[str]:
+    """Paragraphs before the tables."""
+    first = icd.first_telemetry_id
+    kinds = (
+        f" Identifiers below {first} are telecommands, from {first} on telemetry."
+        if first is not None
+        else ""
+    )
+    yield f"Multi-byte fields are {icd.conventions.byte_order}-endian.{kinds}"
+    yield from _BEHAVIOUR
 
 
 def number(value: float) -> str:
@@ -41,8 +43,14 @@ def number(value: float) -> str:
 
 
 def title(row: Row) -> str:
-    """Return the heading of a row: id and name."""
-    return f"{row.id} (0x{row.id:02X}) {row.name}"
+    """Return the heading of a row: class, if it has one, id and name."""
+    klass = f"{row.klass} " if row.klass else ""
+    return f"{klass}{row.id} (0x{row.id:02X}) {row.name}"
+
+
+def anchor(row: Row) -> str:
+    """Return a name for a row's place in a page that no other row has."""
+    return f"row-{row.kind}-{row.klass}-{row.id}"
 
 
 def facts(row: Row) -> str:

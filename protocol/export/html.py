@@ -32,7 +32,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     yield '<html lang="en"><head><meta charset="utf-8">'
     yield f"<title>{escape(heading)}</title><style>{_STYLE}</style></head><body>"
     yield f"<h1>{escape(heading)}</h1><p>{escape(icd.doc)}</p>"
-    yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.INTRODUCTION)
+    yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.introduction(icd))
     yield (
         "<nav>"
         + "".join(_link(section) for section in icd.sections)
@@ -48,12 +48,12 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         yield "<table><tr><th>Id</th><th>Name</th><th>Bytes</th><th>Source</th><th>Meaning</th></tr>"
         for row in rows:
             yield (
-                f'<tr class="{row.provenance}"><td>{row.id}</td><td><a href="#row-{row.id}">{escape(row.name)}</a></td>'
+                f'<tr class="{row.provenance}"><td>{row.id}</td><td><a href="#{describe.anchor(row)}">{escape(row.name)}</a></td>'
                 f"<td>{row.size}</td><td>{row.provenance}</td><td>{escape(row.doc)}</td></tr>"
             )
         yield "</table>"
         for row in rows:
-            yield f'<h3 id="row-{row.id}">{escape(describe.title(row))}</h3>'
+            yield f'<h3 id="{describe.anchor(row)}">{escape(describe.title(row))}</h3>'
             yield f'<p>{escape(row.doc)}</p><p class="facts">{escape(describe.facts(row))}.</p>'
             if row.fields:
                 yield from _table(

@@ -19,7 +19,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     yield f"# Interface definition {icd.name} {icd.version}"
     yield ""
     yield icd.doc
-    for paragraph in describe.INTRODUCTION:
+    for paragraph in describe.introduction(icd):
         yield ""
         yield paragraph
     yield ""

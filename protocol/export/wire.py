@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
+
+from pydantic import BaseModel
 
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
 from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, read_layout
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
 from starhil.protocol.values import Section
@@ -24,11 +28,75 @@ _PLACEHOLDERS: Final = {
 
 
 def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
-    """Return the sections on the links."""
-    if icd.canopen is None:
-        return (_serial(), _can())
-    layout = read_layout(icd)
-    return (_serial(), _can(), _objects(layout), _pdos(layout))
+    """Return the sections on the links that the unit has."""
+    found: list[Section] = []
+    if icd.link.serial is not None:
+        cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
+        found.append(_serial() if cubespace else _composed(icd.link.serial))
+    if icd.link.can is not None:
+        found.append(_can())
+    if icd.canopen is not None:
+        layout = read_layout(icd)
+        found += [_objects(layout), _pdos(layout)]
+    return tuple(found)
+
+
+def _composed(link: SerialLinkModel) -> Section:
+    messages = (("request", link.request_header), ("reply", link.reply_header))
+    text = (
+        f"{link.baud} bit/s, 8 data bits, no parity, 1 stop bit. A message is its header, the data of its row and the check, put between bytes "
+        f"by the framing. Framing: {_settings(link.framing)}. Check: {_settings(link.check)}."
+    )
+    return Section(
+        "Serial line",
+        (text,),
+        ("Message", "Header field", "Type", "Value"),
+        tuple(
+            (message, *cells)
+            for message, header in messages
+            for field in header
+            for cells in _header_cells(field)
+        ),
+    )
+
+
+def _settings(model: BaseModel) -> str:
+    """Describe the settings of a framing or check in one line."""
+    values = model.model_dump(exclude={"kind"}, exclude_none=True)
+    kind = str(model.model_dump()["kind"])
+    return (
+        f"{kind} ({', '.join(f'{name} {_setting(value)}' for name, value in values.items())})"
+        if values
+        else kind
+    )
+
+
+def _setting(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return " ".join(_setting(item) for item in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:X}h" if isinstance(value, int) else str(value)
+
+
+def _header_cells(field: HeaderFieldModel) -> Iterator[tuple[str, str, str]]:
+    only = f"; in {', '.join(field.classes)}" if field.classes else ""
+    bits = 0
+    for bit in field.bits:
+        yield (
+            bit.role or "constant",
+            f"{field.type}, bits {bits} to {bits + bit.width - 1}",
+            _fixed_value(bit.const, bit.default),
+        )
+        bits += bit.width
+    if not field.bits:
+        yield field.role or "constant", field.type + only, _fixed_value(field.const, field.default)
+
+
+def _fixed_value(const: int | None, default: int | None) -> str:
+    if const is not None:
+        return f"{const:X}h"
+    return "" if default is None else f"{default:X}h unless given"
 
 
 def _serial() -> Section:

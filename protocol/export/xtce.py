@@ -1,6 +1,6 @@
 """The interface definition as XTCE 1.2 (XML Telemetric and Command Exchange).
 
-A packet is the id followed by the row's data, as between start and end of a serial message.
+A packet is the row's identifier followed by its data; in a unit with classes the code of the class is the identifier's upper byte.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from xml.etree import ElementTree as ET
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.export.describe import meaning, number
+from starhil.protocol.export.row_key import key_bits, key_of
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import IcdError
 
@@ -18,7 +19,7 @@ NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
 PACKET: Final = "Packet"
 IDENTIFIER: Final = "identifier"
 
-_LITTLE: Final = "leastSignificantByteFirst"
+_ORDERS: Final = {"little": "leastSignificantByteFirst", "big": "mostSignificantByteFirst"}
 
 
 def render(icd: InterfaceDefinition) -> str:
@@ -29,12 +30,10 @@ def render(icd: InterfaceDefinition) -> str:
     ET.SubElement(
         system, "Header", {"version": icd.version, "date": "2026-01-01", "validationStatus": "Working"}
     )
-    _telemetry(
-        ET.SubElement(system, "TelemetryMetaData"), [row for row in icd.rows if row.kind == "telemetry"]
-    )
-    _commands(
-        ET.SubElement(system, "CommandMetaData"), [row for row in icd.rows if row.kind == "telecommand"]
-    )
+    if icd.telemetry:
+        _telemetry(ET.SubElement(system, "TelemetryMetaData"), icd)
+    if icd.telecommands:
+        _commands(ET.SubElement(system, "CommandMetaData"), icd)
     ET.indent(system)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(system, encoding="unicode") + "\n"
 
@@ -43,7 +42,8 @@ def wire_order(row: Row) -> Iterator[Field]:
     """Yield the fields of a row in wire order, most significant bit of each byte first."""
     for slot in row.slots:
         fields = [field for field in row.fields if field.slot is slot]
-        for byte in range(slot.size) if fields[0].width else (0,):
+        bytes_in_order = range(slot.size) if slot.order == "little" else reversed(range(slot.size))
+        for byte in bytes_in_order if fields[0].width else (0,):
             within = [field for field in fields if not field.width or field.shift // 8 == byte]
             for field in within:
                 if field.width and (field.shift % 8) + field.width > 8:
@@ -51,12 +51,13 @@ def wire_order(row: Row) -> Iterator[Field]:
             yield from sorted(within, key=lambda field: -field.shift)
 
 
-def _telemetry(parent: ET.Element, rows: list[Row]) -> None:
+def _telemetry(parent: ET.Element, icd: InterfaceDefinition) -> None:
     types = ET.SubElement(parent, "ParameterTypeSet")
     parameters = ET.SubElement(parent, "ParameterSet")
     containers = ET.SubElement(parent, "ContainerSet")
     _unsigned(
-        ET.SubElement(types, "IntegerParameterType", {"name": f"{IDENTIFIER}_type", "signed": "false"}), 8
+        ET.SubElement(types, "IntegerParameterType", {"name": f"{IDENTIFIER}_type", "signed": "false"}),
+        key_bits(icd),
     )
     ET.SubElement(
         parameters,
@@ -69,7 +70,7 @@ def _telemetry(parent: ET.Element, rows: list[Row]) -> None:
     )
     root = ET.SubElement(containers, "SequenceContainer", {"name": PACKET, "abstract": "true"})
     _entries(root, "Parameter", [IDENTIFIER])
-    for row in rows:
+    for row in (row for row in icd.rows if row.kind == "telemetry"):
         names = []
         for index, field in enumerate(wire_order(row)):
             name = _name(row, field, index)
@@ -81,13 +82,15 @@ def _telemetry(parent: ET.Element, rows: list[Row]) -> None:
         _entries(container, "Parameter", names)
         base = ET.SubElement(container, "BaseContainer", {"containerRef": PACKET})
         criteria = ET.SubElement(base, "RestrictionCriteria")
-        ET.SubElement(criteria, "Comparison", {"parameterRef": IDENTIFIER, "value": str(row.id)})
+        ET.SubElement(criteria, "Comparison", {"parameterRef": IDENTIFIER, "value": str(key_of(icd, row))})
 
 
-def _commands(parent: ET.Element, rows: list[Row]) -> None:
+def _commands(parent: ET.Element, icd: InterfaceDefinition) -> None:
     types = ET.SubElement(parent, "ArgumentTypeSet")
     commands = ET.SubElement(parent, "MetaCommandSet")
-    for row in rows:
+    if not any(row.named_fields for row in icd.telecommands.values()):
+        parent.remove(types)
+    for row in (row for row in icd.rows if row.kind == "telecommand"):
         command = ET.SubElement(commands, "MetaCommand", {"name": row.name} | _short(row.doc))
         arguments = [(_name(row, field, index), field) for index, field in enumerate(wire_order(row))]
         if any(field.name for _, field in arguments):
@@ -101,7 +104,7 @@ def _commands(parent: ET.Element, rows: list[Row]) -> None:
                     ET.SubElement(listed, "Argument", about | _short(meaning(row, field)))
         container = ET.SubElement(command, "CommandContainer", {"name": f"{row.name}_packet"})
         entries = ET.SubElement(container, "EntryList")
-        _fixed(entries, "identifier", row.id, 8)
+        _fixed(entries, "identifier", key_of(icd, row), key_bits(icd))
         for name, field in arguments:
             if field.name:
                 ET.SubElement(entries, "ArgumentRefEntry", {"argumentRef": field.name})
@@ -137,7 +140,12 @@ def _type(types: ET.Element, what: str, name: str, field: Field) -> None:
         bits = {"sizeInBits": str(8 * field.size)}
         kind = ET.SubElement(types, f"Float{what}Type", about | bits)
         _unit(kind, field)
-        ET.SubElement(kind, "FloatDataEncoding", bits | {"encoding": "IEEE754_1985", "byteOrder": _LITTLE})
+        encoding = ET.SubElement(
+            kind,
+            "FloatDataEncoding",
+            bits | {"encoding": "IEEE754_1985", "byteOrder": _ORDERS[field.slot.order]},
+        )
+        _calibrator(encoding, field)
     elif field.enum is not None:
         kind = ET.SubElement(types, f"Enumerated{what}Type", about)
         _integer(kind, field)
@@ -168,9 +176,14 @@ def _integer(kind: ET.Element, field: Field) -> None:
         {
             "sizeInBits": str(_bits(field)),
             "encoding": "twosComplement" if _signed(field) else "unsigned",
-            "byteOrder": _LITTLE,
+            "byteOrder": _ORDERS[field.slot.order],
         },
     )
+    _calibrator(encoding, field)
+
+
+def _calibrator(encoding: ET.Element, field: Field) -> None:
+    """Add the scale of a number."""
     if field.scaled:
         calibrator = ET.SubElement(ET.SubElement(encoding, "DefaultCalibrator"), "PolynomialCalibrator")
         ET.SubElement(calibrator, "Term", {"coefficient": number(field.bias), "exponent": "0"})

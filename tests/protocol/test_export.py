@@ -22,9 +22,13 @@ from space_packet_parser.xtce import definitions, validation
 from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.export import FORMATS, export
-from starhil.protocol.icd import load_unit
+from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
+from starhil.protocol.export.cosmos import _state
+from starhil.protocol.export.describe import anchor
+from starhil.protocol.export.row_key import key_bits, key_of
+from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.unit_folders import DEFAULT_UNIT, shipped_units
 from starhil.protocol.values import Value, to_f32
 
 ICD = load_unit()
@@ -53,6 +57,8 @@ def _value(field: Field, number: int, turn: int) -> Value:
         case "enum":
             assert field.enum is not None
             return list(field.enum.values)[(number + turn) % len(field.enum.values)]
+        case "text":
+            return "star"[: field.size]
         case "bytes":
             return bytes((17 * index + 31 * turn) % 256 for index in range(field.size))
         case "float":
@@ -290,7 +296,9 @@ def test_the_cosmos_text_has_every_row_once_and_no_overlap() -> None:
             seen[current] = []
         elif match := re.match(r"  (?:PARAMETER|ITEM) (\w+) (\d+) (\d+) ", line):
             seen[current].append((int(match[2]), int(match[3])))
-    assert seen.keys() == {row.name for row in ICD.rows}
+    assert seen.keys() == {row.name for row in ICD.rows} | {f"request_{row.name}" for row in TELEMETRY}
+    for row in TELEMETRY:
+        assert seen[f"request_{row.name}"] == []
     for row in ICD.rows:
         places = sorted(seen[row.name])
         assert sum(size for _, size in places) == 8 * row.size
@@ -326,7 +334,7 @@ def test_the_page_is_whole_and_its_links_lead_somewhere() -> None:
     page.feed(text("html"))
     assert page.open == []
     assert page.links <= page.targets
-    assert {f"row-{row.id}" for row in ICD.rows} <= page.targets
+    assert {anchor(row) for row in ICD.rows} <= page.targets
 
 
 def test_markdown_tables_have_even_columns_and_every_field() -> None:
@@ -397,3 +405,82 @@ def test_a_changed_row_changes_every_export(tmp_path: Path) -> None:
         if name != "eds":  # the object dictionary places rows of the definition by its own file
             assert "frame_interval" in export(changed, name).lower()
             assert "sample_period" not in export(changed, name).lower()
+
+
+# -- other units -------------------------------------------------------------------------------------------------------
+
+UNITS = [name for name in shipped_units() if name != DEFAULT_UNIT]
+WITHOUT = {
+    "dbc": ("has no CAN link", lambda icd: icd.link.can is None),
+    "eds": ("has no CANopen", lambda icd: icd.canopen is None),
+}
+"""Formats that hold no unit without a link: the reason that is given, and whether a unit has it."""
+
+
+@cache
+def unit(name: str) -> InterfaceDefinition:
+    return load_unit(name)
+
+
+@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("format_", FORMATS)
+def test_a_format_holds_a_unit_or_names_what_the_unit_lacks(format_: str, name: str) -> None:
+    reason, lacks = WITHOUT.get(format_, ("", lambda _icd: False))
+    if lacks(unit(name)):
+        with pytest.raises(ProtocolError, match=f"^unit {name}: {reason}"):
+            export(unit(name), format_)
+        return
+    said = export(unit(name), format_).lower()
+    if format_ != "eds":
+        assert all(row.name in said for row in unit(name).rows)
+
+
+@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("format_", FOLDER_FORMATS)
+def test_a_folder_format_refuses_a_unit_without_a_serial_link(format_: str, name: str) -> None:
+    if unit(name).link.serial is None:
+        with pytest.raises(ProtocolError, match=f"^unit {name}: has no serial link"):
+            export_folder(unit(name), format_)
+    else:
+        assert export_folder(unit(name), format_)
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_the_xtce_of_a_unit_is_read_as_its_packets_are(name: str, tmp_path: Path) -> None:
+    icd = unit(name)
+    file = tmp_path / "unit.xml"
+    file.write_text(export(icd, "xtce"), encoding="utf-8")
+    schema = Path(validation.__file__).parent / "schemas" / "SpaceSystem.xsd"
+    result = validation.validate_xtce(
+        file, local_xsd=schema, print_results=False, raise_on_error=False, allow_schema_download=False
+    )
+    assert [str(error) for error in result.errors] == []
+    definition = definitions.XtcePacketDefinition.from_xtce(file, root_container_name="Packet")
+    for row in icd.telemetry.values():
+        for values, data in packets(row):
+            packet = definition.parse_bytes(key_of(icd, row).to_bytes(key_bits(icd) // 8, "big") + data)
+            for key, value in values.items():
+                read = packet[f"{row.name}_{key}"]
+                theirs = (
+                    bool(read) if isinstance(value, bool) else str(read) if isinstance(value, str) else read
+                )
+                if row.named_fields[key].kind == "text":
+                    theirs = bytes(read).rstrip(b"\0").decode()
+                assert same(bytes(theirs) if isinstance(value, bytes) else theirs, value), f"{row.name}.{key}"
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_cosmos_reads_the_packets_of_a_unit(name: str, tmp_path: Path) -> None:
+    icd = unit(name)
+    file = tmp_path / "unit.txt"
+    file.write_text(export(icd, "cosmos"), encoding="utf-8")
+    definition = _cosmos(file)
+    for row in icd.telemetry.values():
+        packet = definition.telemetry["STARHIL"][row.name.upper()]
+        for values, data in packets(row):
+            packet.buffer = key_of(icd, row).to_bytes(key_bits(icd) // 8, "big") + data
+            for key, value in values.items():
+                field = row.named_fields[key]
+                read = packet.read(key.upper(), "CONVERTED")
+                expected = _state(str(value)) if isinstance(value, bool) or field.enum is not None else value
+                assert same(bytes(read) if isinstance(value, bytes) else read, expected), f"{row.name}.{key}"

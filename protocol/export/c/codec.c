@@ -1,0 +1,112 @@
+static uint64_t get_le(const uint8_t *data, unsigned size)
+{
+    uint64_t value = 0u;
+    while (size-- > 0u) {
+        value = (value << 8) | data[size];
+    }
+    return value;
+}
+
+static uint64_t get_be(const uint8_t *data, unsigned size)
+{
+    uint64_t value = 0u;
+    unsigned i;
+    for (i = 0u; i < size; ++i) {
+        value = (value << 8) | data[i];
+    }
+    return value;
+}
+
+static void put_le(uint8_t *data, unsigned size, uint64_t value)
+{
+    unsigned i;
+    for (i = 0u; i < size; ++i) {
+        data[i] = (uint8_t)(value & 0xFFu);
+        value >>= 8;
+    }
+}
+
+static void put_be(uint8_t *data, unsigned size, uint64_t value)
+{
+    while (size-- > 0u) {
+        data[size] = (uint8_t)(value & 0xFFu);
+        value >>= 8;
+    }
+}
+
+static int64_t to_signed(uint64_t value, unsigned bits)
+{
+    const uint64_t sign = (uint64_t)1 << (bits - 1u);
+    return (value & sign) != 0u ? -(int64_t)(~value & (sign - 1u)) - 1 : (int64_t)value;
+}
+
+static float to_float(uint64_t raw)
+{
+    const uint32_t bits = (uint32_t)raw;
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static double to_double(uint64_t bits)
+{
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static uint64_t float_bits(float value)
+{
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+static uint64_t double_bits(double value)
+{
+    uint64_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+/* Round half to even. False if the number is not within the limits after rounding. */
+static bool to_raw(double value, double low, double high, uint64_t *raw)
+{
+    uint64_t whole;
+    double size, rest;
+    if (!(value >= low - 0.5 && value <= high + 0.5)) {
+        return false;
+    }
+    size = value < 0.0 ? -value : value;
+    whole = size >= 18446744073709551615.0 ? UINT64_MAX : (uint64_t)size;
+    rest = size - (double)whole;
+    if (rest > 0.5 || (rest == 0.5 && (whole & 1u) != 0u)) {
+        ++whole;
+    }
+    size = value < 0.0 ? -(double)whole : (double)whole;
+    *raw = value < 0.0 ? (uint64_t)0 - whole : whole;
+    return size >= low && size <= high;
+}
+
+static void get_text(const uint8_t *data, size_t size, char *text)
+{
+    memcpy(text, data, size);
+    text[size] = '\0';
+}
+
+/* Characters beyond 7 bits, or more than `size` of them, are refused. */
+static bool put_text(uint8_t *data, size_t size, const char *text)
+{
+    size_t i;
+    for (i = 0u; i < size && text[i] != '\0'; ++i) {
+        if ((unsigned char)text[i] > 127u) {
+            return false;
+        }
+        data[i] = (uint8_t)text[i];
+    }
+    if (text[i] != '\0') {
+        return false;
+    }
+    memset(data + i, 0, size - i);
+    return true;
+}

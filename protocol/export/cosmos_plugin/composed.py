@@ -1,0 +1,157 @@
+"""The constants and functions of a composed serial link, as the Python text of the plugin's protocol."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from pprint import pformat
+from typing import Any
+
+from starhil.protocol.envelope import Header
+from starhil.protocol.export.row_key import CLASS_SHIFT, row_key
+from starhil.protocol.link_schema import (
+    CrcCheck,
+    CustomCheck,
+    CustomFraming,
+    DelimitedFraming,
+    EscapedFraming,
+    NoCheck,
+    SlipFraming,
+    SumCheck,
+    XorCheck,
+    XxHashCheck,
+)
+from starhil.protocol.messages import RequestKind
+from starhil.protocol.serial_stack import ComposedStack
+from starhil.protocol.values import IcdError
+
+
+def link_text(stack: ComposedStack) -> str:
+    """Return the text of a link: constants, check, framing and the class Link.
+
+    Raises IcdError for a framing or check from a plugin, which is not data.
+    """
+    framing, check = stack.link.framing, stack.link.check
+    for what, model in (("framing", framing), ("check", check)):
+        if isinstance(model, CustomFraming | CustomCheck):
+            raise IcdError(
+                f"link.serial.{what}: {model.name!r} is code of the unit's plugin, which no export can hold"
+            )
+    kind = "counted" if framing.kind in ("length", "fixed") else framing.kind
+    constants = {
+        **_framing(stack), **_check(stack), **_headers(stack), "ROWS": dict(_rows(stack)),
+        "LONGEST": 2 * stack.max_size + 16,
+    }  # fmt: skip
+    functions = (_snippet("checks", check.kind), _snippet("framings", kind), _part("composed_link"))
+    used = {
+        name: value
+        for name, value in constants.items()
+        if any(re.search(rf"\b{name}\b", text) for text in functions)
+    }
+    head = "".join(
+        f"{name} = {pformat(value, width=110, sort_dicts=False)}\n" for name, value in used.items()
+    )
+    return "\n\n".join((head, *(text.strip("\n") + "\n" for text in functions)))
+
+
+def _framing(stack: ComposedStack) -> dict[str, Any]:
+    constants: dict[str, Any] = {"START": stack.framing.start, "END": stack.framing.end}
+    match stack.link.framing:
+        case SlipFraming() as model:
+            pair = model.substitutes or (0xDC, 0xDD)
+            if model.xor is not None:
+                pair = (model.end ^ model.xor, model.escape ^ model.xor)
+            constants |= {
+                "ESCAPE": bytes((model.escape,)),
+                "SUBSTITUTES": bytes(pair),
+                "LEADING_END": model.leading_end,
+            }
+        case EscapedFraming() as model:
+            constants["ESCAPE"] = bytes((model.escape,))
+        case DelimitedFraming() as model:
+            constants["HEX"] = model.encoding == "hex"
+        case _:
+            pass
+    return constants
+
+
+def _check(stack: ComposedStack) -> dict[str, Any]:
+    model = stack.link.check
+    constants: dict[str, Any] = {"CHECK_SIZE": stack.check.size, "CHECK_COVERS": sorted(stack.check.covers)}
+    if not isinstance(model, NoCheck):
+        constants["CHECK_ORDER"] = model.order or stack.byte_order
+    match model:
+        case SumCheck():
+            constants["COMPLEMENT"] = model.complement
+        case XorCheck():
+            constants["INITIAL"] = model.init
+        case CrcCheck():
+            constants |= {
+                "POLYNOMIAL": model.poly,
+                "INITIAL": model.init,
+                "REFLECT": model.reflect,
+                "XOR_OUT": model.xor,
+            }
+        case XxHashCheck():
+            constants["SEED"] = model.seed
+        case _:
+            pass
+    return constants
+
+
+def _headers(stack: ComposedStack) -> dict[str, Any]:
+    classes = stack.classes.classes
+    codes = {item.name: item.code or 0 for item in classes}
+    coded = [item for item in classes if item.code is not None]
+    reply = {(item.code if item.reply is None else item.reply): item.code for item in coded}
+    unsolicited = {item.unsolicited: item.code for item in coded if item.unsolicited is not None}
+    length = [field for field in stack.reply_header.fields if field.role == "length"]
+    return {
+        "CLASS_SHIFT": CLASS_SHIFT,
+        "ADDRESS": stack.reply_header.defaults.get("address"),
+        "REPLY_CLASSES": reply | unsolicited,
+        "UNSOLICITED": sorted(unsolicited),
+        "LENGTH_INCLUDES": sorted(length[0].includes) if length else [],
+        "REQUEST_HEADER": list(_fields(stack.request_header, codes)),
+        "REPLY_HEADER": list(_fields(stack.reply_header, codes)),
+    }
+
+
+def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
+    for field in header.fields:
+        yield {
+            "role": field.role,
+            "size": field.size,
+            "order": field.order,
+            "const": None if field.role == "address" else field.const,
+            "default": 0 if field.bits else field.default,
+            "classes": None if field.classes is None else sorted(codes[name] for name in field.classes),
+            "includes": sorted(field.includes) if field.role == "length" else [],
+            "bits": [(bit.role, bit.mask.bit_length(), bit.default) for bit in field.bits],
+        }
+
+
+def _rows(stack: ComposedStack) -> Iterator[tuple[int, dict[str, Any]]]:
+    for row in stack.rows:
+        yield (
+            row_key(stack.classes.classes, row.klass, row.id),
+            {
+                "telemetry": row.kind is RequestKind.TELEMETRY,
+                "request_size": row.request_size,
+                "reply_size": row.reply_size,
+                "answers": [answer for answer in row.answers if answer in ("echo", "reply")],
+            },
+        )
+
+
+def _part(name: str) -> str:
+    return (Path(__file__).parent / f"{name}.py.in").read_text(encoding="utf-8")
+
+
+def _snippet(name: str, kind: str) -> str:
+    """Return the part of a file under a heading."""
+    found = re.search(rf"^# {kind}\n(.*?)(?=^# \w+$|\Z)", _part(name), re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise IcdError(f"link.serial: {name} of kind {kind!r} cannot be exported")
+    return found[1]

@@ -1,0 +1,139 @@
+"""OpenC3 COSMOS drives the running emulator through the exported plugin: every command, every telemetry."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Self
+
+import pytest
+
+from starhil.hil_tests.client import ObcClient
+from starhil.protocol.icd import load_unit
+from tests.protocol.cosmos_plugin import Plugin
+from tests.protocol.test_export import same
+
+pytestmark = pytest.mark.process
+
+ICD = load_unit()
+CHANGES_THE_DIALECT = frozenset({"reset", "restore_parameters", "default_parameters"})
+DIALECTS = tuple(ICD.enums["serial_dialect"].values)
+
+
+class Cosmos:
+    """A COSMOS interface with the plugin's protocol, and its target's packets; a context manager."""
+
+    def __init__(self, plugin: Plugin) -> None:
+        from openc3.packets.commands import Commands
+        from openc3.packets.packet_config import PacketConfig
+        from openc3.packets.telemetry import Telemetry
+        from openc3.top_level import get_class_from_module
+        from openc3.utilities.string import filename_to_class_name, filename_to_module
+
+        config = PacketConfig()
+        for name in ("cmd", "tlm"):
+            config.process_file(str(plugin.text(f"cmd_tlm/{name}.txt")), plugin.target)
+        assert config.warnings == []
+        self._target = plugin.target
+        self._commands, self._telemetry = Commands(config, None), Telemetry(config, None)
+        _, file, *arguments = plugin.arguments("INTERFACE")
+        interface = get_class_from_module(filename_to_module(file), filename_to_class_name(file))
+        self._interface = interface(*arguments)
+        direction, protocol, *parameters = plugin.arguments("PROTOCOL")
+        self._interface.add_protocol(plugin.protocol_class(protocol), parameters, direction)
+        self._packets: SimpleQueue[Any] = SimpleQueue()
+
+    def __enter__(self) -> Self:
+        self._interface.connect()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._interface.disconnect()
+        self._reader.join(10.0)
+
+    def _read(self) -> None:
+        while (packet := self._interface.read()) is not None:
+            self._packets.put(packet)
+
+    def send(self, name: str, **values: object) -> None:
+        """Send a command."""
+        self._interface.write(self._commands.build_cmd(self._target, name, values))
+
+    def receive(self) -> tuple[str, Any]:
+        """Return the next packet and its name."""
+        try:
+            raw = self._packets.get(timeout=10.0)
+        except Empty:
+            raise AssertionError("COSMOS received no packet within 10 s") from None
+        packet = self._telemetry.identify(raw.buffer, [self._target])
+        assert packet is not None, raw.buffer
+        packet.buffer = raw.buffer
+        return packet.packet_name, packet
+
+
+@pytest.fixture(params=DIALECTS)
+def cosmos(request: pytest.FixtureRequest, emulator, can_obc: ObcClient, tmp_path: Path) -> Iterator[Cosmos]:
+    pytest.importorskip(
+        "openc3.packets.packet_config", reason="openc3 drives the emulator; it is not installed (make cosmos)"
+    )
+    can_obc.command("set_mode", mode="standby")
+    can_obc.set_parameter("serial_dialect", request.param)
+    plugin = Plugin(ICD, tmp_path, port=emulator.ready["serial"], dialect=request.param)
+    with Cosmos(plugin) as running:
+        yield running
+    can_obc.command("default_parameters")
+
+
+def test_every_telemetry_row_is_requested_and_read(cosmos: Cosmos, can_obc: ObcClient) -> None:
+    for row in ICD.telemetry.values():
+        cosmos.send(f"REQUEST_{row.name.upper()}")
+        name, packet = cosmos.receive()
+        assert name == row.name.upper()
+        decoded = row.decode(bytes(packet.buffer)[1:])
+        for field, value in decoded.items():
+            read = packet.read(field.upper(), "CONVERTED")
+            expected = str(value).upper() if isinstance(value, (bool, str)) else value
+            assert same(bytes(read) if isinstance(value, bytes) else read, expected), f"{row.name}.{field}"
+        if row.name in ("boot_status", "star_config", "hole_map_1"):
+            assert decoded == can_obc.telemetry(row.name)
+
+
+def test_every_command_is_sent_and_answered(cosmos: Cosmos, can_obc: ObcClient) -> None:
+    for row in ICD.telecommands.values():
+        if row.name in CHANGES_THE_DIALECT:
+            continue
+        values = {
+            name.upper(): str(value).upper() if isinstance(value, (bool, str)) else value
+            for name, value in row.example().items()
+        }
+        cosmos.send(row.name.upper(), **values)
+        name, packet = cosmos.receive()
+        while name == "FILE_BURST":
+            name, packet = cosmos.receive()
+        assert (name, packet.read("COMMAND")) == ("ANSWER", row.name.upper())
+        seen = can_obc.telemetry("acknowledge")
+        assert (seen["last_telecommand"], str(seen["error"]).upper()) == (row.id, packet.read("CODE"))
+
+
+def test_a_refusal_comes_with_its_code(cosmos: Cosmos) -> None:
+    cosmos.send("SELECT_PARAMETER", PARAMETER=0)
+    name, packet = cosmos.receive()
+    assert (name, packet.read("COMMAND"), packet.read("CODE")) == (
+        "ANSWER",
+        "SELECT_PARAMETER",
+        "INVALID_PARAMETER",
+    )
+
+
+def test_requests_in_a_row_keep_their_names(cosmos: Cosmos) -> None:
+    names = ["QUATERNION", "RATES", "QUATERNION", "ACKNOWLEDGE", "STAR_1_RAW", "STAR_2_RAW"] * 5
+    begin = time.monotonic()
+    for name in names:
+        cosmos.send(f"REQUEST_{name}")
+    assert [cosmos.receive()[0] for _ in names] == names
+    assert time.monotonic() - begin < 60.0

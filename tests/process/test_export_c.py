@@ -1,0 +1,103 @@
+"""The exported C talks to the running emulator over its pty: every row, every dialect, and the example of the docs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.client import ObcClient
+from starhil.protocol.export import export_folder
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.serial_framing import Dialect
+from tests.protocol.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
+from tests.protocol.test_export_c import KINDS
+
+pytestmark = pytest.mark.process
+
+ICD = load_unit()
+DISRUPTIVE = frozenset({"reset", "restore_parameters", "default_parameters"})
+"""Telecommands that change the dialect of the line."""
+STEADY = frozenset({"boot_status", "star_config", "hole_map_1", "parameter"})
+"""Telemetry that stays the same from one request to the next in standby."""
+
+
+@pytest.fixture(scope="module")
+def c(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CDriver]:
+    with CDriver(ICD, tmp_path_factory.mktemp("c")) as driver:
+        yield driver
+
+
+@pytest.fixture(params=list(Dialect))
+def line(request: pytest.FixtureRequest, c: CDriver, emulator, can_obc: ObcClient) -> Iterator[CDriver]:
+    """The program on the serial line, whose replies have a dialect."""
+    identifier = ICD.parameters["serial_dialect"].id
+    number = ICD.enums["serial_dialect"].values[request.param.value]
+    can_obc.command("set_mode", mode="standby")
+    can_obc.command("set_parameter", parameter=identifier, value=number)
+    assert c("open", emulator.ready["serial"], list(Dialect).index(request.param)) == ["0"]
+    yield c
+    can_obc.command("default_parameters")
+
+
+def test_every_telemetry_row_is_asked_for_and_read(line: CDriver, can_obc: ObcClient) -> None:
+    for row in ICD.telemetry.values():
+        kind, identifier, _, data = line("ask", row.id, "-")
+        assert (KINDS[int(kind)], int(identifier), len(data) // 2) == ("telemetry", row.id, row.size)
+        result, *words = line("decode", row.name, data)
+        assert (result, words) == ("0", c_words(row, row.decode(bytes.fromhex(data))))
+        if row.name in STEADY:
+            assert words == c_words(row, can_obc.telemetry(row.name))
+
+
+def test_every_telecommand_is_made_and_taken(line: CDriver, can_obc: ObcClient) -> None:
+    for row in ICD.telecommands.values():
+        if row.name in DISRUPTIVE:
+            continue
+        data = b""
+        if row.named_fields:
+            result, text = line("encode", row.name, *c_words(row, row.example()))
+            data = bytes.fromhex(text)
+            assert (result, data) == ("0", row.encode(row.example()))
+        kind, identifier, code, _ = line("ask", row.id, hex_or_none(data))
+        assert int(identifier) == row.id
+        assert KINDS[int(kind)] in ("ack", "nack")
+        assert (KINDS[int(kind)] == "ack") == (int(code) == ErrorCode.OK)
+        seen = can_obc.telemetry("acknowledge")
+        assert seen["last_telecommand"] == row.id
+        assert ICD.enums["error_code"].values[seen["error"]] == int(code)
+
+
+def test_a_refusal_comes_with_its_code(line: CDriver) -> None:
+    for identifier, data, code in ((200, "-", 1), (60, "-", 1), (2, "00", 2), (96, "4d", 3)):
+        assert line("ask", identifier, data)[:3] == [str(KINDS.index("nack")), str(identifier), str(code)]
+
+
+def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) -> None:
+    if COMPILER is None:
+        pytest.skip("no C compiler (cc, gcc or clang) here: the example of docs/c-export.md is not compiled")
+    page = (Path(__file__).parents[2] / "docs" / "c-export.md").read_text(encoding="utf-8")
+    files = dict(re.findall(r"^```c\n/\* (\S+) \*/\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
+    for name, text in {**files, **export_folder(ICD, "c")}.items():
+        (tmp_path / name).write_text(text)
+    program = tmp_path / "example"
+    sources = sorted(tmp_path.glob("*.c"))
+    done = subprocess.run(
+        [str(COMPILER), *FLAGS, "-o", program, *sources], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
+        obc.command("set_mode", mode="lost_in_space")
+        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=60.0)
+    done = subprocess.run(
+        [program, emulator.ready["serial"]], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    counts, attitude = done.stdout.splitlines()
+    assert counts == "acknowledges 1, refusals 0, faults 0"
+    seen = [float(word) for word in attitude.removeprefix("valid 1, q ").split()]
+    assert seen == pytest.approx([truth[name] for name in ("q_x", "q_y", "q_z", "q_w")], abs=1e-4)

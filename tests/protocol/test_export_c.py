@@ -1,0 +1,149 @@
+"""The exported C, compiled with all warnings as errors and run under the sanitizers, against our codec and link."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+
+import pytest
+
+from starhil.protocol.codec import Row
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_reply, encode_request
+from starhil.protocol.values import FieldError
+from tests.protocol.c_driver import CDriver, c_words, hex_or_none
+from tests.protocol.test_export import by_name, packets
+
+ICD = load_unit()
+ROWS = [row for row in ICD.rows if row.named_fields]
+KINDS = ["none", "telemetry", "ack", "nack", "unsolicited", "event", "burst", "fault"]
+FAULT = str(KINDS.index("fault"))
+
+
+@pytest.fixture(scope="module")
+def c(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CDriver]:
+    with CDriver(ICD, tmp_path_factory.mktemp("c")) as driver:
+        yield driver
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_a_row_has_the_same_bytes_and_values_both_ways(c: CDriver, row: Row) -> None:
+    for values, data in packets(row):
+        words = c_words(row, row.decode(data))
+        assert c("decode", row.name, data.hex()) == ["0", *words]
+        assert c("encode", row.name, *c_words(row, values)) == ["0", data.hex()]
+
+
+def refused_at(row: Row, data: bytes) -> int:
+    """Position of the value that our codec refuses, from 1; 0 if it takes all."""
+    try:
+        row.decode(data)
+    except FieldError as error:
+        return error.index + 1
+    return 0
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_random_bytes_of_a_row_are_read_and_refused_alike(c: CDriver, row: Row) -> None:
+    rng = random.Random(row.id)
+    for _ in range(20):
+        data = rng.randbytes(row.size)
+        if any(field.kind == "text" for field in row.fields):
+            data = bytes(byte % 128 or 32 for byte in data)
+        result, *words = c("decode", row.name, data.hex())
+        words = ["nan" if word == "-nan" else word for word in words]
+        assert words == c_words(row, row.decode(data, check=False))
+        assert int(result) == refused_at(row, data)
+    for size in (row.size - 1, row.size + 1):
+        assert c("decode", row.name, hex_or_none(bytes(size))) == ["-1"]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_a_value_beyond_its_limits_is_refused_by_its_position(c: CDriver, row: Row) -> None:
+    words = c_words(row, row.example())
+    for index, field in enumerate(row.named_fields.values(), 1):
+        if field.kind not in ("integer", "bits", "float") or not (
+            field.scaled or field.minimum or field.maximum
+        ):
+            continue
+        low, high = field.physical_limits
+        for bad in (low - max(abs(low), 1.0), high + max(abs(high), 1.0)):
+            if field.scaled or field.kind == "float":
+                text = f"{bad:.17g}"
+            elif (bad < 0 and not field.type.startswith("i")) or abs(bad) >= 2 ** (8 * field.size - 1):
+                continue  # the member cannot hold it
+            else:
+                text = str(int(bad))
+            beyond = (field.minimum is not None and bad < low) or (field.maximum is not None and bad > high)
+            if field.kind != "float" or beyond:
+                given = [*words[: index - 1], text, *words[index:]]
+                assert c("encode", row.name, *given) == [str(index)], field.name
+
+
+@pytest.mark.parametrize("row", list(ICD.rows), ids=by_name)
+def test_requests_are_framed_as_ours(c: CDriver, row: Row) -> None:
+    samples = [data for _, data in packets(row)] if row.kind == "telecommand" else [b""]
+    for data in [*samples, b"\x1f" * row.size]:
+        framed = encode_request(Request.of(row.id, data))
+        assert c("frame", row.id, hex_or_none(data)) == ["0", framed.hex()]
+
+
+def events(dialect: Dialect, pending: int | None, data: bytes) -> list[str]:
+    """What our receiver of the OBC's side makes of bytes, as the program prints it."""
+    receiver = HostReceiver(dialect)
+    if pending is not None:
+        row = ICD.telemetry_by_id.get(pending)
+        receiver.expect(Request.of(pending), row.size if row is not None else 0)
+    words: list[str] = []
+    for event in receiver.feed(data, 0.0):
+        if isinstance(event, LinkFault):
+            words += [FAULT, "0", "0", "-"]
+        else:
+            words += [
+                str(KINDS.index(event.kind.value)),
+                str(event.id),
+                str(int(event.code)),
+                hex_or_none(event.data),
+            ]
+    return [*words, FAULT if receiver.flush(1.0) else "0"]
+
+
+def c_events(c: CDriver, dialect: Dialect, pending: int | None, data: bytes) -> list[str]:
+    return c("receive", list(Dialect).index(dialect), -1 if pending is None else pending, hex_or_none(data))
+
+
+@pytest.mark.parametrize("dialect", Dialect)
+def test_the_receiver_of_the_c_reads_streams_as_ours(c: CDriver, dialect: Dialect) -> None:
+    rng = random.Random(7)
+    rows = list(ICD.rows)
+    for _ in range(400):
+        pending = rng.choice([None, 230, 60, 200, *(row.id for row in rows)])
+        stream = b""
+        for _ in range(rng.randrange(4)):
+            row = rng.choice(rows)
+            kind = rng.choice([kind for kind in ReplyKind if kind is not ReplyKind.ECHO])
+            reply = Reply(
+                kind,
+                119 if kind is ReplyKind.BURST else rng.choice([row.id, pending or 1]),
+                rng.randbytes(22 if kind is ReplyKind.BURST else rng.choice([row.size or 1, 1, 23]))
+                if kind not in (ReplyKind.ACK, ReplyKind.NACK)
+                else b"",
+                code=rng.randrange(1, 11) if kind is ReplyKind.NACK else 0,
+            )
+            try:
+                stream += encode_reply(reply, dialect)
+            except ProtocolError:
+                continue
+        damaged = bytearray(stream + rng.randbytes(rng.randrange(3)))
+        for _ in range(rng.randrange(4)):
+            if damaged:
+                damaged[rng.randrange(len(damaged))] = rng.choice(b"\x1f\x7f\xff\x07\x0f\x2f\x4f\x00\x77")
+        for data in (stream, bytes(damaged)):
+            assert c_events(c, dialect, pending, data) == events(dialect, pending, data), data.hex()
+
+
+def test_a_message_that_is_too_long_is_one_fault(c: CDriver) -> None:
+    data = b"\x1f\x7f\x80" + bytes(600) + b"\x1f\xff"
+    assert c_events(c, Dialect.A, 128, data) == events(Dialect.A, 128, data)
