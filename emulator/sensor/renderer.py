@@ -15,7 +15,9 @@ from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
 from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
-from starhil.emulator.sky.light import AreaLight, AreaPainter, icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.ephemeris import Observer
+from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -152,6 +154,8 @@ class Renderer:
         rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
+        parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
+        self._parallax_rad = np.radians(parallax_mas / 3.6e6)
         self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])
         self._cos_cone = math.cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
@@ -179,6 +183,7 @@ class Renderer:
         *,
         exposure_s: float | None = None,
         objects: SkyObjects | None = None,
+        observer: Observer | None = None,
     ) -> Frame:
         """Render one exposure.
 
@@ -194,6 +199,8 @@ class Renderer:
             Exposure instead of the sensor's, seconds.
         objects : SkyObjects, optional
             Sky objects instead of the renderer's default.
+        observer : Observer, optional
+            Whose place and motion give the stars parallax and aberration; by default they have neither.
 
         Raises
         ------
@@ -209,7 +216,7 @@ class Renderer:
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
         mean = self._mean_without_stars(exposure)
-        path, chosen, inside = self._paths(attitude, rate, exposure)
+        path, chosen, inside = self._paths(attitude, rate, exposure, observer)
         electrons = self._flux_e_s[chosen] * exposure
         drawn = electrons
         object_truth = None
@@ -318,7 +325,11 @@ class Renderer:
         return self._work
 
     def _paths(
-        self, attitude: Attitude, rate: npt.NDArray[np.float64], exposure_s: float
+        self,
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        observer: Observer | None,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars whose light may reach the image.
 
@@ -327,7 +338,10 @@ class Renderer:
         sweep = float(np.linalg.norm(rate)) * exposure_s
         cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
         near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
-        path, inside, touching = self._path_of(self._vectors[near], attitude, rate, exposure_s)
+        icrs = self._vectors[near]
+        if observer is not None:
+            icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
+        path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
 
     def _path_of(
