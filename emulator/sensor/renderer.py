@@ -17,7 +17,7 @@ from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
-from starhil.emulator.sky.light import AreaLight, AreaPainter
+from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area, add_glare
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -29,6 +29,9 @@ _MAX_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
 _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
+_FLOOD_WELLS: Final = 10.0
+"""Full wells of electrons in every pixel when light passes the baffle."""
+
 _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
 
@@ -215,7 +218,10 @@ class Renderer:
         rate = _rate(rate_rad_s)
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
-        mean = self._mean_without_stars(exposure)
+        area = None
+        if others is not None and others.has_extended_objects:
+            area = self._painter.paint(others, attitude)
+        mean = self._mean_without_stars(exposure, area)
         path, chosen, inside = self._paths(attitude, rate, exposure, observer)
         electrons = self._flux_e_s[chosen] * exposure
         drawn = electrons
@@ -223,7 +229,9 @@ class Renderer:
         if others is not None:
             drawn = electrons.copy()
             drawn[np.flatnonzero(inside)[: others.missing_stars]] = 0.0
-            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, path, drawn)
+            if area is not None:
+                drawn *= area.seen_at(path[:, :2])
+            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, area)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[inside]]
@@ -246,25 +254,14 @@ class Renderer:
         rate: npt.NDArray[np.float64],
         exposure_s: float,
         index: int,
-        path: npt.NDArray[np.float64],
-        electrons: npt.NDArray[np.float64],
+        area: AreaLight | None,
     ) -> ObjectTruth:
-        """Add sky objects to `mean`, and dim the stars behind them; both in place."""
+        """Add planets, false stars and particles to `mean`, in place."""
         rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
-        covered = 0.0
-        area: AreaLight | None = None
-        if objects.has_extended_objects:
-            area = self._painter.paint(objects, attitude)
-            light = area.electrons_s + (area.transmission - np.float32(1.0)) * self._sky_e_s
-            light *= self._pattern.sensitivity * np.float32(exposure_s)
-            mean += light
-            np.maximum(mean, 0.0, out=mean)
-            electrons *= area.seen_at(path[:, :2])
-            covered = float(np.mean(area.transmission < 0.5))
         planet_xy = self._add_planets(mean, objects.planets, attitude, rate, exposure_s, area)
         false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
         streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
-        return ObjectTruth(false_xy, planet_xy, streaks, covered)
+        return ObjectTruth(false_xy, planet_xy, streaks, 0.0 if area is None else area.covered_share)
 
     def _add_planets(
         self,
@@ -314,14 +311,24 @@ class Renderer:
         end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
         return end - start
 
-    def _mean_without_stars(self, exposure_s: float) -> npt.NDArray[np.float32]:
-        """Return the mean electrons (h, w) of sky and dark current, in a buffer that is reused."""
+    def _mean_without_stars(self, exposure_s: float, area: AreaLight | None) -> npt.NDArray[np.float32]:
+        """Return the mean electrons (h, w) of sky, dark current and extended objects, in a buffer that is reused."""
         if exposure_s != self._still_exposure_s:
             np.multiply(self._pattern.sensitivity, self._sky_e_s, out=self._still)
             self._still += self._pattern.dark_e_s
             self._still *= np.float32(exposure_s)
             self._still_exposure_s = exposure_s
-        np.copyto(self._work, self._still)
+        sensitivity = self._pattern.sensitivity
+        if area is not None and area.flooded:
+            self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
+        elif area is not None and area.glare is not None:
+            add_glare(self._work, self._still, sensitivity, area.glare, exposure_s)
+        else:
+            np.copyto(self._work, self._still)
+        if area is not None and area.electrons_s is not None and area.transmission is not None:
+            add_area(
+                self._work, area.electrons_s, area.transmission, sensitivity, float(self._sky_e_s), exposure_s
+            )
         return self._work
 
     def _paths(

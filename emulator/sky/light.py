@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +18,19 @@ from starid.jit import compiled_ieee
 
 Image = npt.NDArray[np.float32]
 
+Glare: TypeAlias = tuple[npt.NDArray[np.float32], float, float, bool]
+"""Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""
+
 _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
 _SUN_SOFT_DEG: Final = 3.0
 
-_FLOOD_E_S: Final = 1e9
-"""Electrons/s in every pixel when light passes the baffle: saturates any exposure of a millisecond."""
+GLARE_STEP: Final = 8
+"""Pixels between the points at which smooth light is computed."""
+
+_SMOOTH_PX: Final = 7.0 * GLARE_STEP
+"""Distance to a source, or softness of its glare, from which its light is smooth, pixels."""
 
 _GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
@@ -36,21 +42,72 @@ class AreaLight:
 
     Attributes
     ----------
-    electrons_s : ndarray (h, w), float32
-        Electrons/s in a pixel of mean sensitivity.
-    transmission : ndarray (h, w), float32
-        Fraction of the light from behind that is visible, 0…1.
+    glare : ndarray (gh, gw), float32, or None
+        Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row.
+    electrons_s : ndarray (h, w), float32, or None
+        Other light in every pixel, electrons/s.
+    transmission : ndarray (h, w), float32, or None
+        Fraction of the light from behind that is visible, 0…1; None together with `electrons_s`.
+    flooded : bool
+        Light passes the baffle and saturates the image; the rest is then empty.
     """
 
-    electrons_s: Image
-    transmission: Image
+    glare: Image | None = None
+    electrons_s: Image | None = None
+    transmission: Image | None = None
+    flooded: bool = False
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
+        if self.transmission is None:
+            return np.full(len(xy_px), 0.0 if self.flooded else 1.0)
         height, width = self.transmission.shape
         columns = np.clip(np.rint(xy_px[:, 0]), 0, width - 1).astype(np.int64)
         rows = np.clip(np.rint(xy_px[:, 1]), 0, height - 1).astype(np.int64)
         return self.transmission[rows, columns].astype(np.float64)
+
+    @property
+    def covered_share(self) -> float:
+        """Fraction of the image that receives less than half of the sky's light."""
+        if self.transmission is None:
+            return float(self.flooded)
+        return float(np.mean(self.transmission < 0.5))
+
+
+@compiled_ieee
+def add_glare(out: Image, still: Image, sensitivity: Image, grid: Image, exposure_s: float) -> None:
+    """Fill (h, w) with `still` plus smooth light, interpolated linearly between the points of its grid."""
+    line, corners = np.empty(out.shape[1], dtype=np.float32), np.empty(grid.shape[1], dtype=np.float32)
+    for y in range(out.shape[0]):
+        j = y // GLARE_STEP
+        t = np.float32((y - j * GLARE_STEP) / GLARE_STEP)
+        for i in range(corners.size):
+            corners[i] = (grid[j, i] + t * (grid[j + 1, i] - grid[j, i])) * np.float32(exposure_s)
+        for i in range(corners.size - 1):
+            first, slope = corners[i], (corners[i + 1] - corners[i]) * np.float32(1.0 / GLARE_STEP)
+            for k in range(min(GLARE_STEP, line.size - i * GLARE_STEP)):
+                line[i * GLARE_STEP + k] = first + slope * np.float32(k)
+        to, base, gain = out[y], still[y], sensitivity[y]
+        for x in range(line.size):
+            to[x] = base[x] + gain[x] * line[x]
+
+
+@compiled_ieee
+def add_area(
+    mean: Image,
+    electrons_s: Image,
+    transmission: Image,
+    sensitivity: Image,
+    sky_e_s: float,
+    exposure_s: float,
+) -> None:
+    """Add light (h, w) to the mean electrons, and take away the sky that it hides."""
+    sky, exposure = np.float32(sky_e_s), np.float32(exposure_s)
+    for y in range(mean.shape[0]):
+        to, light, passed, gain = mean[y], electrons_s[y], transmission[y], sensitivity[y]
+        for x in range(to.size):
+            added = (light[x] + (passed[x] - np.float32(1.0)) * sky) * gain[x] * exposure
+            to[x] = max(to[x] + added, np.float32(0.0))
 
 
 def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
@@ -185,65 +242,113 @@ class AreaPainter:
     @cached_property
     def _directions(self) -> Image:
         """Unit vectors (3, h, w) of the pixels, sensor frame; −z for pixels without a direction."""
-        camera = self._camera
-        rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
-        vectors = camera.back_project(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+        return self._directions_of(np.arange(self._camera.width), np.arange(self._camera.height))
+
+    @cached_property
+    def _grid_directions(self) -> Image:
+        """Unit vectors (3, gh, gw) of the points of the glare's grid."""
+        steps = (GLARE_STEP * np.arange(-(-size // GLARE_STEP) + 1) for size in self._size)
+        return self._directions_of(*steps)
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self._camera.width, self._camera.height
+
+    def _directions_of(self, columns: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]) -> Image:
+        x, y = np.meshgrid(columns, rows)
+        vectors = self._camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
         vectors[np.isnan(vectors).any(axis=1)] = (0.0, 0.0, -1.0)
-        return np.ascontiguousarray(vectors.T.reshape(3, camera.height, camera.width), dtype=np.float32)
+        return np.ascontiguousarray(vectors.T.reshape(3, rows.size, columns.size), dtype=np.float32)
 
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
         """Return light and transmission of all extended objects at one attitude."""
-        shape = (self._camera.height, self._camera.width)
-        light = AreaLight(np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32))
-        sun, moon, earth = objects.sun, objects.moon, objects.earth
-        if sun is not None and _off_axis_deg(attitude, sun) <= sun.reach_deg:
-            self._paint_sun(light, sun, attitude)
-        if moon is not None and _off_axis_deg(attitude, moon) <= moon.reach_deg:
-            self._paint_moon(light, moon, attitude)
-        if earth is not None and self._earth_in_field(earth, attitude):
-            self._paint_earth(light, earth, attitude)
         if baffle_passed(objects, attitude):
-            light.electrons_s[:] += np.float32(_FLOOD_E_S)
+            return AreaLight(flooded=True)
+        moon, earth = objects.moon, objects.earth
+        if earth is not None and not self._earth_in_field(earth, attitude):
+            earth = None
+        covered = earth is not None or bool(objects.obstructions) or objects.blank
+        disc = None if moon is None else self._moon_box(moon, attitude)
+        smooth, sharp = self._sorted_glare(objects, attitude, sharp=covered)
+        glare = None
+        if smooth:
+            glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
+            for source in smooth:
+                _add_glare(glare, self._grid_directions, *source)
+        if not (sharp or covered or disc):
+            return AreaLight(glare)
+        shape = (self._camera.height, self._camera.width)
+        electrons_s, transmission = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32)
+        for source in sharp:
+            _add_glare(electrons_s, self._directions, *source)
+        light = AreaLight(glare, electrons_s, transmission)
+        if moon is not None and disc is not None:
+            self._paint_moon(electrons_s, transmission, moon, attitude, disc)
+        if earth is not None:
+            self._paint_earth(electrons_s, transmission, earth, attitude)
         for obstruction in objects.obstructions:
-            transmission = self._obstruction_transmission(obstruction)
-            light.electrons_s[:] *= transmission
-            light.transmission[:] *= transmission
+            cover = self._obstruction_transmission(obstruction)
+            electrons_s *= cover
+            transmission *= cover
         if objects.blank:
-            light.electrons_s[:] = 0.0
-            light.transmission[:] = 0.0
+            electrons_s[:] = 0.0
+            transmission[:] = 0.0
         return light
 
-    def _paint_sun(self, light: AreaLight, sun: SunGlare, attitude: Attitude) -> None:
-        """Add stray light of the Sun, which falls with the cube of the angle."""
-        source = attitude.to_sensor(icrs_vector(sun.ra_deg, sun.dec_deg)).astype(np.float32)
-        reference = 2.0 * math.sin(math.radians(_SUN_REFERENCE_DEG) / 2.0)
-        soft = 2.0 * math.sin(math.radians(_SUN_SOFT_DEG) / 2.0)
-        _add_glare(light.electrons_s, self._directions, source, sun.electrons_s * reference**3, soft**2, True)  # noqa: FBT003
+    def _sorted_glare(
+        self, objects: SkyObjects, attitude: Attitude, *, sharp: bool
+    ) -> tuple[list[Glare], list[Glare]]:
+        """Return the glare of Sun and Moon as arguments of the kernel: what is smooth over the image, and the rest.
 
-    def _paint_moon(self, light: AreaLight, moon: Moon, attitude: Attitude) -> None:
-        """Add the Moon's glare over the field, and its disc with the terminator."""
+        With `sharp`, all of it is taken as not smooth, since something covers part of it.
+        """
+        sorted_glare: tuple[list[Glare], list[Glare]] = ([], [])
+        for body in (objects.sun, objects.moon):
+            if body is None:
+                continue
+            off_axis = _off_axis_deg(attitude, body)
+            if off_axis > body.reach_deg:
+                continue
+            source = attitude.to_sensor(icrs_vector(body.ra_deg, body.dec_deg)).astype(np.float32)
+            strength, soft, cube = self._glare_of(body)
+            outside = math.radians(off_axis) - self._camera.field_radius_rad
+            smooth = max(soft, outside) > _SMOOTH_PX * self._camera.pixel_scale_rad and not sharp
+            sorted_glare[0 if smooth else 1].append((source, strength, soft * soft, cube))
+        return sorted_glare
+
+    def _glare_of(self, body: SunGlare | Moon) -> tuple[float, float, bool]:
+        """Strength and softness of a body's stray light, and whether it falls with the cube of the angle."""
+        if isinstance(body, SunGlare):
+            reference = 2.0 * math.sin(math.radians(_SUN_REFERENCE_DEG) / 2.0)
+            soft = 2.0 * math.sin(math.radians(_SUN_SOFT_DEG) / 2.0)
+            return body.electrons_s * reference**3, soft, True
+        share = body.glare_share / (2.0 * math.pi * math.log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
+        total = self._moonlight(body)
+        return total * share * self._camera.pixel_scale_rad**2, math.radians(_GLARE_FROM_DEG), False
+
+    def _moonlight(self, moon: Moon) -> float:
+        """Electrons/s from the whole Moon."""
+        return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
+
+    def _moon_box(self, moon: Moon, attitude: Attitude) -> tuple[slice, slice] | None:
+        """Return the part of the image that the Moon's disc may touch; None if it is outside."""
+        source = attitude.to_sensor(icrs_vector(moon.ra_deg, moon.dec_deg))
+        xy, _ = self._camera.project(source[None, :])
+        return self._box(xy[0], math.radians(moon.diameter_deg) / self._camera.pixel_scale_rad + 8.0)
+
+    def _paint_moon(
+        self,
+        electrons_s: Image,
+        transmission: Image,
+        moon: Moon,
+        attitude: Attitude,
+        box: tuple[slice, slice],
+    ) -> None:
+        """Add the Moon's disc with the terminator."""
         import cv2
 
-        centre = icrs_vector(moon.ra_deg, moon.dec_deg)
-        source = attitude.to_sensor(centre)
+        source = attitude.to_sensor(icrs_vector(moon.ra_deg, moon.dec_deg))
         radius = math.radians(moon.diameter_deg) / 2.0
-        total = self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
-        pixel = self._camera.pixel_scale_rad**2
-        share = moon.glare_share / (2.0 * math.pi * math.log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
-        soft2 = math.radians(_GLARE_FROM_DEG) ** 2
-        _add_glare(
-            light.electrons_s,
-            self._directions,
-            source.astype(np.float32),
-            total * share * pixel,
-            soft2,
-            False,  # noqa: FBT003
-        )
-        xy, _ = self._camera.project(source[None, :])
-        reach = 2.0 * radius / self._camera.pixel_scale_rad + 8.0
-        box = self._box(xy[0], reach)
-        if box is None:
-            return
         # position on the disc in units of its radius, towards the bright limb and across
         ra, dec, angle = (math.radians(value) for value in (moon.ra_deg, moon.dec_deg, moon.bright_limb_deg))
         north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
@@ -259,9 +364,9 @@ class AreaPainter:
         edge = (1.0 - 2.0 * moon.illuminated) * np.sqrt(np.clip(1.0 - v * v, 0.0, 1.0))
         lit = inside * np.clip(0.5 + (u - edge) * scale, 0.0, 1.0)
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
-        disc = (lit * (total / area)).astype(np.float32)
-        light.electrons_s[box] += cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px)
-        light.transmission[box] *= (1.0 - inside).astype(np.float32)
+        disc = (lit * (self._moonlight(moon) / area)).astype(np.float32)
+        electrons_s[box] += cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px)
+        transmission[box] *= (1.0 - inside).astype(np.float32)
 
     def _box(self, xy: npt.NDArray[np.float64], reach: float) -> tuple[slice, slice] | None:
         """Return the slices of the image within `reach` pixels of a position; None if outside."""
@@ -274,12 +379,13 @@ class AreaPainter:
         )
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
-    def _paint_earth(self, light: AreaLight, earth: EarthLimb, attitude: Attitude) -> None:
+    def _paint_earth(
+        self, electrons_s: Image, transmission: Image, earth: EarthLimb, attitude: Attitude
+    ) -> None:
         """Add the Earth's disc, fading over the atmosphere; it hides everything behind it."""
         import cv2
 
-        shape = light.electrons_s.shape
-        shine, clear = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        shine, clear = np.empty_like(electrons_s), np.empty_like(electrons_s)
         sun = _sun_of(earth)
         _earth_face(
             shine,
@@ -291,10 +397,12 @@ class AreaPainter:
             math.radians(earth.atmosphere_deg),
         )
         shine *= np.float32(earth.electrons_s)
-        blurred = cv2.GaussianBlur(shine, (0, 0), self._psf_sigma_px)
-        np.multiply(light.electrons_s, clear, out=light.electrons_s)
-        light.electrons_s[:] += blurred
-        light.transmission[:] *= clear
+        if math.radians(earth.atmosphere_deg) < 3.0 * self._psf_sigma_px * self._camera.pixel_scale_rad:
+            # a wider limb is smooth already
+            shine = np.asarray(cv2.GaussianBlur(shine, (0, 0), self._psf_sigma_px), dtype=np.float32)
+        electrons_s *= clear
+        electrons_s += shine
+        transmission *= clear
 
     def _earth_in_field(self, earth: EarthLimb, attitude: Attitude) -> bool:
         """Whether the Earth or the glow of its limb reaches into the field."""
