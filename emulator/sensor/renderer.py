@@ -279,6 +279,8 @@ class Renderer:
         vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
         path, inside, touching = self._path_of(vectors, attitude, rate, exposure_s)
         xy[inside] = path[inside, :2]
+        if not touching.any():
+            return xy
         electrons = np.array([self.sensor.electrons(planet.magnitude, exposure_s) for planet in planets])
         path, electrons = path[touching], electrons[touching]
         self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))

@@ -81,6 +81,11 @@ class Observer:
         """Barycentric position, m, and velocity, m/s, of the Earth's centre, ICRS."""
         return earth_state(self.unix_s)
 
+    @cached_property
+    def sun_direction(self) -> Vector:
+        """Apparent direction (3,) of the Sun."""
+        return self.towards(self.sun)
+
     @property
     def position_m(self) -> Vector:
         """Barycentric position (3,), ICRS."""
@@ -111,7 +116,7 @@ class Observer:
 
 def sun_seen_by(observer: Observer, style: SunGlare) -> SunGlare:
     """Return the Sun in its place, with the other fields of `style`."""
-    return dataclasses.replace(style, **_place(observer.towards(observer.sun)))
+    return dataclasses.replace(style, **_place(observer.sun_direction))
 
 
 def moon_seen_by(observer: Observer, style: Moon) -> Moon:
@@ -138,7 +143,7 @@ def moon_seen_by(observer: Observer, style: Moon) -> Moon:
         diameter_deg=2.0 * math.degrees(math.asin(min(MOON_RADIUS_M / distance, 1.0))),
         magnitude=-12.73 + 0.026 * degrees + 4e-9 * degrees**4 + light,
         illuminated=0.5 * (1.0 + math.cos(phase)),
-        bright_limb_deg=_position_angle(direction, observer.towards(observer.sun)),
+        bright_limb_deg=_position_angle(direction, observer.sun_direction),
     )
 
 
@@ -153,7 +158,7 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
     if observer.relative_velocity_m_s is not None:
         nadir = aberrated(nadir, observer.relative_velocity_m_s)
     to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
-    sun = _place(observer.towards(observer.sun))
+    sun = _place(observer.sun_direction)
     return dataclasses.replace(
         style,
         **_place(nadir),
@@ -200,7 +205,7 @@ def visible_share_of_sun(observer: Observer, earth: EarthLimb | None) -> float:
     if earth is None:
         return 1.0
     radius = math.asin(SUN_RADIUS_M / _length(observer.sun - observer.position_m))
-    above = _angle(observer.towards(observer.sun), icrs_vector(earth.ra_deg, earth.dec_deg))
+    above = _angle(observer.sun_direction, icrs_vector(earth.ra_deg, earth.dec_deg))
     height = (above - math.radians(earth.radius_deg)) / radius
     if abs(height) >= 1.0:
         return 1.0 if height > 0.0 else 0.0

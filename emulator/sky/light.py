@@ -75,21 +75,28 @@ class AreaLight:
 
 
 @compiled_ieee
+def _expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32]) -> None:
+    """Interpolate a row of the glare's grid at every column."""
+    for i in range(row.size - 1):
+        first, slope = row[i], (row[i + 1] - row[i]) * np.float32(1.0 / GLARE_STEP)
+        for k in range(min(GLARE_STEP, line.size - i * GLARE_STEP)):
+            line[i * GLARE_STEP + k] = first + slope * np.float32(k)
+
+
+@compiled_ieee
 def add_glare(out: Image, still: Image, sensitivity: Image, grid: Image, exposure_s: float) -> None:
     """Fill (h, w) with `still` plus smooth light, interpolated linearly between the points of its grid."""
-    line, corners = np.empty(out.shape[1], dtype=np.float32), np.empty(grid.shape[1], dtype=np.float32)
+    upper, lower = np.empty(out.shape[1], dtype=np.float32), np.empty(out.shape[1], dtype=np.float32)
+    _expand(grid[0], lower)
     for y in range(out.shape[0]):
-        j = y // GLARE_STEP
-        t = np.float32((y - j * GLARE_STEP) / GLARE_STEP)
-        for i in range(corners.size):
-            corners[i] = (grid[j, i] + t * (grid[j + 1, i] - grid[j, i])) * np.float32(exposure_s)
-        for i in range(corners.size - 1):
-            first, slope = corners[i], (corners[i + 1] - corners[i]) * np.float32(1.0 / GLARE_STEP)
-            for k in range(min(GLARE_STEP, line.size - i * GLARE_STEP)):
-                line[i * GLARE_STEP + k] = first + slope * np.float32(k)
+        if y % GLARE_STEP == 0:
+            upper, lower = lower, upper
+            _expand(grid[y // GLARE_STEP + 1], lower)
+        share = np.float32(y % GLARE_STEP) * np.float32(exposure_s / GLARE_STEP)
+        rest = np.float32(exposure_s) - share
         to, base, gain = out[y], still[y], sensitivity[y]
-        for x in range(line.size):
-            to[x] = base[x] + gain[x] * line[x]
+        for x in range(to.size):
+            to[x] = base[x] + gain[x] * (rest * upper[x] + share * lower[x])
 
 
 @compiled_ieee

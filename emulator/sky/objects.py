@@ -6,6 +6,7 @@ All are plain values for profiles and tests; `starhil.emulator.sky.light` render
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
@@ -299,20 +300,33 @@ def _flatten(value: Any) -> Iterator[Any]:
 
 def _check_fields(where: str, body: Any) -> None:
     """Check types and ranges of an object's fields."""
-    for field in dataclasses.fields(body):
-        value = getattr(body, field.name)
-        if type(field.default) is bool and not isinstance(value, bool):
-            raise EmulatorError(f"sky {where} {field.name}: {value!r} given, true or false needed")
-        if type(field.default) is str and not isinstance(value, str):
-            raise EmulatorError(f"sky {where} {field.name}: {value!r} given, a text needed")
-        if field.name not in _RANGES or (value is None and field.default is None):
+    for name, default, low, high in _RULES[type(body)]:
+        value = getattr(body, name)
+        if type(default) is bool and not isinstance(value, bool):
+            raise EmulatorError(f"sky {where} {name}: {value!r} given, true or false needed")
+        if type(default) is str and not isinstance(value, str):
+            raise EmulatorError(f"sky {where} {name}: {value!r} given, a text needed")
+        if type(value) is float and low <= value <= high and not isinstance(low, int):
             continue
-        low, high = _RANGES[field.name]
+        if low > high or (value is None and default is None):
+            continue
         whole = isinstance(low, int)
         for number in _flatten(value):
             good = isinstance(number, int if whole else (int, float)) and not isinstance(number, bool)
             if not good or not low <= number <= high:
                 kind = "a whole number" if whole else "a number"
-                raise EmulatorError(
-                    f"sky {where} {field.name}: {number!r} given, {kind} {low:g}…{high:g} needed"
-                )
+                raise EmulatorError(f"sky {where} {name}: {number!r} given, {kind} {low:g}…{high:g} needed")
+
+
+def _field_rules(kind: Any) -> tuple[tuple[str, Any, float, float], ...]:
+    """Name, default and range of each field of a class; a range from above to below is none."""
+    return tuple(
+        (field.name, field.default, *_RANGES.get(field.name, (math.inf, -math.inf)))
+        for field in dataclasses.fields(kind)
+    )
+
+
+_RULES: Final[dict[type, tuple[tuple[str, Any, float, float], ...]]] = {
+    kind: _field_rules(kind) for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
+}
+"""Rules of the fields of each class of objects."""
