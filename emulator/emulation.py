@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from starhil.emulator.clock import Clock, SteppedClock, make_clock
+from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock, make_clock
 from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Background, Device, outcome, run_at_once
 from starhil.emulator.device.modes import Mode
@@ -28,13 +28,16 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
 from starhil.emulator.revival import PipelineRevival
 from starhil.emulator.symlink_lock import lock_symlink
-from starhil.emulator.truth.config import FileConfig, LiveConfig, TruthConfig
+from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
+from starhil.emulator.truth.feed import LiveFeed
 from starhil.emulator.truth.file import FileTruth
-from starhil.emulator.truth.live import LiveFeed, LiveTruth
-from starhil.emulator.truth.source import TruthSource
+from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.mount import mounted
+from starhil.emulator.truth.source import FixedTruth, TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_icd
 from starhil.protocol.values import Value
+from starid.attitude import Attitude
 
 log = logging.getLogger("starhil.run")
 
@@ -51,20 +54,31 @@ class Emulation:
         Profile of the unit.
     worker
         Pipeline worker that was started earlier; by default one is started here.
+    leader
+        The first head, if this is a further one: it shares that head's clock and truth.
 
     Attributes
     ----------
     ready_fields
         Fields of the ready line: which port, bus or address was opened for what.
+    heads
+        The heads that share clock and truth, the leader first.
+    body_truth
+        Truth of the body on which the heads are mounted.
     """
 
     def __init__(
         self,
         profile: Profile,
         worker: WorkerProcess | None = None,
+        leader: Emulation | None = None,
     ) -> None:
         self.profile = profile
-        self.clock: Clock = make_clock(profile.run.clock)
+        self.leader = leader or self
+        self.heads: list[Emulation] = [] if leader is None else leader.heads
+        self.heads.append(self)
+        self.body_truth: TruthSource = FixedTruth(Attitude.identity())
+        self.clock: Clock = make_clock(profile.run.clock) if leader is None else leader.clock
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
         self.serial: SerialLink | None = None
@@ -124,7 +138,9 @@ class Emulation:
             A file, port or bus is not available; one line.
         """
         store = self._open_store()
-        truth = await self.open_truth(self.profile.truth)
+        if self.leader is self:
+            self.body_truth = await self._open_truth(self.profile.truth)
+        truth = self._mounted(self.leader.body_truth, self.profile.truth)
         stepped = isinstance(self.clock, SteppedClock)
         background = run_at_once if stepped else self._in_background()
         device = Device(self.profile, load_icd(), self.clock, self.imager, store, truth, background)
@@ -141,8 +157,10 @@ class Emulation:
         """Let time pass and start the pipeline; `ready` waits for it."""
         device = self.device
         if isinstance(self.clock, SteppedClock):
-            transports = [link.transport for link in self.links]
-            self.stepper = StepPump(device.scheduler, self.clock, self.imager, transports)
+            if self.leader is self:
+                stepped = [(head.device.scheduler, head.imager) for head in self.heads]
+                transports = [link.transport for head in self.heads for link in head.links]
+                self.stepper = StepPump(stepped, self.clock, transports)
         else:
             self._pump = ClockPump(device.scheduler, self.clock)
             self._pump.start()
@@ -174,25 +192,47 @@ class Emulation:
 
         return background
 
-    async def open_truth(self, config: TruthConfig) -> TruthSource:
-        """Build a truth source, with its socket if it is a live feed, and close the previous feed.
+    async def change_truth(self, config: TruthConfig) -> None:
+        """Replace the truth of all heads, as on the control channel.
 
         Raises
         ------
         EmulatorError
             A file is invalid or a port is not available; the previous source stays.
         """
-        truth = await asyncio.to_thread(config.build, self.clock.now_ns() / 1e9, self.profile.folder)
+        leader = self.leader
+        leader.replace_truth(await leader._open_truth(config), config)  # noqa: SLF001 (of this class)
+
+    def set_truth(self, truth: TruthSource, config: TruthConfig) -> None:
+        """Replace the truth of all heads by a source without a socket, as in a scenario."""
+        self.leader.close_feed()
+        self.leader.replace_truth(truth, config)
+
+    def replace_truth(self, truth: TruthSource, config: TruthConfig) -> None:
+        """Replace the truth of all heads."""
+        self.body_truth = truth
+        for head in self.heads:
+            head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
+
+    def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
+        """Return the truth of this head: at the mount of a configuration, or else of its own profile."""
+        mount = config.mount or self.profile.truth.mount
+        return mounted(truth, None if mount is None else mount.build())
+
+    async def _open_truth(self, config: TruthConfig) -> TruthSource:
+        """Build a truth source, with its socket if it is a live feed, and close the previous feed."""
+        truth = await asyncio.to_thread(config.build, self._now_s(), self.profile.folder)
         if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
-            truth.start_s = self.clock.now_ns() / 1e9  # reading has taken time
+            truth.start_s = self._now_s()  # reading has taken time
         feed: LiveFeed | None = None
-        if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
-            feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
-            wanted = f"{config.protocol}:{config.host}:{config.port}"
+        if isinstance(config, FeedConfig) and isinstance(truth, LiveTruth):
+            feed = LiveFeed(truth, self._now_s, self._step_in_lock if self._is_lockstep(config) else None)
+            protocol = "udp" if config.socket == "udp" else "tcp"
+            wanted = f"{protocol}:{config.host}:{config.port}"
             if config.port != 0 and wanted in (self.ready_fields.get("truth"), self._configured_feed):
                 self.close_feed()  # the same port: it must be free first
                 await asyncio.sleep(0)  # the loop closes it in its next turn
-            where = await feed.start(config.protocol, config.host, config.port)
+            where = await feed.start(config.socket, config.host, config.port)
             self.close_feed()
             self.ready_fields["truth"], self._configured_feed = where, wanted
         else:
@@ -200,10 +240,27 @@ class Emulation:
         self.feed = feed
         return truth
 
-    def set_truth(self, truth: TruthSource) -> None:
-        """Replace the truth source by one without a socket."""
-        self.device.cycle.truth = truth
-        self.close_feed()
+    def _now_s(self) -> float:
+        """Return the simulation time, seconds."""
+        return self.clock.now_ns() / NANOSECONDS
+
+    def _is_lockstep(self, config: FeedConfig) -> bool:
+        """Whether the messages of a feed are to advance the clock."""
+        stepped = isinstance(self.clock, SteppedClock)
+        if isinstance(config, Config42):
+            return stepped
+        if config.lockstep and not stepped:
+            raise EmulatorError(
+                f"truth.lockstep: the clock is {self.clock.name}, which runs by itself; run with --clock stepped"
+            )
+        return config.lockstep
+
+    async def _step_in_lock(self, seconds: float) -> None:
+        """Advance the clock for a simulator, once every head is ready."""
+        for head in self.heads:
+            await head._awake.wait()  # noqa: SLF001 (of this class)
+        if self.stepper is not None:
+            await self.stepper.step(seconds)
 
     def close_feed(self) -> None:
         """Close the socket of the live feed, if there is one."""

@@ -96,7 +96,8 @@ class Run:
         options = self.options
         scenario = load_scenario(options.scenario) if options.scenario else None
         if options.truth_log is not None:
-            self._truth_log = TruthLog(options.truth_log, overwrite=options.overwrite)
+            wall_times = self.emulation.clock.speed > 0.0
+            self._truth_log = TruthLog(options.truth_log, overwrite=options.overwrite, wall_times=wall_times)
         emulation = self.emulation
         await emulation.open()
         device = emulation.device

@@ -196,7 +196,7 @@ class ControlServer:
         _check_keys(request)
         emulation, device = self._emulation, self._emulation.device
         truth = self._state(device.clock.now_ns())
-        feed = device.cycle.truth
+        feed = emulation.leader.body_truth
         answer: Answer = {
             "mode": device.modes.mode.value,
             "error_cause": device.modes.error,
@@ -260,9 +260,8 @@ class ControlServer:
         if not isinstance(request.get("truth"), dict):
             raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
-        device = self._emulation.device
         async with self._opening:  # reading a file takes time; the last request wins
-            device.cycle.truth = await self._emulation.open_truth(config)
+            await self._emulation.change_truth(config)
         return {"kind": config.kind, "address": self._emulation.ready_fields.get("truth", "")}
 
     async def _step(self, request: dict[str, Any]) -> Answer:
