@@ -20,6 +20,7 @@ from starhil.emulator.guard import call_guarded, log_internal_error, one_line
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import FrameRequest
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
+from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
@@ -118,6 +119,8 @@ class Device:
             profile.device.rate_window,
         )
         self.cycle.truth = truth
+        self.cycle.start_unix_s = profile.start_unix_s
+        self.cycle.orbit = orbit_of(profile)
         self.cycle.mode = lambda: self.modes.mode
         self.images = ImageStore(
             self.scheduler,
@@ -274,7 +277,7 @@ class Device:
         return last if age_ns <= limit_s * NANOSECONDS else None
 
     def _request_single_frame(self, mid_ns: int) -> FrameRequest:
-        truth = self.cycle.truth.state(mid_ns / NANOSECONDS)
+        truth = self.cycle.true_state(mid_ns)
         exposure_s = float(self.parameters["exposure"]) / 1000.0
         return self.cycle.request(truth, exposure_s, None, solve=False)
 
@@ -312,6 +315,22 @@ class Device:
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if names & {"update_rate", "exposure", "delay_time"}:
             self.cycle.retime()
+
+
+def orbit_of(profile: Profile) -> Orbit | None:
+    """Return the true orbit of a profile, or None.
+
+    Raises
+    ------
+    EmulatorError
+        Its values are not those of an orbit.
+    """
+    if profile.orbit is None:
+        return None
+    try:
+        return profile.orbit.build(profile.start_unix_s)
+    except EmulatorError as error:
+        raise EmulatorError(f"profile {profile.source}: {error}") from None
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:

@@ -97,6 +97,13 @@ class FrameRequest:
         Parameters of detection and identification.
     faults
         Fields of the sky objects that the control channel overrides.
+    unix_s
+        True date of mid-exposure, Unix time; None leaves the sky undated.
+    position_m, velocity_m_s
+        True position and velocity of the sensor relative to the Earth's centre, GCRS; None: at the centre.
+    observer_velocity
+        Velocity of the sensor relative to the barycentre as the device believes it, ICRS, m/s, to correct
+        aberration; None: no correction.
     """
 
     index: int
@@ -108,6 +115,10 @@ class FrameRequest:
     predicted_xyzw: Quaternion | None = None
     settings: SolverSettings = field(default_factory=SolverSettings)
     faults: dict[str, Any] = field(default_factory=dict)
+    unix_s: float | None = None
+    position_m: Triple | None = None
+    velocity_m_s: Triple | None = None
+    observer_velocity: Triple | None = None
 
 
 @dataclass(frozen=True)

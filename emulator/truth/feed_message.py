@@ -15,7 +15,10 @@
     default: derived from the last two messages, or without ``t`` from messages at least
     `starhil.emulator.truth.feed_rates.RECEIPT_BASELINE_S` apart.
 ``position_m``, ``velocity_m_s``
-    Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional.
+    Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, both
+    or none.
+``unix_s``
+    Date, as Unix time. Optional; default: that of the run.
 """
 
 from __future__ import annotations
@@ -28,13 +31,14 @@ import numpy as np
 
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json
 from starhil.emulator.truth.feed_rates import FeedError
+from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
 from starid.attitude import Attitude
 
 NORM_TOLERANCE: Final = 0.01
 """Largest error of a quaternion's length that is attributed to rounding."""
 
-KEYS: Final = ("t", "q", "rate", "position_m", "velocity_m_s")
+KEYS: Final = ("t", "q", "rate", "position_m", "velocity_m_s", "unix_s")
 
 Convention = Literal["rotation", "attitude"]
 Order = Literal["xyzw", "wxyz"]
@@ -52,15 +56,17 @@ class FeedMessage:
         ICRS→body.
     rate_rad_s
         Body rate (3,), rad/s, body frame, or None.
-    position_m, velocity_m_s
-        GCRS (3,), or None.
+    orbit
+        Position and velocity, GCRS, or None.
+    unix_s
+        Date as Unix time, or None.
     """
 
     t: float | None
     attitude: Attitude
     rate_rad_s: Vector | None = None
-    position_m: Vector | None = None
-    velocity_m_s: Vector | None = None
+    orbit: OrbitState | None = None
+    unix_s: float | None = None
 
 
 class FeedFormat(Protocol):
@@ -119,14 +125,17 @@ class JsonFormat:
         quaternion = _numbers("q", message["q"], 4)
         if self.order == "wxyz":
             quaternion = np.roll(quaternion, -1)
-        rate, position, velocity = (_optional(message, key) for key in KEYS[2:])
-        t = message.get("t")
+        rate = _optional(message, "rate", 3)
+        t, unix_s = (_optional_number(message, key) for key in ("t", "unix_s"))
+        position, velocity = (_optional(message, key, 3) for key in ("position_m", "velocity_m_s"))
+        if (position is None) != (velocity is None):
+            raise FeedError("position_m and velocity_m_s: give both or none")
         return FeedMessage(
-            None if t is None else float(_numbers("t", [t], 1)[0]),
+            t,
             checked_attitude("q", quaternion, self.convention),
             checked_rate("rate", None if rate is None else np.radians(rate)),
-            position,
-            velocity,
+            None if position is None or velocity is None else OrbitState(position, velocity),
+            unix_s,
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:
@@ -163,9 +172,14 @@ def checked_rate(key: str, rate_rad_s: Vector | None) -> Vector | None:
     return rate_rad_s
 
 
-def _optional(message: dict[str, Any], key: str) -> Vector | None:
+def _optional(message: dict[str, Any], key: str, count: int) -> Vector | None:
     value = message.get(key)
-    return None if value is None else _numbers(key, value, 3)
+    return None if value is None else _numbers(key, value, count)
+
+
+def _optional_number(message: dict[str, Any], key: str) -> float | None:
+    value = message.get(key)
+    return None if value is None else float(_numbers(key, [value], 1)[0])
 
 
 def _numbers(key: str, value: object, count: int) -> Vector:

@@ -21,14 +21,16 @@ from __future__ import annotations
 import bisect
 import logging
 from collections import deque
+from dataclasses import replace
 from typing import Final, Literal
 
 import numpy as np
 
 from starhil.emulator.truth.feed_message import FeedFormat, FeedMessage, JsonFormat
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
+from starhil.emulator.truth.orbit import interpolate_orbit
 from starhil.emulator.truth.sender_clock import SenderClock
-from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
+from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
 from starid.attitude import Attitude, interpolate, propagate
 
 log = logging.getLogger("starhil.truth")
@@ -82,7 +84,7 @@ class LiveTruth:
         self._received_s = 0.0
         """Simulation time at which the last message was accepted."""
         self._times: deque[float] = deque(maxlen=HISTORY)
-        self._states: deque[tuple[Attitude, Vector]] = deque(maxlen=HISTORY)
+        self._states: deque[TruthState] = deque(maxlen=HISTORY)
 
     def receive(self, data: bytes | str, received_s: float) -> bool:
         """Process what was received at a simulation time in seconds; return whether it was accepted."""
@@ -128,14 +130,14 @@ class LiveTruth:
         self._drop_superseded(t, timed=timed)
         self._received_s = received_s
         self._times.append(t)
-        self._states.append((message.attitude, rate))
+        self._states.append(TruthState(message.attitude, rate, orbit=message.orbit, unix_s=message.unix_s))
 
     def _repeats_the_last(self, message: FeedMessage) -> bool:
         """Whether a message is the last one again, as simulators send at their start."""
         return (
             bool(self._states)
             and message.t == self._last_t
-            and np.array_equal(message.attitude.quaternion_xyzw, self._states[-1][0].quaternion_xyzw)
+            and np.array_equal(message.attitude.quaternion_xyzw, self._states[-1].attitude.quaternion_xyzw)
         )
 
     def _check_time(self, t: float) -> None:
@@ -171,19 +173,40 @@ class LiveTruth:
         if not self._times:
             return TruthState(self._start, ZERO_RATE, TruthStatus.WAITING)
         age = t_s - self._times[-1]
-        attitude, rate = self._states[-1]
+        last = self._states[-1]
         silence = age if self.timeline == "run" else min(age, t_s - self._received_s)
         if silence > self.stale_s:
-            return TruthState(propagate(attitude, rate, self.stale_s), ZERO_RATE, TruthStatus.STALE)
+            return replace(_moved_on(last, self.stale_s), rate_rad_s=ZERO_RATE, status=TruthStatus.STALE)
         if age >= 0.0:
-            status = TruthStatus.EXTRAPOLATED if age > 0.0 else TruthStatus.OK
-            return TruthState(propagate(attitude, rate, min(age, self.stale_s)), rate, status)
+            return _moved_on(last, min(age, self.stale_s)) if age > 0.0 else last
         if t_s <= self._times[0]:
-            attitude, rate = self._states[0]
-            return TruthState(attitude, rate, TruthStatus.BEFORE_START)
+            return replace(self._states[0], status=TruthStatus.BEFORE_START)
         upper = bisect.bisect_right(self._times, t_s)
         low = upper - 1
-        fraction = (t_s - self._times[low]) / (self._times[upper] - self._times[low])
-        (before, rate_before), (after, rate_after) = self._states[low], self._states[upper]
-        rate = (1.0 - fraction) * rate_before + fraction * rate_after
-        return TruthState(interpolate(before, after, fraction), rate)
+        span_s = self._times[upper] - self._times[low]
+        return _between(self._states[low], self._states[upper], (t_s - self._times[low]) / span_s, span_s)
+
+
+def _moved_on(last: TruthState, seconds: float) -> TruthState:
+    """Return a state propagated at its rates."""
+    orbit = last.orbit
+    return replace(
+        last,
+        attitude=propagate(last.attitude, last.rate_rad_s, seconds),
+        status=TruthStatus.EXTRAPOLATED,
+        orbit=orbit and replace(orbit, position_m=orbit.position_m + seconds * orbit.velocity_m_s),
+        unix_s=None if last.unix_s is None else last.unix_s + seconds,
+    )
+
+
+def _between(before: TruthState, after: TruthState, fraction: float, span_s: float) -> TruthState:
+    """Return the state a fraction of the way between two that are `span_s` seconds apart."""
+    orbit = None
+    if before.orbit is not None and after.orbit is not None:
+        orbit = interpolate_orbit(before.orbit, after.orbit, fraction, span_s)
+    unix_s = None
+    if before.unix_s is not None and after.unix_s is not None:
+        unix_s = before.unix_s + fraction * (after.unix_s - before.unix_s)
+    rate = (1.0 - fraction) * before.rate_rad_s + fraction * after.rate_rad_s
+    attitude = interpolate(before.attitude, after.attitude, fraction)
+    return TruthState(attitude, rate, orbit=orbit, unix_s=unix_s)

@@ -25,6 +25,7 @@ import numpy as np
 
 from starhil.emulator.truth.feed_message import FeedMessage, checked_attitude, checked_rate
 from starhil.emulator.truth.feed_rates import FeedError
+from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import Vector
 
 ACKNOWLEDGE: Final = b"Ack\0"
@@ -71,12 +72,14 @@ class Format42:
             raise FeedError(f"no {body}.{'qn' if quaternion is None else 'wn'}; {_PREFIXES}")
         if self._first_ns is None:
             self._first_ns = time_ns
+        position = _sum(_vector(values, 3, f"{self._orbit}.PosN"), _vector(values, 3, f"{body}.PosR"))
+        velocity = _sum(_vector(values, 3, f"{self._orbit}.VelN"), _vector(values, 3, f"{body}.VelR"))
         return FeedMessage(
             (time_ns - self._first_ns) / 1e9,
             checked_attitude(f"{body}.qn", quaternion, "attitude"),
             checked_rate(f"{body}.wn", rate),
-            _sum(_vector(values, 3, f"{self._orbit}.PosN"), _vector(values, 3, f"{body}.PosR")),
-            _sum(_vector(values, 3, f"{self._orbit}.VelN"), _vector(values, 3, f"{body}.VelR")),
+            None if position is None or velocity is None else OrbitState(position, velocity),
+            time_ns / 1e9,
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)

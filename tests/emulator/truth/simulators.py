@@ -36,7 +36,7 @@ def block_of_42(
         *([] if bodies_only else of_spacecraft),
         f"SC[0].B[0].wn = {rate}",
         f"SC[0].B[0].qn = {quaternion}",
-        f"Orb[0].PosN = {numbers(POSITION_M)}",
+        f"Orb[0].PosN = {numbers(np.add(POSITION_M, np.multiply(t, VELOCITY_M_S)))}",
         f"Orb[0].VelN = {numbers(VELOCITY_M_S)}",
         "World[3].eph.PosN = [-1.4e+11 -4.7e+10 0.0]",
         "[ENDMSG]",

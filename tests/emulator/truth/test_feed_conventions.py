@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from starhil.emulator.truth.config import MountConfig, TruthConfig
 from starhil.emulator.truth.feed_message import JsonFormat
+from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.mount import mounted
 from starhil.emulator.truth.source import FixedTruth, RateTruth
@@ -60,12 +61,24 @@ def test_a_convention_that_is_not_the_senders_is_rejected_at_the_second_message(
     assert sent == read or "truth.convention" in live.last_fault
 
 
-def test_position_and_velocity_are_read_from_a_message():
-    message = JsonFormat().decode(
-        line(0.0, ORION, position_m=[7e6, 0.0, 1.0], velocity_m_s=[0.0, 7.5e3, 0.0])
-    )
-    assert message.position_m.tolist() == [7e6, 0.0, 1.0]
-    assert message.velocity_m_s.tolist() == [0.0, 7500.0, 0.0]
+def test_position_velocity_and_date_of_a_feed_are_those_of_its_truth():
+    live = LiveTruth(Attitude.identity(), timeline="run")
+    velocity = [0.0, 7500.0, 0.0]
+    for t in (0.0, 1.0):
+        attitude = propagate(ORION, np.radians(RATE_DEG_S), t)
+        position = [7e6, 7500.0 * t, 1.0]
+        sent = line(t, attitude, position_m=position, velocity_m_s=velocity, unix_s=1.8e9 + t)
+        assert live.receive(sent, t), live.last_fault
+    for t in (0.25, 1.0, 1.5):
+        state = live.state(t)
+        assert state.orbit.position_m == pytest.approx([7e6, 7500.0 * t, 1.0])
+        assert state.orbit.velocity_m_s == pytest.approx(velocity)
+        assert state.unix_s == pytest.approx(1.8e9 + t, abs=1e-6)
+
+
+def test_a_position_without_a_velocity_is_rejected():
+    with pytest.raises(FeedError, match="both or none"):
+        JsonFormat().decode(line(0.0, ORION, position_m=[7e6, 0.0, 1.0]))
 
 
 def mount_of(**keys):

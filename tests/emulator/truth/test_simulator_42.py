@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from tests.emulator.truth.simulators import (
 )
 
 MILLIARCSECOND = 1e-3
+START_UNIX_S = datetime(2024, 12, 31, 23, tzinfo=UTC).timestamp()
 WITHIN_S = 60.0
 
 
@@ -36,9 +38,9 @@ def test_a_block_gives_the_conjugate_attitude_the_rate_and_the_orbit(form):
     message = Format42().decode(block_of_42(3.0, ORION, **form))
     assert apart_arcsec(message.attitude, ORION) < MILLIARCSECOND
     assert np.degrees(message.rate_rad_s) == pytest.approx(RATE_DEG_S)
-    relative = [0.0, 0.0, 0.0] if form else [10.0, 0.0, 0.0]
-    assert message.position_m == pytest.approx(np.add(POSITION_M, relative), rel=1e-12)
-    assert message.velocity_m_s == pytest.approx(VELOCITY_M_S)
+    moved = np.multiply(3.0, VELOCITY_M_S) + ([0.0, 0.0, 0.0] if form else [10.0, 0.0, 0.0])
+    assert message.orbit.position_m == pytest.approx(np.add(POSITION_M, moved), rel=1e-12)
+    assert message.orbit.velocity_m_s == pytest.approx(VELOCITY_M_S)
 
 
 def test_time_counts_from_the_first_block_to_the_nanosecond_over_the_turn_of_a_year():
@@ -46,7 +48,9 @@ def test_time_counts_from_the_first_block_to_the_nanosecond_over_the_turn_of_a_y
     before = block_of_42(0.1, ORION)
     after = before.replace(b"2024-366-23:00:00.1", b"2025-001-00:00:00.3")
     assert read.decode(before).t == 0.0
-    assert read.decode(after).t == 3600.2
+    message = read.decode(after)
+    assert message.t == 3600.2
+    assert message.unix_s == datetime(2025, 1, 1, 0, 0, 0, 300_000, UTC).timestamp()
 
 
 @pytest.mark.parametrize(
@@ -128,6 +132,8 @@ def test_an_exposure_in_lock_step_sees_the_attitude_of_its_time(run):
         expected = propagate(ORION, np.radians(RATE_DEG_S), frame.mid_ns / 1e9)
         assert apart_arcsec(frame.truth.attitude, expected) < MILLIARCSECOND
         assert np.degrees(frame.truth.rate_rad_s) == pytest.approx(RATE_DEG_S)
+        assert frame.truth.orbit.velocity_m_s == pytest.approx(VELOCITY_M_S)
+        assert frame.truth.unix_s == pytest.approx(START_UNIX_S + frame.mid_ns / 1e9, abs=1e-5)
         assert frame.truth.status == "ok"
 
 
