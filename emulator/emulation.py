@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -28,14 +29,18 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
 from starhil.emulator.revival import PipelineRevival
 from starhil.emulator.symlink_lock import lock_symlink
+from starhil.emulator.tape import LatchedClock, Tape
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
 from starhil.emulator.truth.feed import LiveFeed
 from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.mount import mounted
-from starhil.emulator.truth.source import FixedTruth, TruthSource
+from starhil.emulator.truth.source import FixedTruth, RateTruth, SlewTruth, TruthSource
+from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_icd
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.values import Value
 from starid.attitude import Attitude
 
@@ -56,6 +61,8 @@ class Emulation:
         Pipeline worker that was started earlier; by default one is started here.
     leader
         The first head, if this is a further one: it shares that head's clock and truth.
+    tape
+        Records the run, or plays a recording.
 
     Attributes
     ----------
@@ -72,13 +79,17 @@ class Emulation:
         profile: Profile,
         worker: WorkerProcess | None = None,
         leader: Emulation | None = None,
+        tape: Tape | None = None,
     ) -> None:
         self.profile = profile
+        self.tape = tape
         self.leader = leader or self
         self.heads: list[Emulation] = [] if leader is None else leader.heads
         self.heads.append(self)
         self.body_truth: TruthSource = FixedTruth(Attitude.identity())
         self.clock: Clock = make_clock(profile.run.clock) if leader is None else leader.clock
+        if tape is not None:
+            self.clock = tape.clock
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
         self.serial: SerialLink | None = None
@@ -122,7 +133,7 @@ class Emulation:
         return self.requests.device
 
     def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
-        setup = pipeline_setup(self.profile)
+        setup = pipeline_setup(self.profile, repeatable=self.tape is not None)
         if self.profile.run.worker == "process":
             return ProcessImager(setup, worker or WorkerProcess())
         if worker is not None:
@@ -143,7 +154,10 @@ class Emulation:
         truth = self._mounted(self.leader.body_truth, self.profile.truth)
         stepped = isinstance(self.clock, SteppedClock)
         background = run_at_once if stepped else self._in_background()
-        device = Device(self.profile, load_icd(), self.clock, self.imager, store, truth, background)
+        if self.tape is not None:
+            background = self.tape.background(background)
+        imager = self.imager if self.tape is None else self.tape.imager(self.imager)
+        device = Device(self.profile, load_icd(), self.clock, imager, store, truth, background)
         self._requests = Requests(device)
         device.on_frame.append(_log_frame)
         device.power_on()
@@ -160,9 +174,10 @@ class Emulation:
             if self.leader is self:
                 stepped = [(head.device.scheduler, head.imager) for head in self.heads]
                 transports = [link.transport for head in self.heads for link in head.links]
-                self.stepper = StepPump(stepped, self.clock, transports)
+                self.stepper = StepPump(stepped, self.clock, transports, self.tape)
         else:
-            self._pump = ClockPump(device.scheduler, self.clock)
+            passing = self.clock.source if isinstance(self.clock, LatchedClock) else self.clock
+            self._pump = ClockPump(device.scheduler, passing, self.tape)
             self._pump.start()
         self._revival = PipelineRevival(
             self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
@@ -201,7 +216,20 @@ class Emulation:
             A file is invalid or a port is not available; the previous source stays.
         """
         leader = self.leader
-        leader.replace_truth(await leader._open_truth(config), config)  # noqa: SLF001 (of this class)
+        truth = await leader._open_truth(config)  # noqa: SLF001 (of this class)
+        self._enter(
+            "truth", config=config.model_dump(mode="json"), start_s=getattr(truth, "start_s", self._now_s())
+        )
+        leader.replace_truth(truth, config)
+
+    async def play_truth(self, config: TruthConfig, start_s: float) -> None:
+        """Replace the truth as a recorded command did, with time zero of its motion at `start_s` seconds."""
+        truth = await self._open_truth(config)
+        if isinstance(truth, FileTruth | SlewTruth):
+            truth.start_s = start_s
+        elif isinstance(truth, RateTruth):
+            truth = replace(truth, start_s=start_s)
+        self.replace_truth(truth, config)
 
     def set_truth(self, truth: TruthSource, config: TruthConfig) -> None:
         """Replace the truth of all heads by a source without a socket, as in a scenario."""
@@ -226,7 +254,11 @@ class Emulation:
             truth.start_s = self._now_s()  # reading has taken time
         feed: LiveFeed | None = None
         if isinstance(config, FeedConfig) and isinstance(truth, LiveTruth):
-            feed = LiveFeed(truth, self._now_s, self._step_in_lock if self._is_lockstep(config) else None)
+            step = self._step_in_lock if self._is_lockstep(config) else None
+            feed = LiveFeed(truth, self._now_s, step, self._message_received)
+            if self.tape is not None and self.tape.plays:
+                self.feed = feed  # its messages come from the tape
+                return truth
             protocol = "udp" if config.socket == "udp" else "tcp"
             wanted = f"{protocol}:{config.host}:{config.port}"
             if config.port != 0 and wanted in (self.ready_fields.get("truth"), self._configured_feed):
@@ -240,13 +272,22 @@ class Emulation:
         self.feed = feed
         return truth
 
+    def _enter(self, kind: str, **values: object) -> None:
+        """Note an entry on the tape, if there is one."""
+        if self.tape is not None:
+            self.tape.enter(kind, **values)
+
+    def _message_received(self, data: bytes) -> None:
+        """Note a message of the feed."""
+        self._enter("feed", data=data.decode("latin-1"))
+
     def _now_s(self) -> float:
         """Return the simulation time, seconds."""
         return self.clock.now_ns() / NANOSECONDS
 
     def _is_lockstep(self, config: FeedConfig) -> bool:
         """Whether the messages of a feed are to advance the clock."""
-        stepped = isinstance(self.clock, SteppedClock)
+        stepped = self.profile.run.clock == "stepped"
         if isinstance(config, Config42):
             return stepped
         if config.lockstep and not stepped:
@@ -257,6 +298,8 @@ class Emulation:
 
     async def _step_in_lock(self, seconds: float) -> None:
         """Advance the clock for a simulator, once every head is ready."""
+        if self.tape is not None and self.tape.plays:
+            return  # the events of the step are on the tape
         for head in self.heads:
             await head._awake.wait()  # noqa: SLF001 (of this class)
         if self.stepper is not None:
@@ -284,28 +327,34 @@ class Emulation:
             if symlink is not None:
                 self._closers.append(lock_symlink(symlink).close)
             paced = None if links.serial.pace and not stepped else False
-            transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
+
+            def open_port() -> SerialTransport:
+                return open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
+
+            transport = open_port() if self.tape is None else self.tape.serial(open_port)
             self.serial = SerialLink(requests, transport, seed)
             self.ready_fields["serial"] = await self.serial.start()
             self.ready_fields["dialect"] = str(device.parameters["serial_dialect"])
         if links.can.channel != "off":
-            from starhil.protocol.transports.can import open_can
-
-            self.can = CanLink(
-                requests, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
-            )
+            gap_s = 0.0 if stepped else links.can.frame_gap_s
+            self.can = CanLink(requests, self._can_transport("can", links.can.channel), gap_s, seed)
             self.ready_fields["can"] = await self.can.start()
         if links.canopen.node:
             await self._open_canopen(requests)
 
+    def _can_transport(self, name: str, channel: str) -> Transport[CanFrame]:
+        """Return the transport of a CAN link, on the tape if there is one."""
+        from starhil.protocol.transports.can import open_can
+
+        return open_can(channel) if self.tape is None else self.tape.can(name, lambda: open_can(channel))
+
     async def _open_canopen(self, requests: Requests) -> None:
         """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""
         from starhil.emulator.links.canopen import open_canopen
-        from starhil.protocol.transports.can import open_can
 
         channel = self.profile.links.can.channel
         bus = self.ready_fields.get("can") or ("auto" if channel == "off" else channel)
-        transport = open_can(bus)
+        transport = self._can_transport("canopen", bus)
         link = open_canopen(requests, transport, self._state_dir, self.profile.run.seed)
         self.canopen = link
         opened = await link.start()
@@ -323,6 +372,7 @@ class Emulation:
         try:
             self.warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
+            self._enter("ready")
             device.on_mode.append(
                 lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
             )
@@ -385,8 +435,8 @@ async def _cancel(task: asyncio.Task[None]) -> None:
         task.exception()
 
 
-def pipeline_setup(profile: Profile) -> PipelineSetup:
-    """Return the pipeline configuration of a profile."""
+def pipeline_setup(profile: Profile, *, repeatable: bool = False) -> PipelineSetup:
+    """Return the pipeline configuration of a profile; `repeatable` if no result may depend on the machine's speed."""
     path = profile.catalog.path
     return PipelineSetup(
         camera=profile.camera.values(),
@@ -397,7 +447,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         epoch=profile.catalog.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
-        build_in_background=profile.run.clock != "stepped",
+        build_in_background=profile.run.clock != "stepped" and not repeatable,
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from starhil.emulator.clock import make_clock
 from starhil.emulator.control.channel import ControlServer, ControlTarget
 from starhil.emulator.control.faults import Faults
 from starhil.emulator.control.scenario import Scenario, load_scenario
@@ -15,6 +16,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
+from starhil.emulator.replay import prepare_recording
+from starhil.emulator.tape import TRUTH_FILE, Recorder
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.truth_log import TruthLog
@@ -37,6 +40,8 @@ class RunOptions:
         Token that each request on the control channel must carry; empty for none.
     scenario
         Name or path of a scenario; empty for none.
+    record
+        Folder of a recording of the run.
     """
 
     truth_log: Path | None = None
@@ -44,6 +49,7 @@ class RunOptions:
     control: str = "off"
     control_token: str = ""
     scenario: str = ""
+    record: Path | None = None
 
 
 class Head:
@@ -78,9 +84,12 @@ class Head:
 
     def open_log(self, options: RunOptions) -> None:
         """Open the truth log."""
-        if options.truth_log is not None:
+        path = options.truth_log
+        if path is None and options.record is not None:
+            path = options.record / TRUTH_FILE
+        if path is not None:
             self._truth_log = TruthLog(
-                path_of_head(options.truth_log, self.number),
+                path_of_head(path, self.number),
                 overwrite=options.overwrite,
                 wall_times=self.emulation.clock.speed > 0.0,
             )
@@ -138,11 +147,17 @@ class Run:
         others: Sequence[Profile] = (),
     ) -> None:
         check_heads([profile, *others])
-        self.emulation = Emulation(profile, worker)
+        self.options = options or RunOptions()
+        self._recorder: Recorder | None = None
+        if self.options.record is not None:
+            if others:
+                raise EmulatorError("--record: records one head; run the others apart, or leave it out")
+            prepare_recording(self.options.record, profile, self.options.scenario)
+            self._recorder = Recorder(self.options.record, make_clock(profile.run.clock))
+        self.emulation = Emulation(profile, worker, tape=self._recorder)
         self.heads = [Head(1, self.emulation)]
         for number, other in enumerate(others, start=2):
             self.heads.append(Head(number, Emulation(other, leader=self.emulation)))
-        self.options = options or RunOptions()
         self.ended = asyncio.Event()
         self.control: ControlServer | None = None
 
@@ -209,6 +224,8 @@ class Run:
         if self.control is not None:
             closers.insert(0, self.control.close)
         closers += [head.close_log for head in self.heads]
+        if self._recorder is not None:
+            closers.append(self._recorder.close)
         await close_all(closers)
 
 

@@ -12,6 +12,7 @@ from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.tape import Tape
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")
@@ -23,11 +24,20 @@ PEER_PATIENCE_S: Final = 1.0
 
 
 class ClockPump:
-    """Runs each event in the event loop when the clock reaches it."""
+    """Runs each event in the event loop when the clock reaches it.
 
-    def __init__(self, scheduler: Scheduler, clock: Clock) -> None:
+    Parameters
+    ----------
+    clock
+        Clock that passes.
+    tape
+        Records the events.
+    """
+
+    def __init__(self, scheduler: Scheduler, clock: Clock, tape: Tape | None = None) -> None:
         self._scheduler = scheduler
         self._clock = clock
+        self._tape = tape
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
@@ -65,8 +75,13 @@ class ClockPump:
 
     def _run_due_event(self) -> None:
         self._timer = None
-        event = self._scheduler.pop_due(self._clock.now_ns())
+        if self._tape is not None:
+            self._tape.latch()
+        now_ns = self._clock.now_ns() if self._tape is None else self._tape.clock.now_ns()
+        event = self._scheduler.pop_due(now_ns)
         try:
+            if event is not None and self._tape is not None:
+                self._tape.write("event")
             if event is not None:  # one at a time, so that the links run in between
                 call_guarded("event", event.action, event.due_ns)
         finally:
@@ -84,6 +99,8 @@ class StepPump:
     transports
         Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, its transport is not
         waited for until it reads again.
+    tape
+        Records the events.
     """
 
     def __init__(
@@ -91,7 +108,9 @@ class StepPump:
         devices: Sequence[tuple[Scheduler, Imager]],
         clock: SteppedClock,
         transports: Sequence[Transport[Any]] = (),
+        tape: Tape | None = None,
     ) -> None:
+        self._tape = tape
         self._schedulers = [scheduler for scheduler, _ in devices]
         self._clock = clock
         self._imagers = [imager for _, imager in devices]
@@ -115,6 +134,8 @@ class StepPump:
             await self._settle()
             while (event := self._pop_next(end_ns)) is not None:
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
+                if self._tape is not None:
+                    self._tape.write("event")
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
             self._clock.set_ns(end_ns)

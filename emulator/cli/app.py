@@ -30,6 +30,7 @@ USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
 COMMANDS: Final[dict[str, str]] = {
     "icd": "icd",
     "run": "run",
+    "replay": "replay",
     "bench": "bench",
     "render": "render",
     "identify": "identify",

@@ -81,6 +81,12 @@ def command(
             help="Scenario of timed faults and attitude changes: a TOML file, or a name in configs/scenarios."
         ),
     ] = "",
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a recording of the run, for starhil replay; missing folders are created."
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Override a key of the profile: section.key=value. May be repeated."),
@@ -136,7 +142,11 @@ def command(
         ]
         profiles.append(load_profile(name, overrides))
     profiles = with_own_seeds(profiles)
-    if control == "off" and not truth_log and not any(_is_reachable(each.links) for each in profiles):
+    if (
+        control == "off"
+        and not (truth_log or record)
+        and not any(_is_reachable(each.links) for each in profiles)
+    ):
         raise EmulatorError(
             "no link: the device cannot be reached and nothing is recorded; "
             "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
@@ -144,7 +154,7 @@ def command(
 
     if control_token is not None and not control_token:
         raise EmulatorError("--control-token: empty; give a text, or leave the option out")
-    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario)
+    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario, record)
     if truth_log is not None:
         prepare_output(truth_log, "--truth-log")
 

@@ -197,7 +197,10 @@ class ControlServer:
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
         try:
-            return {**identity, "ok": True, **await action(self._target(request), request)}
+            target = self._target(request)
+            if target.emulation.tape is not None:
+                target.emulation.tape.latch()
+            return {**identity, "ok": True, **await action(target, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {**identity, "ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
@@ -298,11 +301,15 @@ class ControlServer:
         return {"run_time_s": emulation.clock.now_ns() / NANOSECONDS}
 
     async def _fault(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
-        target.faults.inject(_parse(_FAULT, FaultRequest, request))
+        wanted = _parse(_FAULT, FaultRequest, request)
+        target.faults.check(wanted)
+        _note(target, "fault", request=request)
+        target.faults.inject(wanted)
         return {"faults": target.faults.describe()}
 
     async def _clear_faults(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request)
+        _note(target, "clear_faults")
         target.faults.clear()
         return {"faults": target.faults.describe()}
 
@@ -310,6 +317,12 @@ class ControlServer:
         _check_keys(request)
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
+
+
+def _note(target: ControlTarget, kind: str, **values: Any) -> None:
+    """Note a command on the tape, if there is one."""
+    if target.emulation.tape is not None:
+        target.emulation.tape.enter(kind, **values)
 
 
 def _state(emulation: Emulation, run_ns: int) -> TruthState:

@@ -45,10 +45,19 @@ class LiveFeed:
         Returns the simulation time in seconds.
     step
         Advances the simulation clock, for lock-step; None if time passes by itself.
+    on_message
+        Called with each message before it is processed.
     """
 
-    def __init__(self, truth: LiveTruth, now_s: Callable[[], float], step: Step | None = None) -> None:
+    def __init__(
+        self,
+        truth: LiveTruth,
+        now_s: Callable[[], float],
+        step: Step | None = None,
+        on_message: Callable[[bytes], None] | None = None,
+    ) -> None:
         self.truth = truth
+        self._on_message = on_message
         self._now_s = now_s
         self._lock_step = None if step is None else LockStep(truth, now_s, step)
         self._transport: asyncio.DatagramTransport | None = None
@@ -89,7 +98,20 @@ class LiveFeed:
 
     def receive(self, data: bytes) -> None:
         """Process one message received now."""
+        self._message_received(data)
         self.truth.receive(data, self._now_s())
+
+    async def process(self, data: bytes) -> str:
+        """Process one message, in lock-step if that is wanted; return the fault of one rejected in lock-step."""
+        if self._lock_step is None:
+            self.receive(data)
+            return ""
+        self._message_received(data)
+        return await self._lock_step.receive(data)
+
+    def _message_received(self, data: bytes) -> None:
+        if self._on_message is not None:
+            self._on_message(data)
 
     async def _keep_connected(self, host: str, port: int) -> None:
         """Connect to a simulator that listens, again whenever it is gone."""
@@ -124,16 +146,10 @@ class LiveFeed:
 
     async def _answer(self, data: bytes, writer: asyncio.StreamWriter) -> None:
         """Process one message from a connection, and answer it if its sender waits for that."""
-        message_format = self.truth.format
-        if self._lock_step is None:
-            self.receive(data)
-            if not message_format.always_answers:
-                return
-            fault = ""
-        else:
-            fault = await self._lock_step.receive(data)
-        writer.write(message_format.answer(self._now_s(), fault))
-        await writer.drain()
+        fault = await self.process(data)
+        if self._lock_step is not None or self.truth.format.always_answers:
+            writer.write(self.truth.format.answer(self._now_s(), fault))
+            await writer.drain()
 
     def close(self) -> None:
         """Stop listening and connecting."""
