@@ -25,6 +25,7 @@ $(VENV)/.product: pyproject.toml
 
 $(VENV)/.developer: $(VENV)/.product
 	$(BIN)/pip install --quiet --editable '.[test,lint]'
+	-$(BIN)/pip install --quiet --editable '.[basilisk]'  # 100 MB; without it, the tests with Basilisk are skipped
 	@touch $@
 
 demo: $(VENV)/.product

@@ -6,12 +6,13 @@ import asyncio
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from starhil.emulator.clock import Clock, SteppedClock, make_clock
+from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock, make_clock
 from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Background, Device, outcome, run_at_once
 from starhil.emulator.device.modes import Mode
@@ -29,14 +30,21 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump, StepPump
 from starhil.emulator.revival import PipelineRevival
 from starhil.emulator.symlink_lock import lock_symlink
-from starhil.emulator.truth.config import FileConfig, LiveConfig, TruthConfig
+from starhil.emulator.tape import LatchedClock, Tape
+from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
+from starhil.emulator.truth.feed import LiveFeed
 from starhil.emulator.truth.file import FileTruth
-from starhil.emulator.truth.live import LiveFeed, LiveTruth
-from starhil.emulator.truth.source import TruthSource
+from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.mount import mounted
+from starhil.emulator.truth.source import FixedTruth, RateTruth, SlewTruth, TruthSource
+from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.icd_bindings import unbound
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.values import Value
+from starid.attitude import Attitude
 
 log = logging.getLogger("starhil.run")
 
@@ -53,6 +61,10 @@ class Emulation:
         Profile of the unit.
     worker
         Pipeline worker that was started earlier; by default one is started here.
+    leader
+        The first head, if this is a further one: it shares that head's clock and truth.
+    tape
+        Records the run, or plays a recording.
 
     Attributes
     ----------
@@ -60,19 +72,32 @@ class Emulation:
         Interface definition of the profile's unit.
     ready_fields
         Fields of the ready line: which port, bus or address was opened for what.
+    heads
+        The heads that share clock and truth, the leader first.
+    body_truth
+        Truth of the body on which the heads are mounted.
     """
 
     def __init__(
         self,
         profile: Profile,
         worker: WorkerProcess | None = None,
+        leader: Emulation | None = None,
+        tape: Tape | None = None,
     ) -> None:
         self.profile = profile
         self.icd = load_unit(profile.unit_source)
         missing = unbound(self.icd)
         if missing:
             raise EmulatorError(missing[0])
-        self.clock: Clock = make_clock(profile.run.clock)
+        self.tape = tape
+        self.leader = leader or self
+        self.heads: list[Emulation] = [] if leader is None else leader.heads
+        self.heads.append(self)
+        self.body_truth: TruthSource = FixedTruth(Attitude.identity())
+        self.clock: Clock = make_clock(profile.run.clock) if leader is None else leader.clock
+        if tape is not None:
+            self.clock = tape.clock
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
         self.serial: SerialLink | None = None
@@ -116,7 +141,7 @@ class Emulation:
         return self.requests.device
 
     def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
-        setup = pipeline_setup(self.profile)
+        setup = pipeline_setup(self.profile, repeatable=self.tape is not None)
         if self.profile.run.worker == "process":
             return ProcessImager(setup, worker or WorkerProcess())
         if worker is not None:
@@ -132,10 +157,15 @@ class Emulation:
             A file, port or bus is not available; one line.
         """
         store = self._open_store()
-        truth = await self.open_truth(self.profile.truth)
+        if self.leader is self:
+            self.body_truth = await self._open_truth(self.profile.truth)
+        truth = self._mounted(self.leader.body_truth, self.profile.truth)
         stepped = isinstance(self.clock, SteppedClock)
         background = run_at_once if stepped else self._in_background()
-        device = Device(self.profile, self.icd, self.clock, self.imager, store, truth, background)
+        if self.tape is not None:
+            background = self.tape.background(background)
+        imager = self.imager if self.tape is None else self.tape.imager(self.imager)
+        device = Device(self.profile, self.icd, self.clock, imager, store, truth, background)
         self._requests = Requests(device)
         device.on_frame.append(_log_frame)
         device.power_on()
@@ -149,10 +179,13 @@ class Emulation:
         """Let time pass and start the pipeline; `ready` waits for it."""
         device = self.device
         if isinstance(self.clock, SteppedClock):
-            transports = [link.transport for link in self.links]
-            self.stepper = StepPump(device.scheduler, self.clock, self.imager, transports)
+            if self.leader is self:
+                stepped = [(head.device.scheduler, head.imager) for head in self.heads]
+                transports = [link.transport for head in self.heads for link in head.links]
+                self.stepper = StepPump(stepped, self.clock, transports, self.tape)
         else:
-            self._pump = ClockPump(device.scheduler, self.clock)
+            passing = self.clock.source if isinstance(self.clock, LatchedClock) else self.clock
+            self._pump = ClockPump(device.scheduler, passing, self.tape)
             self._pump.start()
         self._revival = PipelineRevival(
             self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
@@ -182,25 +215,64 @@ class Emulation:
 
         return background
 
-    async def open_truth(self, config: TruthConfig) -> TruthSource:
-        """Build a truth source, with its socket if it is a live feed, and close the previous feed.
+    async def change_truth(self, config: TruthConfig) -> None:
+        """Replace the truth of all heads, as on the control channel.
 
         Raises
         ------
         EmulatorError
             A file is invalid or a port is not available; the previous source stays.
         """
-        truth = await asyncio.to_thread(config.build, self.clock.now_ns() / 1e9, self.profile.folder)
+        leader = self.leader
+        truth = await leader._open_truth(config)  # noqa: SLF001 (of this class)
+        self._enter(
+            "truth", config=config.model_dump(mode="json"), start_s=getattr(truth, "start_s", self._now_s())
+        )
+        leader.replace_truth(truth, config)
+
+    async def play_truth(self, config: TruthConfig, start_s: float) -> None:
+        """Replace the truth as a recorded command did, with time zero of its motion at `start_s` seconds."""
+        truth = await self._open_truth(config)
+        if isinstance(truth, FileTruth | SlewTruth):
+            truth.start_s = start_s
+        elif isinstance(truth, RateTruth):
+            truth = replace(truth, start_s=start_s)
+        self.replace_truth(truth, config)
+
+    def set_truth(self, truth: TruthSource, config: TruthConfig) -> None:
+        """Replace the truth of all heads by a source without a socket, as in a scenario."""
+        self.leader.close_feed()
+        self.leader.replace_truth(truth, config)
+
+    def replace_truth(self, truth: TruthSource, config: TruthConfig) -> None:
+        """Replace the truth of all heads."""
+        self.body_truth = truth
+        for head in self.heads:
+            head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
+
+    def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
+        """Return the truth of this head: at the mount of a configuration, or else of its own profile."""
+        mount = config.mount or self.profile.truth.mount
+        return mounted(truth, None if mount is None else mount.build())
+
+    async def _open_truth(self, config: TruthConfig) -> TruthSource:
+        """Build a truth source, with its socket if it is a live feed, and close the previous feed."""
+        truth = await asyncio.to_thread(config.build, self._now_s(), self.profile.folder)
         if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
-            truth.start_s = self.clock.now_ns() / 1e9  # reading has taken time
+            truth.start_s = self._now_s()  # reading has taken time
         feed: LiveFeed | None = None
-        if isinstance(config, LiveConfig) and isinstance(truth, LiveTruth):
-            feed = LiveFeed(truth, lambda: self.clock.now_ns() / 1e9)
-            wanted = f"{config.protocol}:{config.host}:{config.port}"
+        if isinstance(config, FeedConfig) and isinstance(truth, LiveTruth):
+            step = self._step_in_lock if self._is_lockstep(config) else None
+            feed = LiveFeed(truth, self._now_s, step, self._message_received)
+            if self.tape is not None and self.tape.plays:
+                self.feed = feed  # its messages come from the tape
+                return truth
+            protocol = "udp" if config.socket == "udp" else "tcp"
+            wanted = f"{protocol}:{config.host}:{config.port}"
             if config.port != 0 and wanted in (self.ready_fields.get("truth"), self._configured_feed):
                 self.close_feed()  # the same port: it must be free first
                 await asyncio.sleep(0)  # the loop closes it in its next turn
-            where = await feed.start(config.protocol, config.host, config.port)
+            where = await feed.start(config.socket, config.host, config.port)
             self.close_feed()
             self.ready_fields["truth"], self._configured_feed = where, wanted
         else:
@@ -208,10 +280,38 @@ class Emulation:
         self.feed = feed
         return truth
 
-    def set_truth(self, truth: TruthSource) -> None:
-        """Replace the truth source by one without a socket."""
-        self.device.cycle.truth = truth
-        self.close_feed()
+    def _enter(self, kind: str, **values: object) -> None:
+        """Note an entry on the tape, if there is one."""
+        if self.tape is not None:
+            self.tape.enter(kind, **values)
+
+    def _message_received(self, data: bytes) -> None:
+        """Note a message of the feed."""
+        self._enter("feed", data=data.decode("latin-1"))
+
+    def _now_s(self) -> float:
+        """Return the simulation time, seconds."""
+        return self.clock.now_ns() / NANOSECONDS
+
+    def _is_lockstep(self, config: FeedConfig) -> bool:
+        """Whether the messages of a feed are to advance the clock."""
+        stepped = self.profile.run.clock == "stepped"
+        if isinstance(config, Config42):
+            return stepped
+        if config.lockstep and not stepped:
+            raise EmulatorError(
+                f"truth.lockstep: the clock is {self.clock.name}, which runs by itself; run with --clock stepped"
+            )
+        return config.lockstep
+
+    async def _step_in_lock(self, seconds: float) -> None:
+        """Advance the clock for a simulator, once every head is ready."""
+        if self.tape is not None and self.tape.plays:
+            return  # the events of the step are on the tape
+        for head in self.heads:
+            await head._awake.wait()  # noqa: SLF001 (of this class)
+        if self.stepper is not None:
+            await self.stepper.step(seconds)
 
     def close_feed(self) -> None:
         """Close the socket of the live feed, if there is one."""
@@ -236,17 +336,18 @@ class Emulation:
             if symlink is not None:
                 self._closers.append(lock_symlink(symlink).close)
             paced = None if links.serial.pace and not stepped else False
-            transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
+
+            def open_port() -> SerialTransport:
+                return open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
+
+            transport = open_port() if self.tape is None else self.tape.serial(open_port)
             self.serial = SerialLink(requests, transport, seed)
             self.ready_fields["serial"] = await self.serial.start()
             if self.serial.dialect is not None:
                 self.ready_fields["dialect"] = self.serial.dialect.value
         if links.can.channel != "off" and self.icd.link.can is not None:
-            from starhil.protocol.transports.can import open_can
-
-            self.can = CanLink(
-                requests, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
-            )
+            gap_s = 0.0 if stepped else links.can.frame_gap_s
+            self.can = CanLink(requests, self._can_transport("can", links.can.channel), gap_s, seed)
             self.ready_fields["can"] = await self.can.start()
         if self._canopen_wanted:
             await self._open_canopen(requests)
@@ -273,14 +374,19 @@ class Emulation:
             if wanted and not there:
                 raise EmulatorError(f"links.{key}: unit {self.icd.name} has no such link")
 
+    def _can_transport(self, name: str, channel: str) -> Transport[CanFrame]:
+        """Return the transport of a CAN link, on the tape if there is one."""
+        from starhil.protocol.transports.can import open_can
+
+        return open_can(channel) if self.tape is None else self.tape.can(name, lambda: open_can(channel))
+
     async def _open_canopen(self, requests: Requests) -> None:
         """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""
         from starhil.emulator.links.canopen import open_canopen
-        from starhil.protocol.transports.can import open_can
 
         channel = self.profile.links.can.channel
         bus = self.ready_fields.get("can") or ("auto" if channel == "off" else channel)
-        transport = open_can(bus)
+        transport = self._can_transport("canopen", bus)
         link = open_canopen(requests, transport, self._state_dir, self.profile.run.seed)
         self.canopen = link
         opened = await link.start()
@@ -298,6 +404,7 @@ class Emulation:
         try:
             self.warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
+            self._enter("ready")
             device.on_mode.append(
                 lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
             )
@@ -366,8 +473,8 @@ async def _cancel(task: asyncio.Task[None]) -> None:
         task.exception()
 
 
-def pipeline_setup(profile: Profile) -> PipelineSetup:
-    """Return the pipeline configuration of a profile."""
+def pipeline_setup(profile: Profile, *, repeatable: bool = False) -> PipelineSetup:
+    """Return the pipeline configuration of a profile; `repeatable` if no result may depend on the machine's speed."""
     path = profile.catalog.path
     return PipelineSetup(
         camera=profile.camera.values(),
@@ -378,7 +485,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         epoch=profile.catalog.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
-        build_in_background=profile.run.clock != "stepped",
+        build_in_background=profile.run.clock != "stepped" and not repeatable,
     )
 
 

@@ -34,12 +34,15 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-async def read_lines(reader: asyncio.StreamReader) -> AsyncIterator[bytes | None]:
-    """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped."""
+async def read_lines(reader: asyncio.StreamReader, end: bytes = b"\n") -> AsyncIterator[bytes | None]:
+    """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped.
+
+    `end` is what ends a line.
+    """
     too_long = False
     while True:
         try:
-            line = await reader.readuntil(b"\n")
+            line = await reader.readuntil(end)
         except asyncio.LimitOverrunError as overrun:
             await reader.readexactly(overrun.consumed)
             too_long = True

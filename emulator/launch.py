@@ -1,20 +1,25 @@
-"""The composition root: makes an emulation with its truth log, faults, scenario and control channel."""
+"""The composition root: makes one or several heads with truth logs, faults, scenario and control channel."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from starhil.emulator.control.channel import ControlServer
+from starhil.emulator.clock import make_clock
+from starhil.emulator.control.channel import ControlServer, ControlTarget
 from starhil.emulator.control.faults import Faults
-from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
+from starhil.emulator.replay import prepare_recording
+from starhil.emulator.tape import TRUTH_FILE, Recorder
+from starhil.emulator.truth.config import TruthConfig
+from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.errors import ProtocolError
 
@@ -26,7 +31,7 @@ class RunOptions:
     Attributes
     ----------
     truth_log
-        CSV file of truth and measurement, one row per frame.
+        CSV file of truth and measurement, one row per frame; one file per head (`path_of_head`).
     overwrite
         Replace an existing truth log.
     control
@@ -35,6 +40,8 @@ class RunOptions:
         Token that each request on the control channel must carry; empty for none.
     scenario
         Name or path of a scenario; empty for none.
+    record
+        Folder of a recording of the run.
     """
 
     truth_log: Path | None = None
@@ -42,39 +49,29 @@ class RunOptions:
     control: str = "off"
     control_token: str = ""
     scenario: str = ""
+    record: Path | None = None
 
 
-class Run:
-    """An emulation with its truth log, faults, scenario and control channel.
+class Head:
+    """One device of a run, with its faults and its truth log.
 
     Parameters
     ----------
-    profile
-        Profile of the unit.
-    options
-        Options that are not part of the profile.
-    worker
-        Pipeline worker that was started earlier; by default one is started here.
-
-    Attributes
-    ----------
-    ended
-        Set when the run is to end.
+    number
+        1 for the first head.
+    emulation
+        Device, pipeline and links.
     """
 
-    def __init__(
-        self, profile: Profile, options: RunOptions | None = None, worker: WorkerProcess | None = None
-    ) -> None:
-        self.emulation = Emulation(profile, worker)
-        self.options = options or RunOptions()
-        self.ended = asyncio.Event()
-        self.control: ControlServer | None = None
+    def __init__(self, number: int, emulation: Emulation) -> None:
+        self.number = number
+        self.emulation = emulation
         self._faults: Faults | None = None
         self._truth_log: TruthLog | None = None
 
     @property
     def faults(self) -> Faults:
-        """The faults of the run.
+        """The faults of the head.
 
         Raises
         ------
@@ -85,8 +82,92 @@ class Run:
             raise EmulatorError("run: not started")
         return self._faults
 
+    def open_log(self, options: RunOptions) -> None:
+        """Open the truth log."""
+        path = options.truth_log
+        if path is None and options.record is not None:
+            path = options.record / TRUTH_FILE
+        if path is not None:
+            self._truth_log = TruthLog(
+                path_of_head(path, self.number),
+                overwrite=options.overwrite,
+                wall_times=self.emulation.clock.speed > 0.0,
+            )
+
+    async def open(self) -> None:
+        """Open the links and switch the device on."""
+        emulation = self.emulation
+        await emulation.open()
+        self._faults = Faults(emulation.device, emulation.links)
+        if self._truth_log is not None:
+            emulation.device.on_frame.append(self._truth_log.write)
+
+    def enter(self, scenario: Scenario) -> None:
+        """Schedule a scenario; its truth is set once, by the first head."""
+        emulation = self.emulation
+        set_truth = emulation.set_truth if self.number == 1 else _leave_truth
+        scenario.enter(emulation.device.scheduler, self.faults, set_truth, emulation.profile.folder)
+
+    def close_log(self) -> None:
+        """Close the truth log."""
+        if self._truth_log is not None:
+            self._truth_log.close()
+
+
+class Run:
+    """A run of one or several heads, with truth logs, faults, scenario and control channel.
+
+    Parameters
+    ----------
+    profile
+        Profile of the unit, or of the first head.
+    options
+        Options that are not part of the profile.
+    worker
+        Pipeline worker that was started earlier; by default one is started here.
+    others
+        Profiles of further heads on the same truth and clock.
+
+    Attributes
+    ----------
+    ended
+        Set when the run is to end.
+
+    Raises
+    ------
+    EmulatorError
+        Two heads exclude each other; one line.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        options: RunOptions | None = None,
+        worker: WorkerProcess | None = None,
+        others: Sequence[Profile] = (),
+    ) -> None:
+        check_heads([profile, *others])
+        self.options = options or RunOptions()
+        self._recorder: Recorder | None = None
+        if self.options.record is not None:
+            if others:
+                raise EmulatorError("--record: records one head; run the others apart, or leave it out")
+            prepare_recording(self.options.record, profile, self.options.scenario)
+            self._recorder = Recorder(self.options.record, make_clock(profile.run.clock))
+        self.emulation = Emulation(profile, worker, tape=self._recorder)
+        self.heads = [Head(1, self.emulation)]
+        for number, other in enumerate(others, start=2):
+            self.heads.append(Head(number, Emulation(other, leader=self.emulation)))
+        self.ended = asyncio.Event()
+        self.control: ControlServer | None = None
+
+    @property
+    def faults(self) -> Faults:
+        """The faults of the first head."""
+        return self.heads[0].faults
+
     async def start(self) -> None:
-        """Open files, links and control channel, switch the device on and let time pass.
+        """Open files, links and control channel, switch the devices on and let time pass.
 
         Raises
         ------
@@ -95,30 +176,114 @@ class Run:
         """
         options = self.options
         scenario = load_scenario(options.scenario) if options.scenario else None
-        if options.truth_log is not None:
-            self._truth_log = TruthLog(options.truth_log, overwrite=options.overwrite)
-        emulation = self.emulation
-        await emulation.open()
-        device = emulation.device
-        self._faults = Faults(device, emulation.links)
-        if self._truth_log is not None:
-            device.on_frame.append(self._truth_log.write)
+        for head in self.heads:
+            head.open_log(options)
+        opened: list[Head] = []
         try:
+            for head in self.heads:
+                await head.open()
+                opened.append(head)
             if scenario is not None:
-                scenario.enter(device.scheduler, self._faults, emulation.set_truth, emulation.profile.folder)
+                for head in self.heads:
+                    head.enter(scenario)
             if options.control != "off":
-                self.control = ControlServer(emulation, self._faults, self.ended.set, options.control_token)
-                emulation.ready_fields["control"] = await self.control.start(options.control)
+                targets = [ControlTarget(head.emulation, head.faults) for head in self.heads]
+                self.control = ControlServer(targets, self.ended.set, options.control_token)
+                where = await self.control.start(options.control)
+                self.emulation.ready_fields["control"] = where
         except (EmulatorError, ProtocolError):
-            device.withdraw_start()
+            for head in opened:
+                head.emulation.device.withdraw_start()
             raise
-        emulation.begin()
+        for head in self.heads:
+            head.emulation.begin()
+
+    async def ready(self) -> str:
+        """Wait until every device takes commands; return the ready line.
+
+        Fields of the nth head end in `.n`, but for the first head.
+
+        Raises
+        ------
+        EmulatorError
+            A pipeline cannot start; one line.
+        """
+        line = await self.emulation.ready()
+        for head in self.heads[1:]:
+            further = (await head.emulation.ready()).split()[1:]
+            line += "".join(
+                f" {key}.{head.number}={value}"
+                for key, _, value in (field.partition("=") for field in further)
+                if key != "clock"
+            )
+        return line
 
     async def close(self) -> None:
-        """Close the control channel, the emulation and the truth log, whatever fails to close."""
-        closers: list[Callable[[], object]] = [self.emulation.close]
+        """Close the control channel, the emulations and the truth logs, whatever fails to close."""
+        closers: list[Callable[[], object]] = [head.emulation.close for head in reversed(self.heads)]
         if self.control is not None:
             closers.insert(0, self.control.close)
-        if self._truth_log is not None:
-            closers.append(self._truth_log.close)
+        closers += [head.close_log for head in self.heads]
+        if self._recorder is not None:
+            closers.append(self._recorder.close)
         await close_all(closers)
+
+
+def path_of_head(path: Path, number: int) -> Path:
+    """Return the path of a head's file: of the second head, `truth.2.csv` for `truth.csv`."""
+    return path if number == 1 else path.with_name(f"{path.stem}.{number}{path.suffix}")
+
+
+def with_own_seeds(profiles: Sequence[Profile]) -> list[Profile]:
+    """Return the profiles of heads with a seed each: one that an earlier head has is increased until it is free."""
+    seeds: set[int] = set()
+    found: list[Profile] = []
+    for profile in profiles:
+        seed = profile.run.seed
+        while seed in seeds:
+            seed += 1
+        seeds.add(seed)
+        found.append(profile.model_copy(update={"run": profile.run.model_copy(update={"seed": seed})}))
+    return found
+
+
+def check_heads(profiles: Sequence[Profile]) -> None:
+    """Check that several heads can share a truth, a clock and their buses.
+
+    Raises
+    ------
+    EmulatorError
+        They cannot; the text names the two profiles and the key to change.
+    """
+    first = profiles[0]
+    taken: dict[tuple[str, str, int], Profile] = {}
+    for profile in profiles:
+        if profile is not first and profile.run.clock != first.run.clock:
+            raise EmulatorError(
+                f"--head {profile.source}: run.clock is {profile.run.clock}, that of {first.source} "
+                f"{first.run.clock}; heads share a clock, give --clock"
+            )
+        links = profile.links
+        for key, bus, number in (
+            ("links.can.address", links.can.channel if links.can.channel != "off" else "", links.can.address),
+            ("links.canopen.node", links.can.channel if links.canopen.node else "", links.canopen.node),
+            ("links.serial.port", _fixed_port(links.serial.port), 0),
+            ("run.state_dir", profile.run.state_dir and str(profile.folder / profile.run.state_dir), 0),
+        ):
+            if not bus:
+                continue
+            other = taken.setdefault((key, bus, number), profile)
+            if other is not profile:
+                value = number or bus
+                raise EmulatorError(
+                    f"--head {profile.source}: {key} is {value}, as that of {other.source}; give it another"
+                )
+
+
+def _fixed_port(port: str) -> str:
+    """Return the port of a serial link that only one head can have, else an empty text."""
+    return "" if port in ("auto", "off") or port.endswith(":0") else port
+
+
+def _leave_truth(_truth: TruthSource, _config: TruthConfig) -> None:
+    """Leave the truth to the first head."""

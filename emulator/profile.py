@@ -368,6 +368,8 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
         if not isinstance(below, dict):
             raise EmulatorError(f"--set {override}: {name} is a value, not a section")
         table = below
+    if names[-1] == "kind":
+        value = text.strip().strip("\"'")  # a name, also where it is a number: 42
     if names[-1] == "kind" and table.get("kind") != value:
         for other in set(table) - ({"attitude"} if value != "file" else set()):
             del table[other]

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
-from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.tape import Tape
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")
@@ -23,11 +24,20 @@ PEER_PATIENCE_S: Final = 1.0
 
 
 class ClockPump:
-    """Runs each event in the event loop when the clock reaches it."""
+    """Runs each event in the event loop when the clock reaches it.
 
-    def __init__(self, scheduler: Scheduler, clock: Clock) -> None:
+    Parameters
+    ----------
+    clock
+        Clock that passes.
+    tape
+        Records the events.
+    """
+
+    def __init__(self, scheduler: Scheduler, clock: Clock, tape: Tape | None = None) -> None:
         self._scheduler = scheduler
         self._clock = clock
+        self._tape = tape
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
@@ -65,8 +75,13 @@ class ClockPump:
 
     def _run_due_event(self) -> None:
         self._timer = None
-        event = self._scheduler.pop_due(self._clock.now_ns())
+        if self._tape is not None:
+            self._tape.latch()
+        now_ns = self._clock.now_ns() if self._tape is None else self._tape.clock.now_ns()
+        event = self._scheduler.pop_due(now_ns)
         try:
+            if event is not None and self._tape is not None:
+                self._tape.write("event")
             if event is not None:  # one at a time, so that the links run in between
                 call_guarded("event", event.action, event.due_ns)
         finally:
@@ -75,25 +90,30 @@ class ClockPump:
 
 
 class StepPump:
-    """Runs events on request; before each, it waits for the pipeline and for the links to send.
+    """Runs events on request; before each, it waits for the pipelines and for the links to send.
 
     Parameters
     ----------
+    devices
+        Scheduler and pipeline of each device on the clock. Of events at the same time, those of the first device run first.
     transports
         Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, its transport is not
         waited for until it reads again.
+    tape
+        Records the events.
     """
 
     def __init__(
         self,
-        scheduler: Scheduler,
+        devices: Sequence[tuple[Scheduler, Imager]],
         clock: SteppedClock,
-        imager: Imager,
         transports: Sequence[Transport[Any]] = (),
+        tape: Tape | None = None,
     ) -> None:
-        self._scheduler = scheduler
+        self._tape = tape
+        self._schedulers = [scheduler for scheduler, _ in devices]
         self._clock = clock
-        self._imager = imager
+        self._imagers = [imager for _, imager in devices]
         self._transports = transports
         self._stalled: dict[Transport[Any], int] = {}
         """Transports that are not waited for, with the bytes or frames sent when the peer stopped reading."""
@@ -112,15 +132,30 @@ class StepPump:
         async with self._lock:
             end_ns = self._clock.now_ns() + round(seconds * NANOSECONDS)
             await self._settle()
-            while (event := self._scheduler.pop_due(end_ns)) is not None:
+            while (event := self._pop_next(end_ns)) is not None:
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
+                if self._tape is not None:
+                    self._tape.write("event")
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
             self._clock.set_ns(end_ns)
 
+    def _pop_next(self, end_ns: int) -> Event | None:
+        """Remove and return the earliest event of all devices that is due at `end_ns`, or None."""
+        due = [
+            (due_ns, scheduler)
+            for scheduler in self._schedulers
+            if (due_ns := scheduler.next_due_ns()) is not None
+        ]
+        if not due:
+            return None
+        _, earliest = min(due, key=lambda item: item[0])
+        return earliest.pop_due(end_ns)
+
     async def _settle(self) -> None:
-        """Wait for the pipeline and the links, and let other tasks of the loop run."""
-        await self._imager.settle()
+        """Wait for the pipelines and the links, and let other tasks of the loop run."""
+        for imager in self._imagers:
+            await imager.settle()
         await asyncio.sleep(0)
         for transport in self._transports:
             await self._drain(transport)

@@ -32,8 +32,10 @@ COLUMNS: Final = (
 """Columns: Unix time on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured attitude.
 
 `latency_ms` is simulation time from mid-exposure to publication; `processing_ms` and the three after
-it are wall time.
+it are wall time, and empty on the stepped clock, so that the same run gives the same file.
 """
+
+WALL_TIMES: Final = ("processing_ms", "render_ms", "detect_ms", "identify_ms")
 
 
 def compare(measurement: Measurement) -> dict[str, Any]:
@@ -92,6 +94,8 @@ class TruthLog:
         The file; created if it does not exist.
     overwrite
         Replace an existing file.
+    wall_times
+        Fill the columns of `WALL_TIMES`.
 
     Raises
     ------
@@ -99,8 +103,9 @@ class TruthLog:
         The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False, wall_times: bool = True) -> None:
         self._path = path
+        self._left_out = () if wall_times else WALL_TIMES
         self._size = 0
         self._file: io.FileIO | None = None
         try:
@@ -117,7 +122,8 @@ class TruthLog:
         if self._file is None:
             return
         try:
-            self._write_row([_format_cell(name, value) for name, value in compare(measurement).items()])
+            row = compare(measurement) | dict.fromkeys(self._left_out)
+            self._write_row([_format_cell(name, value) for name, value in row.items()])
         except OSError as error:
             log.warning(
                 "truth log %s: cannot be written (%s); it ends before frame %d, the run goes on",

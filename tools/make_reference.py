@@ -225,7 +225,7 @@ def section(name: str, text: str, model: type[BaseModel]) -> str:
 
 def truth() -> str:
     """The truth sources, segments of a slew, and an attitude."""
-    from starhil.emulator.truth.config import AttitudeConfig, SegmentConfig, TruthConfig
+    from starhil.emulator.truth.config import AttitudeConfig, MountConfig, SegmentConfig, TruthConfig
 
     parts = [
         f'### `kind = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
@@ -235,9 +235,10 @@ def truth() -> str:
         f'### Segment `do = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
         for model in models_in(SegmentConfig)
     ]
-    parts.append(
-        f"### An attitude\n\n{plain_text(AttitudeConfig.__doc__ or '')}\n\n{table(model_rows(AttitudeConfig))}"
-    )
+    parts += [
+        f"### {title}\n\n{plain_text(model.__doc__ or '')}\n\n{table(model_rows(model))}"
+        for title, model in (("An attitude", AttitudeConfig), ("A mount", MountConfig))
+    ]
     return "\n\n".join(parts)
 
 

@@ -31,6 +31,7 @@ COMMANDS: Final[dict[str, str]] = {
     "icd": "icd",
     "unit": "unit",
     "run": "run",
+    "replay": "replay",
     "bench": "bench",
     "render": "render",
     "identify": "identify",

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from starhil.emulator.cli.options import UnitChoice
 from starhil.emulator.cli.output import output_help, prepare_output
 
+if TYPE_CHECKING:
+    from starhil.emulator.profile import LinksConfig
+
 
 def command(
     profile: Annotated[
-        str, typer.Argument(help="Name of a device profile, or path of a profile file.")
-    ] = "cubestar",
+        str | None,
+        typer.Argument(help="Name of a device profile, or path of a profile file.", show_default="cubestar"),
+    ] = None,
     unit: UnitChoice = None,
+    head: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Profile of one of several heads, in place of PROFILE; repeat it for each. They share the clock, "
+            "and the truth of the first one at their own mounts."
+        ),
+    ] = None,
     serial: Annotated[
         str | None, typer.Option(help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off.")
     ] = None,
@@ -72,6 +83,12 @@ def command(
             help="Scenario of timed faults and attitude changes: a TOML file, or a name in configs/scenarios."
         ),
     ] = "",
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a recording of the run, for starhil replay; missing folders are created."
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Override a key of the profile: section.key=value. May be repeated."),
@@ -91,8 +108,8 @@ def command(
     import logging
 
     from starhil.emulator.errors import EmulatorError
-    from starhil.emulator.launch import Run, RunOptions
-    from starhil.emulator.profile import load_profile
+    from starhil.emulator.launch import Run, RunOptions, path_of_head, with_own_seeds
+    from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.protocol.serial_framing import Dialect
 
     levels = ("debug", "info", "warning", "error")
@@ -101,25 +118,37 @@ def command(
     logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
     if dialect is not None and dialect not in list(Dialect):
         raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
-    overrides = list(settings or ())
+    if head and profile is not None:
+        raise EmulatorError(
+            f"{profile}: a profile and --head exclude each other; give it as --head {profile}"
+        )
     values = {
         "unit": None if unit is None else _absolute_folder(unit),
         "links.serial.port": serial,
         "links.serial.dialect": dialect,
         "links.can.channel": can,
+        "links.canopen.node": canopen,
         "run.clock": clock,
-        "run.state_dir": None if state_dir is None else str(state_dir.resolve()),
-        "links.serial.symlink": None if symlink is None else str(symlink.absolute()),
+        "run.seed": seed,
     }
-    overrides += [f"{key}={_quoted(value)}" for key, value in values.items() if value is not None]
-    if canopen is not None:
-        overrides.append(f"links.canopen.node={canopen}")
-    if seed is not None:
-        overrides.append(f"run.seed={seed}")
-    loaded = load_profile(profile, overrides)
-    links = loaded.links
-    if (links.serial.port, links.can.channel, control) == ("off", "off", "off") and not (
-        links.canopen.node or truth_log
+    profiles = []
+    for number, name in enumerate(head or [profile or DEFAULT_PROFILE], start=1):
+        own = {
+            "run.state_dir": None if state_dir is None else str(_folder_of_head(state_dir.resolve(), number)),
+            "links.serial.symlink": None
+            if symlink is None
+            else str(path_of_head(symlink.absolute(), number)),
+        }
+        overrides = list(settings or ())
+        overrides += [
+            f"{key}={_as_toml(value)}" for key, value in (values | own).items() if value is not None
+        ]
+        profiles.append(load_profile(name, overrides))
+    profiles = with_own_seeds(profiles)
+    if (
+        control == "off"
+        and not (truth_log or record)
+        and not any(_is_reachable(each.links) for each in profiles)
     ):
         raise EmulatorError(
             "no link: the device cannot be reached and nothing is recorded; "
@@ -128,14 +157,14 @@ def command(
 
     if control_token is not None and not control_token:
         raise EmulatorError("--control-token: empty; give a text, or leave the option out")
-    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario)
+    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario, record)
     if truth_log is not None:
         prepare_output(truth_log, "--truth-log")
 
     async def run() -> None:
         import signal
 
-        emulator = Run(loaded, options, worker)
+        emulator = Run(profiles[0], options, worker, profiles[1:])
         loop = asyncio.get_running_loop()
         ends = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
@@ -144,7 +173,7 @@ def command(
             loop.add_signal_handler(number, emulator.ended.set)
         try:
             await emulator.start()
-            line = asyncio.create_task(emulator.emulation.ready())
+            line = asyncio.create_task(emulator.ready())
             stop = asyncio.create_task(emulator.ended.wait())
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
@@ -167,6 +196,18 @@ def _absolute_folder(unit: str) -> str:
     return unit if unit in shipped_units() else str(find_unit(unit).absolute())
 
 
-def _quoted(text: str) -> str:
-    """Write a text as TOML."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+def _folder_of_head(folder: Path, number: int) -> Path:
+    """Return the state folder of a head: of the second head, `head-2` in that of the first."""
+    return folder if number == 1 else folder / f"head-{number}"
+
+
+def _is_reachable(links: LinksConfig) -> bool:
+    """Whether a device has any link."""
+    return (links.serial.port, links.can.channel) != ("off", "off") or bool(links.canopen.node)
+
+
+def _as_toml(value: str | int) -> str:
+    """Write a value as TOML."""
+    if isinstance(value, int):
+        return str(value)
+    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -7,7 +7,8 @@ the reason in one line, and nothing was changed.
 `--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open.
 HOST:PORT listens on TCP, which is open to every local user and, unless on loopback, to the network:
 every peer can send all requests below. With a token (`--control-token`, or STARHIL_CONTROL_TOKEN),
-each request must carry it as `token`.
+each request must carry it as `token`. With several heads, `head` in a request names the one that it is for:
+1, the default, is the first.
 
 ========================  =======================================================================================
 `do`                      effect, and fields of the answer
@@ -37,7 +38,8 @@ import hmac
 import json
 import logging
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -67,15 +69,32 @@ KEPT_FRAMES: Final = 200
 Answer = dict[str, Any]
 
 
+@dataclass(frozen=True)
+class ControlTarget:
+    """A head that the control channel commands.
+
+    Attributes
+    ----------
+    emulation
+        Its emulation; it is open.
+    faults
+        Its faults.
+    frames
+        Its last measurements.
+    """
+
+    emulation: Emulation
+    faults: Faults
+    frames: deque[Measurement] = field(default_factory=lambda: deque(maxlen=KEPT_FRAMES))
+
+
 class ControlServer:
     """Serves the control channel of a run.
 
     Parameters
     ----------
-    emulation
-        Emulation to control; it is open.
-    faults
-        Faults of the run.
+    targets
+        The heads of the run.
     quit_run
         Called to end the run.
     token
@@ -83,18 +102,16 @@ class ControlServer:
     """
 
     def __init__(
-        self, emulation: Emulation, faults: Faults, quit_run: Callable[[], None], token: str = ""
+        self, targets: Sequence[ControlTarget], quit_run: Callable[[], None], token: str = ""
     ) -> None:
-        self._emulation = emulation
-        self._faults = faults
+        self._targets = targets
         self._token = token
         self._socket: ControlSocket | None = None
         self._opening = asyncio.Lock()
         self._quit = quit_run
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
-        self._frames: deque[Measurement] = deque(maxlen=KEPT_FRAMES)
-        self._actions: dict[str, Callable[[dict[str, Any]], Awaitable[Answer]]] = {
+        self._actions: dict[str, Callable[[ControlTarget, dict[str, Any]], Awaitable[Answer]]] = {
             "status": self._status,
             "truth": self._truth,
             "frames": self._last_frames,
@@ -104,7 +121,8 @@ class ControlServer:
             "clear_faults": self._clear_faults,
             "quit": self._quit_run,
         }
-        emulation.device.on_frame.append(self._frames.append)
+        for target in targets:
+            target.emulation.device.on_frame.append(target.frames.append)
 
     async def start(self, where: str) -> str:
         """Listen at `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
@@ -179,7 +197,10 @@ class ControlServer:
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
         try:
-            return {**identity, "ok": True, **await action(request)}
+            target = self._target(request)
+            if target.emulation.tape is not None:
+                target.emulation.tape.latch()
+            return {**identity, "ok": True, **await action(target, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {**identity, "ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
@@ -192,11 +213,18 @@ class ControlServer:
             return True
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
-    async def _status(self, request: dict[str, Any]) -> Answer:
+    def _target(self, request: dict[str, Any]) -> ControlTarget:
+        """Return the head that a request is for."""
+        number = request.pop("head", 1)
+        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(self._targets):
+            raise EmulatorError(f"head: {number!r} given, must be 1 to {len(self._targets)}")
+        return self._targets[number - 1]
+
+    async def _status(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request)
-        emulation, device = self._emulation, self._emulation.device
-        truth = self._state(device.clock.now_ns())
-        feed = device.cycle.truth
+        emulation, device = target.emulation, target.emulation.device
+        truth = _state(emulation, device.clock.now_ns())
+        feed = emulation.leader.body_truth
         answer: Answer = {
             "mode": device.modes.mode.value,
             "error_cause": device.modes.error,
@@ -214,29 +242,28 @@ class ControlServer:
             "link_faults": {kind.value: count for kind, count in device.counters.faults.items()},
             "truth_kind": feed.kind,
             "truth_status": truth.status.value,
-            "faults": self._faults.describe(),
+            "faults": target.faults.describe(),
         }
+        if len(self._targets) > 1:
+            answer["heads"] = len(self._targets)
         if isinstance(feed, LiveTruth):
             answer["feed"] = {
                 "accepted": feed.accepted,
                 "refused": feed.refused,
                 "last_fault": feed.last_fault,
-                "address": emulation.ready_fields.get("truth", ""),
+                "address": emulation.leader.ready_fields.get("truth", ""),
             }
         return answer
 
-    def _state(self, run_ns: int) -> TruthState:
-        return self._emulation.device.cycle.truth.state(run_ns / NANOSECONDS)
-
-    async def _truth(self, request: dict[str, Any]) -> Answer:
+    async def _truth(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request, "run_time_s", "unix_s")
-        device = self._emulation.device
+        device = target.emulation.device
         run_ns = device.clock.now_ns()
         if "run_time_s" in request:
             run_ns = round(_number(request, "run_time_s") * NANOSECONDS)
         elif "unix_s" in request:
             run_ns = round(_number(request, "unix_s") * NANOSECONDS) - device.time.offset_ns
-        state = self._state(run_ns)
+        state = _state(target.emulation, run_ns)
         return {
             "run_time_s": run_ns / NANOSECONDS,
             "unix_s": device.time.unix_ns(run_ns) / NANOSECONDS,
@@ -248,44 +275,58 @@ class ControlServer:
             "status": state.status.value,
         }
 
-    async def _last_frames(self, request: dict[str, Any]) -> Answer:
+    async def _last_frames(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request, "count")
         count = int(_number(request, "count", 1.0))
         if not 1 <= count <= KEPT_FRAMES:
             raise EmulatorError(f"count: {count} is outside 1 … {KEPT_FRAMES}")
-        return {"frames": [compare(measurement) for measurement in list(self._frames)[-count:]]}
+        return {"frames": [compare(measurement) for measurement in list(target.frames)[-count:]]}
 
-    async def _set_truth(self, request: dict[str, Any]) -> Answer:
+    async def _set_truth(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request, "truth")
         if not isinstance(request.get("truth"), dict):
             raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
-        device = self._emulation.device
         async with self._opening:  # reading a file takes time; the last request wins
-            device.cycle.truth = await self._emulation.open_truth(config)
-        return {"kind": config.kind, "address": self._emulation.ready_fields.get("truth", "")}
+            await target.emulation.change_truth(config)
+        return {"kind": config.kind, "address": target.emulation.leader.ready_fields.get("truth", "")}
 
-    async def _step(self, request: dict[str, Any]) -> Answer:
+    async def _step(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request, "seconds")
-        stepper = self._emulation.stepper
+        emulation = target.emulation.leader
+        stepper = emulation.stepper
         if stepper is None:
-            raise EmulatorError(f"step: the clock is {self._emulation.clock.name}; run with --clock stepped")
+            raise EmulatorError(f"step: the clock is {emulation.clock.name}; run with --clock stepped")
         await stepper.step(_number(request, "seconds"))
-        return {"run_time_s": self._emulation.clock.now_ns() / NANOSECONDS}
+        return {"run_time_s": emulation.clock.now_ns() / NANOSECONDS}
 
-    async def _fault(self, request: dict[str, Any]) -> Answer:
-        self._faults.inject(_parse(_FAULT, FaultRequest, request))
-        return {"faults": self._faults.describe()}
+    async def _fault(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+        wanted = _parse(_FAULT, FaultRequest, request)
+        target.faults.check(wanted)
+        _note(target, "fault", request=request)
+        target.faults.inject(wanted)
+        return {"faults": target.faults.describe()}
 
-    async def _clear_faults(self, request: dict[str, Any]) -> Answer:
+    async def _clear_faults(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request)
-        self._faults.clear()
-        return {"faults": self._faults.describe()}
+        _note(target, "clear_faults")
+        target.faults.clear()
+        return {"faults": target.faults.describe()}
 
-    async def _quit_run(self, request: dict[str, Any]) -> Answer:
+    async def _quit_run(self, _target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request)
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
+
+
+def _note(target: ControlTarget, kind: str, **values: Any) -> None:
+    """Note a command on the tape, if there is one."""
+    if target.emulation.tape is not None:
+        target.emulation.tape.enter(kind, **values)
+
+
+def _state(emulation: Emulation, run_ns: int) -> TruthState:
+    return emulation.device.cycle.truth.state(run_ns / NANOSECONDS)
 
 
 class _Truth(BaseModel):

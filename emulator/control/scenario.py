@@ -32,12 +32,14 @@ from starhil.emulator.device.scheduler import Action, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import configs_folder
 from starhil.emulator.toml_file import read_toml
-from starhil.emulator.truth.config import LiveConfig, Strict, TruthConfig
+from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.validation_messages import explain
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
+
+SetTruth = Callable[[TruthSource, TruthConfig], None]
 
 
 class ScenarioEvent(Strict):
@@ -50,29 +52,30 @@ class ScenarioEvent(Strict):
     clear_faults: bool = False
     """End all faults first."""
     truth: TruthConfig | None = None
-    """Another truth, as in the control channel's `set_truth`; not `live`."""
+    """Another truth, as in the control channel's `set_truth`; not `live` or `42`."""
 
     @model_validator(mode="after")
     def _something(self) -> Self:
         if self.fault is None and self.truth is None and not self.clear_faults:
             raise ValueError("give fault, truth or clear_faults = true")
-        if isinstance(self.truth, LiveConfig):
+        if isinstance(self.truth, FeedConfig):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
-    def prepare(self, faults: Faults, set_truth: Callable[[TruthSource], None], folder: Path) -> Action:
+    def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path) -> Action:
         """Return the action of the event; what it needs is read and checked now."""
         if self.fault is not None:
             faults.check(self.fault)
-        truth = None if self.truth is None else self.truth.build(self.run_time_s, folder)
+        config = self.truth
+        truth = None if config is None else config.build(self.run_time_s, folder)
 
         def act(_due_ns: int) -> None:
             if self.clear_faults:
                 faults.clear()
             if self.fault is not None:
                 faults.inject(self.fault)
-            if truth is not None:
-                set_truth(truth)
+            if config is not None and truth is not None:
+                set_truth(truth, config)
             log.info("scenario at %g s", self.run_time_s)
 
         return act
@@ -90,7 +93,7 @@ class Scenario(Strict):
         self,
         scheduler: Scheduler,
         faults: Faults,
-        set_truth: Callable[[TruthSource], None],
+        set_truth: SetTruth,
         folder: Path,
     ) -> None:
         """Schedule all events; files that they need are read and checked now.
@@ -102,7 +105,7 @@ class Scenario(Strict):
         faults
             Faults of the run, whose links are open.
         set_truth
-            Called with a new truth source.
+            Called with a new truth source and its configuration.
         folder
             Folder that relative paths of truth files start from.
 

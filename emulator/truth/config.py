@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from starhil.emulator.truth.feed import Socket
+from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.orbit import (
@@ -19,6 +22,7 @@ from starhil.emulator.truth.orbit import (
     OrbitState,
     TleOrbit,
 )
+from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
     FixedTruth,
@@ -112,6 +116,55 @@ DEFAULT_ATTITUDE = AttitudeConfig(ra_deg=83.8, dec_deg=-1.2, roll_deg=0.0)
 """Orion: bright stars, and easy to recognise in an image."""
 
 
+Angle: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
+Row: TypeAlias = Annotated[list[Annotated[float, Field(ge=-1.0, le=1.0)]], Field(min_length=3, max_length=3)]
+
+ORTHONORMAL: Final = 1e-4
+"""Largest error of a mount's matrix that is attributed to rounding."""
+
+
+class MountConfig(Strict):
+    """How the sensor sits in the body: the rotation from the body frame to the sensor frame, in one of three forms."""
+
+    quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    """Quaternion body to sensor, scalar last, of length 1: it rotates vectors, v_sensor = q ⊗ v_body ⊗ q*."""
+    matrix: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
+    """The sensor's x, y and z axis in the body frame, as three rows."""
+    euler_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
+    """Angles by which the body axes are turned, one after the other, to become those of the sensor, as 42 has them."""
+    sequence: Annotated[str, Field(pattern="^[123]{3}$")] = "321"
+    """Axes of `euler_deg`: 1 is x, 2 is y, 3 is z."""
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        forms = (self.quaternion_xyzw, self.matrix, self.euler_deg)
+        if sum(form is not None for form in forms) != 1:
+            raise ValueError("give quaternion_xyzw, matrix or euler_deg, one of them")
+        if self.quaternion_xyzw is not None and abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
+            raise ValueError("quaternion_xyzw is not of length 1")
+        if self.matrix is not None:
+            axes = np.array(self.matrix)
+            if np.abs(axes @ axes.T - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(axes) < 0.0:
+                raise ValueError("matrix is not a rotation; its rows must be orthonormal and right-handed")
+        if any(one == other for one, other in pairwise(self.sequence)):
+            raise ValueError(f"sequence {self.sequence} turns about one axis twice in a row")
+        return self
+
+    def build(self) -> Attitude:
+        """Return the rotation body→sensor."""
+        if self.quaternion_xyzw is not None:
+            return Attitude(np.array(self.quaternion_xyzw))
+        if self.matrix is not None:
+            left, _, right = np.linalg.svd(np.array(self.matrix))
+            return Attitude.from_matrix(left @ right)
+        rotation = Attitude.identity()
+        for axis, angle in zip(self.sequence, self.euler_deg or (), strict=True):
+            turn = np.zeros(3)
+            turn[int(axis) - 1] = math.radians(angle)
+            rotation = rotation.rotated(turn)
+        return rotation
+
+
 class FixedConfig(Strict):
     """An attitude that does not change."""
 
@@ -119,6 +172,8 @@ class FixedConfig(Strict):
     """Which truth source this is."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """The attitude."""
+    mount: MountConfig | None = None
+    """Mount of the sensor: the truth is then that of the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
@@ -134,6 +189,8 @@ class RateConfig(Strict):
     """Attitude at the start."""
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
+    mount: MountConfig | None = None
+    """Mount of the sensor: the truth is then that of the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the rotation begins now."""
@@ -206,6 +263,8 @@ class SlewConfig(Strict):
     """Segments, one after the other."""
     repeat: bool = False
     """Begin again after the last segment."""
+    mount: MountConfig | None = None
+    """Mount of the sensor: the truth is then that of the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -224,6 +283,8 @@ class FileConfig(Strict):
     """Time zero of the file: the start of the run, or the time at which the source is set."""
     repeat: bool = False
     """Begin again after the last row."""
+    mount: MountConfig | None = None
+    """Mount of the sensor: the truth is then that of the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
@@ -232,7 +293,7 @@ class FileConfig(Strict):
 
 
 class LiveConfig(Strict):
-    """A feed of JSON lines in the format of `starhil.emulator.truth.live`."""
+    """A feed of JSON lines in the format of `starhil.emulator.truth.feed_message`."""
 
     kind: Literal["live"]
     """Which truth source this is."""
@@ -242,20 +303,90 @@ class LiveConfig(Strict):
     """Address to listen at."""
     port: Annotated[int, Field(ge=0, le=65535)] = 0
     """Port to listen at; 0 takes a free one, which the ready line names."""
+    convention: Literal["rotation", "attitude"] = "rotation"
+    """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42, Basilisk and most textbooks."""
+    order: Literal["xyzw", "wxyz"] = "xyzw"
+    """Where the scalar of `q` stands: last or first."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
     """Silence after which the attitude stands still and is flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
     """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds of simulation time."""
+    lockstep: bool = False
+    """Each message advances the stepped clock to its `t`, and is then answered by a line; over TCP only."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude before the first message."""
+    mount: MountConfig | None = None
+    """Mount of the sensor: the messages are then those of the body."""
+
+    @model_validator(mode="after")
+    def _answers_have_a_way_back(self) -> Self:
+        if self.lockstep and self.protocol != "tcp":
+            raise ValueError('lockstep needs protocol = "tcp", as each message is answered')
+        return self
+
+    @property
+    def socket(self) -> Socket:
+        """How the feed is reached."""
+        return "udp" if self.protocol == "udp" else "listen"
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the emulation opens its socket."""
-        return LiveTruth(self.attitude.build(), stale_s=self.stale_s, timeline=self.timeline)
+        return LiveTruth(
+            self.attitude.build(),
+            stale_s=self.stale_s,
+            timeline=self.timeline,
+            message_format=JsonFormat(self.convention, self.order),
+        )
 
+
+class Config42(Strict):
+    """The simulator 42, over its socket (`Inp_IPC.txt`, mode TX); on the stepped clock in lock-step with it."""
+
+    kind: Literal["42"]
+    """Which truth source this is."""
+    role: Literal["client", "server"] = "client"
+    """`client` connects to 42, where `Inp_IPC.txt` says SERVER; `server` listens, where it says CLIENT."""
+    host: str = "127.0.0.1"
+    """Address of 42, or to listen at."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 4242
+    """Its port; 0 listens at a free one, which the ready line names."""
+    spacecraft: Annotated[int, Field(ge=0, le=999)] = 0
+    """Number of the spacecraft, i of `SC[i]`."""
+    orbit: Annotated[int, Field(ge=0, le=999)] = 0
+    """Number of its reference orbit, i of `Orb[i]`."""
+    stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
+    """Silence after which the attitude stands still and is flagged `stale`."""
+    attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    """Attitude before the first message."""
+    mount: MountConfig | None = None
+    """Mount of the sensor in the body frame of 42."""
+
+    @model_validator(mode="after")
+    def _port_to_connect_to(self) -> Self:
+        if self.role == "client" and self.port == 0:
+            raise ValueError('port: 0 needs role = "server"; give the port of 42')
+        return self
+
+    @property
+    def socket(self) -> Socket:
+        """How the feed is reached."""
+        return "connect" if self.role == "client" else "listen"
+
+    def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
+        """Make the source; the emulation opens its socket."""
+        return LiveTruth(
+            self.attitude.build(),
+            stale_s=self.stale_s,
+            message_format=Format42(self.spacecraft, self.orbit),
+            kind=self.kind,
+        )
+
+
+FeedConfig: TypeAlias = LiveConfig | Config42
+"""A truth that comes over a socket."""
 
 TruthConfig: TypeAlias = Annotated[
-    FixedConfig | RateConfig | SlewConfig | FileConfig | LiveConfig, Field(discriminator="kind")
+    FixedConfig | RateConfig | SlewConfig | FileConfig | LiveConfig | Config42, Field(discriminator="kind")
 ]
 
 

@@ -132,7 +132,8 @@ class FeedRates:
         if self._contradicts:
             raise FeedError(
                 f"rate contradicts q, which turned by {_degrees(turned)} degrees instead of {_degrees(expected)}; "
-                "q must be ICRS to sensor as x, y, z, w (else conjugate it), rate in degrees per second in the sensor frame"
+                "q must be ICRS to body as x, y, z, w (else set truth.convention and truth.order, or conjugate it), "
+                "rate in degrees per second in the body frame"
             )
 
     def _disagree(self, turned: Vector) -> bool:

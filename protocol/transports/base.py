@@ -44,10 +44,10 @@ class Statistics:
 class Transport(ABC, Generic[Item]):
     """A port or bus in the running event loop; callbacks run in the loop's thread."""
 
-    def __init__(self, description: str) -> None:
+    def __init__(self, description: str, statistics: Statistics | None = None) -> None:
         self.description = description
         """Specification that opens the same port again; final once started."""
-        self.statistics: Final = Statistics()
+        self.statistics: Final = statistics or Statistics()
         self._on_receive: Receive[Item] | None = None
         self._on_error: ReportError | None = None
 

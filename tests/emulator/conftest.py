@@ -175,20 +175,20 @@ def run(monkeypatch, make_bench):
     pipeline = make_bench().pipeline
     monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(pipeline.handle))
 
-    def run(scenario, *, clock="stepped", options=None, **overrides):
-        profile = Profile.model_validate(
-            {
-                "run": {"clock": clock},
-                "links": {"serial": {"port": "auto"}, "can": {"channel": "off"}},
-                **overrides,
-            }
-        )
+    def run(scenario, *, clock="stepped", options=None, others=(), **overrides):
+        def profile(keys):
+            links = {"serial": {"port": "auto"}, "can": {"channel": "off"}}
+            return Profile.model_validate({"run": {"clock": clock}, "links": links, **keys})
 
         async def whole():
-            run.launched = Run(profile, options or RunOptions(control="auto"))
+            run.launched = Run(
+                profile(overrides),
+                options or RunOptions(control="auto"),
+                others=[profile(keys) for keys in others],
+            )
             try:
                 await run.launched.start()
-                line = await run.launched.emulation.ready()
+                line = await run.launched.ready()
                 return await scenario(run.launched.emulation, line)
             finally:
                 await run.launched.close()

@@ -87,7 +87,7 @@ def test_overrides_are_toml_or_text():
         ("[run]\nseed = '1'\n", "run.seed: must be a valid integer (given: '1')"),
         ("[links.can]\naddress = 255\n", "links.can.address"),
         ("[truth]\nkind = 'wobble'\n", "truth.kind: must be one of 'fixed', 'rate'"),
-        ("[truth]\nrate_deg_s = [0, 0, 1]\n", "truth.kind: must be one of 'file', 'fixed'"),
+        ("[truth]\nrate_deg_s = [0, 0, 1]\n", "truth.kind: must be one of '42', 'file', 'fixed'"),
         ("truth = 3\n", "truth: must be a"),
         ("run = 3\n", "run: must be a table (given: 3)"),
         ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: missing; give it"),
@@ -206,3 +206,8 @@ def test_a_device_in_place_of_a_profile_is_refused(tmp_path):
     path.symlink_to("/dev/zero")
     with pytest.raises(EmulatorError, match="no such file"):
         load_profile(str(path))
+
+
+@pytest.mark.parametrize("text", ["42", '"42"', "'42'"])
+def test_a_kind_that_looks_like_a_number_is_a_name(text):
+    assert load_profile("cubestar", [f"truth.kind={text}"]).truth.kind == "42"

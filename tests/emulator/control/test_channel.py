@@ -56,8 +56,8 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             for wrong, said in (
                 ({}, "truth: an object is needed, with the keys of [truth] in a profile"),
                 ({"truth": 3}, "truth: an object is needed, with the keys of [truth] in a profile"),
-                ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind"),
-                ({"truth": {}}, "truth.kind: must be one of 'file', 'fixed', 'live', 'rate', 'slew'"),
+                ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind, mount"),
+                ({"truth": {}}, "truth.kind: must be one of '42', 'file', 'fixed', 'live', 'rate', 'slew'"),
                 (
                     {"truth": {"kind": "fixed", "attitude": {"ra_deg": "x"}}},
                     "truth.attitude.ra_deg: must be a valid number (given: 'x')",

@@ -1,0 +1,234 @@
+"""The tape of a run: everything that reaches the device from outside, with its time, and everything that it sends.
+
+Between two entries the model computes alone. An entry is what makes it compute: input on a link, an event
+that is due, a reply of the pipeline, a message of a feed, a command on the control channel, a write that has
+ended. While an entry is processed the clock stands still, so that a run on the real clock can be repeated on
+the stepped clock to the byte.
+
+A recording is a folder: `run.json` (profile and version), `events.jsonl` (entries and output, one JSON
+object per line, in order), `truth.csv` (truth log), and what else the run needed: `scenario.json`, `state/`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar
+
+from starhil.emulator.clock import Clock
+from starhil.emulator.device.device import Background
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.transports.base import Receive, ReportError, Transport
+from starhil.protocol.transports.paced import SerialTransport
+
+Item = TypeVar("Item", bytes, CanFrame)
+Done = Callable[[EmulatorError | None], None]
+
+RUN_FILE: Final = "run.json"
+EVENTS_FILE: Final = "events.jsonl"
+TRUTH_FILE: Final = "truth.csv"
+SCENARIO_FILE: Final = "scenario.json"
+STATE_FOLDER: Final = "state"
+
+
+class Tape(Protocol):
+    """What stands between an emulation and the outside: a recorder, or a player."""
+
+    @property
+    def plays(self) -> bool:
+        """Whether nothing outside is opened, as a recording is played."""
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the model."""
+
+    def latch(self) -> None:
+        """Let the clock show the present time."""
+
+    def write(self, kind: str, **values: Any) -> None:
+        """Note an entry at the time that the clock shows."""
+
+    def enter(self, kind: str, **values: Any) -> None:
+        """Let the clock show the present time, and note an entry."""
+
+    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
+        """Return the transport of the serial line."""
+
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:
+        """Return the transport of a CAN link."""
+
+    def imager(self, inner: Imager) -> Imager:
+        """Return the pipeline as the device sees it."""
+
+    def background(self, inner: Background) -> Background:
+        """Return what runs slow writes."""
+
+
+class LatchedClock:
+    """A clock that stands still while an entry is processed.
+
+    Parameters
+    ----------
+    source
+        The clock that passes.
+    """
+
+    def __init__(self, source: Clock) -> None:
+        self.source = source
+        self.name = source.name
+        self.speed = source.speed
+        self._now_ns = 0
+
+    def now_ns(self) -> int:
+        """Return the time of the last entry, nanoseconds."""
+        return self._now_ns
+
+    def latch(self) -> None:
+        """Show the present time from now on."""
+        self._now_ns = self.source.now_ns()
+
+
+def as_json(item: bytes | CanFrame) -> Any:
+    """Return an item of a link as JSON."""
+    if isinstance(item, CanFrame):
+        return [item.id, item.data.hex(), item.extended, item.remote]
+    return item.hex()
+
+
+def from_json(value: Any) -> bytes | CanFrame:
+    """Return the item of a link that `as_json` has written."""
+    if isinstance(value, str):
+        return bytes.fromhex(value)
+    number, data, extended, remote = value
+    return CanFrame(number, bytes.fromhex(data), extended, remote)
+
+
+class Recorder:
+    """Writes the tape of a run.
+
+    Parameters
+    ----------
+    folder
+        Folder of the recording; it exists.
+    clock
+        Clock of the run: stepped, or one that passes by itself.
+    """
+
+    plays: Final = False
+
+    def __init__(self, folder: Path, clock: Clock) -> None:
+        self._latched = LatchedClock(clock) if clock.speed > 0.0 else None
+        self.clock: Clock = self._latched or clock
+        self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8", buffering=1)
+
+    def latch(self) -> None:
+        """Let the clock show the present time."""
+        if self._latched is not None:
+            self._latched.latch()
+
+    def enter(self, kind: str, **values: Any) -> None:
+        """Let the clock show the present time, and write an entry."""
+        self.latch()
+        self.write(kind, **values)
+
+    def write(self, kind: str, **values: Any) -> None:
+        """Write a line at the time that the clock shows."""
+        if not self._file.closed:
+            self._file.write(json.dumps({"ns": self.clock.now_ns(), "do": kind, **values}) + "\n")
+
+    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
+        """Return the transport of the serial line, which is written down."""
+        return _RecordedSerial(make(), self)
+
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:
+        """Return the transport of a CAN link, which is written down."""
+        return _RecordedTransport(make(), name, self)
+
+    def imager(self, inner: Imager) -> Imager:
+        """Return a pipeline whose replies are entries."""
+        return _RecordedImager(inner, self)
+
+    def background(self, inner: Background) -> Background:
+        """Make the end of a write an entry, unless it ends at once, as on the stepped clock."""
+        if self._latched is None:
+            return inner
+
+        def background(work: Callable[[], None], done: Done) -> None:
+            def ended(error: EmulatorError | None) -> None:
+                self.enter("stored")
+                done(error)
+
+            inner(work, ended)
+
+        return background
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class _RecordedTransport(Transport[Item]):
+    """A transport whose input and output are written down."""
+
+    def __init__(self, inner: Transport[Item], name: str, recorder: Recorder) -> None:
+        super().__init__(inner.description, inner.statistics)
+        self._inner: Transport[Item] = inner
+        self._name = name
+        self._recorder = recorder
+
+    async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
+        def received(item: Item) -> None:
+            self._recorder.enter("in", link=self._name, data=as_json(item))
+            on_receive(item)
+
+        await self._inner.start(received, on_error)
+        self.description = self._inner.description
+
+    async def _open(self) -> None:
+        """Do nothing: `start` opens the inner transport."""
+
+    def send(self, item: Item) -> bool:
+        self._recorder.write("out", link=self._name, data=as_json(item))
+        return self._inner.send(item)
+
+    async def drain(self) -> None:
+        await self._inner.drain()
+
+    async def close(self) -> None:
+        await self._inner.close()
+
+
+class _RecordedSerial(_RecordedTransport[bytes], SerialTransport):
+    """A serial line whose bytes are written down."""
+
+    def __init__(self, inner: SerialTransport, recorder: Recorder) -> None:
+        super().__init__(inner, "serial", recorder)
+        self._port = inner
+
+    def set_baud(self, baud: int) -> None:
+        self._port.set_baud(baud)
+
+
+class _RecordedImager:
+    """A pipeline whose replies are entries."""
+
+    def __init__(self, inner: Imager, recorder: Recorder) -> None:
+        self._inner = inner
+        self._recorder = recorder
+
+    @property
+    def pending(self) -> int:
+        return self._inner.pending
+
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
+        def arrived(reply: PipelineReply) -> None:
+            self._recorder.enter("reply")
+            done(reply)
+
+        self._inner.submit(request, arrived)
+
+    async def settle(self) -> None:
+        await self._inner.settle()

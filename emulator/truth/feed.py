@@ -1,0 +1,166 @@
+"""The sockets of a live feed: UDP, or TCP to which the simulator connects or which connects to it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Final, Literal
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.json_lines import read_lines
+from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.lock_step import LockStep, Step
+from starhil.protocol.errors import reason
+
+log = logging.getLogger("starhil.truth")
+
+RETRY_S: Final = 0.5
+"""Pause between attempts to connect to a simulator, seconds."""
+
+Socket = Literal["udp", "listen", "connect"]
+
+
+class _Datagrams(asyncio.DatagramProtocol):
+    """Passes each line of each datagram to the feed."""
+
+    def __init__(self, feed: LiveFeed) -> None:
+        self._feed = feed
+
+    def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
+        """Process a datagram."""
+        for line in data.splitlines():
+            if line.strip():
+                self._feed.receive(line)
+
+
+class LiveFeed:
+    """The socket between a dynamics simulator and a `LiveTruth`.
+
+    Parameters
+    ----------
+    truth
+        Receives the messages.
+    now_s
+        Returns the simulation time in seconds.
+    step
+        Advances the simulation clock, for lock-step; None if time passes by itself.
+    on_message
+        Called with each message before it is processed.
+    """
+
+    def __init__(
+        self,
+        truth: LiveTruth,
+        now_s: Callable[[], float],
+        step: Step | None = None,
+        on_message: Callable[[bytes], None] | None = None,
+    ) -> None:
+        self.truth = truth
+        self._on_message = on_message
+        self._now_s = now_s
+        self._lock_step = None if step is None else LockStep(truth, now_s, step)
+        self._transport: asyncio.DatagramTransport | None = None
+        self._server: asyncio.Server | None = None
+        self._client: asyncio.Task[None] | None = None
+        self._writers: set[asyncio.StreamWriter] = set()
+
+    async def start(self, socket: Socket, host: str, port: int) -> str:
+        """Listen, or begin to connect; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
+
+        Raises
+        ------
+        EmulatorError
+            The address is not available to listen at.
+        """
+        if socket == "connect":
+            self._client = asyncio.create_task(self._keep_connected(host, port))
+            return f"tcp:{host}:{port}"
+        loop = asyncio.get_running_loop()
+        protocol = "udp" if socket == "udp" else "tcp"
+        try:
+            if socket == "udp":
+                transport, _ = await loop.create_datagram_endpoint(
+                    lambda: _Datagrams(self), local_addr=(host, port)
+                )
+                self._transport = transport
+                address = transport.get_extra_info("sockname")
+            else:
+                self._server = await asyncio.start_server(
+                    self._serve, host, port, limit=self.truth.format.max_size
+                )
+                address = self._server.sockets[0].getsockname()
+        except (OSError, ValueError) as error:  # ValueError: not a valid host name
+            raise EmulatorError(
+                f"truth feed {protocol}:{host}:{port}: cannot listen ({reason(error)}); choose another port, or 0"
+            ) from None
+        return f"{protocol}:{address[0]}:{address[1]}"
+
+    def receive(self, data: bytes) -> None:
+        """Process one message received now."""
+        self._message_received(data)
+        self.truth.receive(data, self._now_s())
+
+    async def process(self, data: bytes) -> str:
+        """Process one message, in lock-step if that is wanted; return the fault of one rejected in lock-step."""
+        if self._lock_step is None:
+            self.receive(data)
+            return ""
+        self._message_received(data)
+        return await self._lock_step.receive(data)
+
+    def _message_received(self, data: bytes) -> None:
+        if self._on_message is not None:
+            self._on_message(data)
+
+    async def _keep_connected(self, host: str, port: int) -> None:
+        """Connect to a simulator that listens, again whenever it is gone."""
+        reported = False
+        while True:
+            try:
+                reader, writer = await asyncio.open_connection(host, port, limit=self.truth.format.max_size)
+            except (OSError, ValueError) as error:
+                if not reported:  # once, not at every attempt
+                    log.warning(
+                        "truth feed tcp:%s:%d: no connection (%s); still trying", host, port, reason(error)
+                    )
+                reported = True
+            else:
+                reported = False
+                await self._serve(reader, writer)
+            await asyncio.sleep(RETRY_S)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        try:
+            async for data in read_lines(reader, self.truth.format.end):
+                if data is None:
+                    self.truth.reject(f"message longer than {self.truth.format.max_size} bytes")
+                elif data.strip():
+                    await self._answer(data, writer)
+        except ConnectionError:
+            self.truth.reject("connection broken")
+        finally:
+            self._writers.discard(writer)
+            writer.close()
+
+    async def _answer(self, data: bytes, writer: asyncio.StreamWriter) -> None:
+        """Process one message from a connection, and answer it if its sender waits for that."""
+        fault = await self.process(data)
+        if self._lock_step is not None or self.truth.format.always_answers:
+            writer.write(self.truth.format.answer(self._now_s(), fault))
+            await writer.drain()
+
+    def close(self) -> None:
+        """Stop listening and connecting."""
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        if self._client is not None:
+            self._client.cancel()
+            self._client = None
+        for writer in list(self._writers):
+            writer.transport.abort()

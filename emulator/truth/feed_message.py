@@ -1,0 +1,191 @@
+"""Messages of a live feed, and their form as JSON lines.
+
+::
+
+    {"t": 12.25, "q": [0.0, 0.0, 0.0, 1.0], "rate": [0.0, 0.3, 0.0]}
+
+``t``
+    Seconds on the sender's clock, increasing. Optional; default: time of receipt.
+``q``
+    Quaternion between ICRS and body, of length 1 within 1 %. With ``convention = "rotation"`` it rotates
+    vectors (v_body = q ⊗ v_icrs ⊗ q*), with ``"attitude"`` it is the conjugate, as the attitude quaternions of
+    42, Basilisk and most textbooks. ``order`` is ``"xyzw"`` (scalar last) or ``"wxyz"``.
+``rate``
+    Body rate in the body frame, degrees per second, at most `MAX_RATE_DEG_S` per axis. Optional;
+    default: derived from the last two messages, or without ``t`` from messages at least
+    `starhil.emulator.truth.feed_rates.RECEIPT_BASELINE_S` apart.
+``position_m``, ``velocity_m_s``
+    Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, both
+    or none.
+``unix_s``
+    Date, as Unix time. Optional; default: that of the run.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol
+
+import numpy as np
+
+from starhil.emulator.json_lines import RepeatedKeyError, parse_json
+from starhil.emulator.truth.feed_rates import FeedError
+from starhil.emulator.truth.orbit import OrbitState
+from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
+from starid.attitude import Attitude
+
+NORM_TOLERANCE: Final = 0.01
+"""Largest error of a quaternion's length that is attributed to rounding."""
+
+KEYS: Final = ("t", "q", "rate", "position_m", "velocity_m_s", "unix_s")
+
+Convention = Literal["rotation", "attitude"]
+Order = Literal["xyzw", "wxyz"]
+
+
+@dataclass(frozen=True)
+class FeedMessage:
+    """A decoded message.
+
+    Attributes
+    ----------
+    t
+        Seconds on the sender's clock, or None.
+    attitude
+        ICRS→body.
+    rate_rad_s
+        Body rate (3,), rad/s, body frame, or None.
+    orbit
+        Position and velocity, GCRS, or None.
+    unix_s
+        Date as Unix time, or None.
+    """
+
+    t: float | None
+    attitude: Attitude
+    rate_rad_s: Vector | None = None
+    orbit: OrbitState | None = None
+    unix_s: float | None = None
+
+
+class FeedFormat(Protocol):
+    """How the messages of a feed are written, and answered in lock-step."""
+
+    @property
+    def end(self) -> bytes:
+        """Bytes that end a message in a stream."""
+
+    @property
+    def max_size(self) -> int:
+        """Longest accepted message, bytes."""
+
+    def decode(self, data: bytes | str) -> FeedMessage:
+        """Decode one message.
+
+        Raises
+        ------
+        FeedError
+            It is not valid; the text names the key.
+        """
+
+    def answer(self, run_time_s: float, fault: str) -> bytes:
+        """Return the answer to a message; `fault` is empty if it was accepted."""
+
+    @property
+    def always_answers(self) -> bool:
+        """Whether the sender waits for an answer without lock-step too."""
+
+
+@dataclass(frozen=True)
+class JsonFormat:
+    """JSON objects, one per line; see the module."""
+
+    convention: Convention = "rotation"
+    order: Order = "xyzw"
+    end: bytes = b"\n"
+    max_size: int = 4096
+    always_answers: bool = False
+
+    def decode(self, data: bytes | str) -> FeedMessage:
+        """Decode one line."""
+        try:
+            message: Any = parse_json(data)
+        except RepeatedKeyError as error:
+            raise FeedError(str(error)) from None
+        except (ValueError, RecursionError):
+            raise FeedError("not a JSON line") from None
+        if not isinstance(message, dict):
+            raise FeedError("not a JSON object")
+        unknown = sorted(set(message) - set(KEYS))
+        if unknown:
+            raise FeedError(f"unknown key {unknown[0]!r}; known: {', '.join(KEYS)}")
+        if "q" not in message:
+            raise FeedError("q is missing")
+        quaternion = _numbers("q", message["q"], 4)
+        if self.order == "wxyz":
+            quaternion = np.roll(quaternion, -1)
+        rate = _optional(message, "rate", 3)
+        t, unix_s = (_optional_number(message, key) for key in ("t", "unix_s"))
+        position, velocity = (_optional(message, key, 3) for key in ("position_m", "velocity_m_s"))
+        if (position is None) != (velocity is None):
+            raise FeedError("position_m and velocity_m_s: give both or none")
+        return FeedMessage(
+            t,
+            checked_attitude("q", quaternion, self.convention),
+            checked_rate("rate", None if rate is None else np.radians(rate)),
+            None if position is None or velocity is None else OrbitState(position, velocity),
+            unix_s,
+        )
+
+    def answer(self, run_time_s: float, fault: str) -> bytes:
+        """Return a line: `ok`, the simulation time, and the fault of a rejected message."""
+        body = {"ok": not fault, "run_time_s": run_time_s, **({"error": fault} if fault else {})}
+        return json.dumps(body).encode() + b"\n"
+
+
+def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) -> Attitude:
+    """Return the attitude of a scalar-last quaternion (4,).
+
+    Raises
+    ------
+    FeedError
+        It is not of length 1.
+    """
+    if not abs(float(np.linalg.norm(quaternion_xyzw)) - 1.0) <= NORM_TOLERANCE:
+        raise FeedError(f"{key} is not of length 1")
+    if convention == "attitude":
+        quaternion_xyzw = quaternion_xyzw * [-1.0, -1.0, -1.0, 1.0]
+    return Attitude(quaternion_xyzw)
+
+
+def checked_rate(key: str, rate_rad_s: Vector | None) -> Vector | None:
+    """Return a body rate in rad/s.
+
+    Raises
+    ------
+    FeedError
+        It is above `MAX_RATE_DEG_S`.
+    """
+    if rate_rad_s is not None and not np.degrees(np.abs(rate_rad_s).max()) <= MAX_RATE_DEG_S * (1.0 + 1e-12):
+        raise FeedError(f"{key} exceeds {MAX_RATE_DEG_S:g} degrees per second")
+    return rate_rad_s
+
+
+def _optional(message: dict[str, Any], key: str, count: int) -> Vector | None:
+    value = message.get(key)
+    return None if value is None else _numbers(key, value, count)
+
+
+def _optional_number(message: dict[str, Any], key: str) -> float | None:
+    value = message.get(key)
+    return None if value is None else float(_numbers(key, [value], 1)[0])
+
+
+def _numbers(key: str, value: object, count: int) -> Vector:
+    if not isinstance(value, list) or len(value) != count:
+        raise FeedError(f"{key} is not {count} numbers")
+    for number in value:
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) < 1e15:
+            raise FeedError(f"{key} holds {number!r}, not a finite number")
+    return np.array(value, dtype=np.float64)

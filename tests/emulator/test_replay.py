@@ -1,0 +1,179 @@
+"""A recorded run, played again on the stepped clock, sends and measures the same to the byte."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+
+import pytest
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.launch import RunOptions
+from starhil.emulator.replay import replay
+from starhil.emulator.tape import EVENTS_FILE, RUN_FILE
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from tests.emulator.runs import Control
+from tests.emulator.truth.simulators import Stub42, blocks_of_42
+
+PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
+WITHIN_S = 60.0
+
+
+@pytest.fixture
+def record(run, tmp_path):
+    """Record a run with a scenario; return the folder."""
+
+    def record(scenario, *, script="", **keys):
+        folder = tmp_path / "recorded"
+        options = RunOptions(control="auto", record=folder, scenario=script)
+        run(scenario, options=options, parameters=PARAMETERS, **keys)
+        return folder
+
+    return record
+
+
+def report_of(folder):
+    return asyncio.run(replay(folder))
+
+
+async def talk(emulation, frames):
+    """Command and read the device over its serial line, as an OBC does, for some frames."""
+    client = AsyncObcClient(SerialHostLink(emulation.ready_fields["serial"]))
+    await client.start()
+    await client.set_parameter("exposure", 80)
+    await client.command("save_parameters")
+    async with asyncio.timeout(WITHIN_S):
+        while emulation.device.cycle.published < frames:
+            if emulation.stepper is not None:
+                await emulation.stepper.step(0.05)
+            for name in ("precise_attitude", "identification", "device_status"):
+                await client.telemetry(name)
+            await asyncio.sleep(0.01)
+    await client.close()
+
+
+async def talk_over_a_bad_wire(emulation):
+    """Read telemetry of which some does not arrive whole."""
+    client = AsyncObcClient(SerialHostLink(emulation.ready_fields["serial"]), timeout_s=0.1)
+    await client.start()
+    for _ in range(10):
+        with contextlib.suppress(BenchError):
+            await client.telemetry("precise_attitude")
+    await client.close()
+
+
+@pytest.mark.parametrize("clock", ["real", "scaled:3", "stepped"])
+def test_a_run_is_repeated_to_the_byte(record, clock, tmp_path):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+        async with Control(emulation) as control:
+            await control.do("fault", serial={"corrupt": 0.2}, optical={"false_stars": 3})
+            await control.do("set_truth", truth={"kind": "rate", "rate_deg_s": [0.1, 0.2, 0.3]})
+            await control.do("status")
+        await talk_over_a_bad_wire(emulation)
+        async with Control(emulation) as control:
+            await control.do("clear_faults")
+        await talk(emulation, 8)
+
+    state = tmp_path / "state"
+    folder = record(scenario, clock=clock, run={"clock": clock, "state_dir": str(state)})
+    assert state.is_dir()
+    report = report_of(folder)
+    assert report.differences == []
+    assert report.sent["serial"] > 1000
+    assert (folder / "truth.csv").read_text().count("\n") >= 9
+
+
+def test_can_frames_and_canopen_are_repeated(record):
+    bus = "virtual:recorded"
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(CanHostLink(bus))
+        await client.start()
+        async with asyncio.timeout(WITHIN_S):
+            while emulation.device.cycle.published < 4:
+                await client.telemetry("precise_attitude")
+                await asyncio.sleep(0.02)
+        await client.close()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": bus}, "canopen": {"node": 5}}
+    report = report_of(record(scenario, clock="real", links=links))
+    assert report.differences == []
+    assert report.sent["can"] > 8
+    assert report.sent["canopen"] >= 1
+
+
+@pytest.mark.parametrize("clock", ["real", "stepped"])
+def test_a_simulator_is_not_needed_for_the_replay(record, clock):
+    async def scenario(emulation, _line):
+        await Stub42(blocks_of_42(31)).connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
+        async with asyncio.timeout(WITHIN_S):
+            while emulation.device.cycle.published < 3:
+                await asyncio.sleep(0.02)
+
+    folder = record(scenario, clock=clock, truth={"kind": "42", "role": "server", "port": 0})
+    assert report_of(folder).differences == []
+    assert "0.279" in (folder / "truth.csv").read_text()
+
+
+def test_a_scenario_is_part_of_the_recording(record, tmp_path):
+    path = tmp_path / "scenario.toml"
+    path.write_text('[[at]]\nrun_time_s = 0.5\ntruth = { kind = "rate", rate_deg_s = [0.0, 0.5, 0.0] }\n')
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 4)
+
+    folder = record(scenario, script=str(path))
+    path.unlink()
+    report = report_of(folder)
+    assert report.differences == []
+    assert "0.5" in (folder / "truth.csv").read_text()
+
+
+def test_a_changed_device_is_found(record):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    run_file = folder / RUN_FILE
+    run = json.loads(run_file.read_text())
+    run["profile"]["device"]["firmware_minor"] = 9
+    run_file.write_text(json.dumps(run))
+    (difference,) = report_of(folder).differences
+    assert difference.startswith("serial: differs")
+
+
+def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_is_played_to_there(record):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    events = folder / EVENTS_FILE
+    text = events.read_text()
+    cut = text.index("\n", len(text) // 2)
+    while '"do": "out"' not in text[:cut].rpartition("\n")[2]:
+        cut = text.index("\n", cut + 1)
+    events.write_text(text[: cut + 1] + text[cut + 1 : cut + 9])
+    (folder / "truth.csv").unlink()
+    report = report_of(folder)
+    assert 0 < report.entries < text.count("\n")
+    assert report.differences == []
+
+
+@pytest.mark.parametrize("content", [None, "{}", '{"profile": {"x": 1}, "folder": "."}'])
+def test_a_folder_that_is_no_recording_is_named(tmp_path, content):
+    if content is not None:
+        (tmp_path / RUN_FILE).write_text(content)
+    with pytest.raises(EmulatorError, match=f"replay {os.fspath(tmp_path)}"):
+        report_of(tmp_path)
+
+
+def test_a_folder_with_files_is_not_recorded_to(record, tmp_path):
+    (tmp_path / "recorded").mkdir()
+    (tmp_path / "recorded" / "notes.txt").write_text("x")
+    with pytest.raises(EmulatorError, match="not empty"):
+        record(None)

@@ -1,0 +1,136 @@
+"""The examples of docs/simulators.md, run as they stand there."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.private_can_bus import PrivateCanBus
+from tests.emulator.truth.simulators import blocks_of_42
+
+pytestmark = pytest.mark.process
+
+PAGE = (Path(__file__).parents[2] / "docs" / "simulators.md").read_text(encoding="utf-8")
+FILES = {
+    match[2]: match[1]
+    for match in re.finditer(r"^```(?:python|toml)\n(# (\S+)\n.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+}
+WITHIN_S = 300.0
+PNG = b"\x89PNG\r\n\x1a\n"
+
+needs_basilisk = pytest.mark.skipif(
+    importlib.util.find_spec("Basilisk") is None,
+    reason="Basilisk is not installed; pip install 'starhil[basilisk]'",
+)
+
+
+def write_files(folder: Path, *names: str, **instead: str) -> None:
+    """Write the files of the page, with the addresses of this run."""
+    for name in names:
+        text = FILES[name]
+        for shown, actual in instead.items():
+            text = text.replace({"serial": "/tmp/startracker", "port": "5500", "control": "/tmp/startracker-control",
+                                 "can": "socketcand:127.0.0.1:29536/vcan0"}[shown], actual)  # fmt: skip
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def printed(folder: Path, *command: str) -> dict[str, list[float]]:
+    """Run a program; return the numbers that it prints by the text before them."""
+    done = subprocess.run(
+        [sys.executable, *command], cwd=folder, capture_output=True, text=True, timeout=WITHIN_S,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    lines = [re.match(r"(\D+?):? *([-\d].*|\[.*)$", line) for line in done.stdout.splitlines()]
+    return {
+        line[1]: [float(number) for number in re.findall(r"\d+(?:\.\d+)?", line[2])] for line in lines if line
+    }
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]
+
+
+@needs_basilisk
+@pytest.mark.parametrize(("motion", "seconds"), [("tumble", 120), ("pointing", 15)])
+def test_basilisk_in_lock_step(motion, seconds, tmp_path):
+    port = str(free_port())
+    write_files(tmp_path, "basilisk.toml", port=port)
+    command = emulator_command(profile=str(tmp_path / "basilisk.toml"))
+    with EmulatorProcess(command) as emulator:
+        write_files(tmp_path, "orbit.py", port=port, serial=emulator.ready["serial"])
+        figures = printed(tmp_path, "orbit.py", motion, str(seconds))
+    assert figures["attitudes read"][0] > seconds - 4
+    assert figures["largest error of the rate"][0] < 0.01
+    assert figures["within"][1] >= 99.7
+    assert (tmp_path / f"{motion}.png").read_bytes().startswith(PNG)
+
+
+@needs_basilisk
+def test_a_basilisk_feed_that_nobody_listens_to_is_named():
+    from starhil.basilisk import StarTrackerFeed, StarTrackerFeedError
+
+    with pytest.raises(StarTrackerFeedError, match="no emulator"):
+        StarTrackerFeed(f"tcp:127.0.0.1:{free_port()}")
+    with pytest.raises(StarTrackerFeedError, match="must be udp:HOST:PORT"):
+        StarTrackerFeed("127.0.0.1:5500")
+
+
+def send_as_42(server: socket.socket, blocks: list[bytes]) -> None:
+    """Send the blocks as 42 does, each after the acknowledge of the one before."""
+    connection, _ = server.accept()
+    connection.settimeout(WITHIN_S)
+    with connection:
+        for block in blocks:
+            connection.sendall(block)
+            acknowledge = connection.recv(4, socket.MSG_WAITALL)
+            if acknowledge != b"Ack\0":
+                return
+
+
+def test_42_in_lock_step(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(WITHIN_S)
+        command = emulator_command(
+            settings=["truth.kind=42", f"truth.port={server.getsockname()[1]}", "parameters.start_mode=lost_in_space"],
+            truth_log=tmp_path / "truth.csv",
+            extra=["--clock", "stepped"],
+        )  # fmt: skip
+        with EmulatorProcess(command) as emulator:
+            write_files(tmp_path, "obc.py", serial=emulator.ready["serial"])
+            simulator = threading.Thread(target=send_as_42, args=(server, blocks_of_42(201)), daemon=True)
+            simulator.start()
+            figures = printed(tmp_path, "obc.py")
+            simulator.join(WITHIN_S)
+            assert not simulator.is_alive()
+    assert len((tmp_path / "truth.csv").read_text().splitlines()) == 21
+    assert figures["attitudes read"][0] >= 1
+    assert figures["largest error of the attitude"][0] < 20.0
+    assert figures["largest error of the rate"][0] < 0.01
+    assert (tmp_path / "42.png").read_bytes().startswith(PNG)
+
+
+def test_two_heads_on_one_bus(tmp_path):
+    write_files(tmp_path, "first.toml", "second.toml")
+    control = tmp_path / "control"
+    heads = ["--head", str(tmp_path / "first.toml"), "--head", str(tmp_path / "second.toml")]
+    with PrivateCanBus() as bus:
+        command = emulator_command(serial="off", can=bus, extra=[*heads, "--control", f"unix:{control}"])
+        with EmulatorProcess(command) as emulator:
+            assert emulator.ready["can.2"] == emulator.ready["can"] == bus
+            assert emulator.ready["seed.2"] != emulator.ready["seed"]
+            write_files(tmp_path, "heads.py", can=bus, control=str(control))
+            figures = printed(tmp_path, "heads.py")
+    assert figures["attitudes read"] == [30.0, 30.0]
+    assert figures["the two heads agree on the body within"][0] < 20.0
+    assert (tmp_path / "heads.png").read_bytes().startswith(PNG)
