@@ -16,8 +16,10 @@ from starid.photograph.typical_camera import FIELD_STEP
 from starid.photograph.views import Counts, views
 from starid.solution import Reason
 
-FIELDS_DEG: Final = tuple(FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21))
-"""Widths of the square fields tried, each within `TOLERANCE`: 5° to 46°, the middle ones first."""
+FIELDS_DEG: Final = tuple(
+    FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21, 22, 23)
+)
+"""Widths of the square fields tried, each within `TOLERANCE`: 5° to 66°, the common ones first."""
 
 TOLERANCE: Final = 0.1
 
