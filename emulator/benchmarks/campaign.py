@@ -214,6 +214,7 @@ class FrameMaker:
         from starid.camera import Camera
         from starid.catalog import load_catalog
         from starid.interface import make_identifier
+        from starid.photograph.field_sweep import FieldSweep
 
         self.plan = plan
         sensor = SensorModel() if plan.sky == "clear" else HARD_SENSOR
@@ -224,6 +225,8 @@ class FrameMaker:
             options["zero_point"] = 2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s)
         self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera, **options)
         self.settings = sensor.detection_settings()
+        size = (self.camera.width, self.camera.height)
+        self.sweep = FieldSweep(*size, self.identifier.catalog) if plan.unknown_field else None
 
     def solve(self, frame: int) -> tuple[Any, ...]:
         """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
@@ -265,11 +268,10 @@ class FrameMaker:
     def _identified(self, image: npt.NDArray[Any]) -> tuple[Solution, int, float]:
         """Return the solution of an image, the number of detections, and the time when they were known."""
         from starid.imaging.detection import detect
-        from starid.photograph.field_sweep import solve_any_field
 
-        if self.plan.unknown_field:
+        if self.sweep is not None:
             begun = time.perf_counter()
-            result = solve_any_field(image, self.identifier.catalog, settings=self.settings)
+            result = self.sweep.solve(image, self.settings)
             return result.solution, len(result.detections.flux), begun
         found = detect(image, self.settings)
         detected = time.perf_counter()
