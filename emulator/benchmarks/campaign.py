@@ -78,6 +78,8 @@ class CampaignPlan:
         (`starhil.emulator.benchmarks.hard_sky`).
     algorithm : star identification algorithm, as in a device profile.
     chunk : frames per chunk, the unit of work and of resumption.
+    unknown_field : the field of view is not known to the identification, which searches for it as
+        `starhil identify --fov auto` does; the time for detection is part of that of identification.
     """
 
     frames: int
@@ -88,6 +90,7 @@ class CampaignPlan:
     algorithm: str = "geometric"
     chunk: int = 50
     sky: str = "clear"
+    unknown_field: bool = False
 
     def __post_init__(self) -> None:
         if self.frames < 1:
@@ -96,6 +99,10 @@ class CampaignPlan:
             raise EmulatorError(f"campaign: blocked is {self.blocked}: give a share from 0 to 0.9")
         if self.sky not in ("clear", "hard"):
             raise EmulatorError(f"campaign: sky is {self.sky!r}: give clear or hard")
+        if self.unknown_field and self.algorithm != "geometric":
+            raise EmulatorError(
+                f"campaign: algorithm is {self.algorithm!r}: only geometric identifies with an unknown field"
+            )
 
     @property
     def chunks(self) -> int:
@@ -207,6 +214,7 @@ class FrameMaker:
         from starid.camera import Camera
         from starid.catalog import load_catalog
         from starid.interface import make_identifier
+        from starid.photograph.field_sweep import FieldSweep
 
         self.plan = plan
         sensor = SensorModel() if plan.sky == "clear" else HARD_SENSOR
@@ -217,11 +225,12 @@ class FrameMaker:
             options["zero_point"] = 2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s)
         self.identifier: StarIdentifier = make_identifier(plan.algorithm, self.camera, **options)
         self.settings = sensor.detection_settings()
+        size = (self.camera.width, self.camera.height)
+        self.sweep = FieldSweep(*size, self.identifier.catalog) if plan.unknown_field else None
 
     def solve(self, frame: int) -> tuple[Any, ...]:
         """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
         from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, hard_sky
-        from starid.imaging.detection import detect
 
         rng = np.random.default_rng((self.plan.seed, frame))
         truth = random_attitude(rng)
@@ -235,9 +244,7 @@ class FrameMaker:
         exposure = self.renderer.render(truth, rate, frame, objects=objects)
         image = block_side(exposure.image, self.plan.blocked, rng)
         rendered = time.perf_counter()
-        found = detect(image, self.settings)
-        detected = time.perf_counter()
-        answer = self.identifier.identify(found.xy_px, found.flux, found.sigma_px)
+        answer, count, detected = self._identified(image)
         identified = time.perf_counter()
         cross, roll, squared = error_of(answer, truth)
         return (
@@ -251,12 +258,24 @@ class FrameMaker:
             cross,
             roll,
             squared,
-            len(found.flux),
+            count,
             len(answer.detection_index),
             1e3 * (rendered - start),
             1e3 * (detected - rendered),
             1e3 * (identified - detected),
         )
+
+    def _identified(self, image: npt.NDArray[Any]) -> tuple[Solution, int, float]:
+        """Return the solution of an image, the number of detections, and the time when they were known."""
+        from starid.imaging.detection import detect
+
+        if self.sweep is not None:
+            begun = time.perf_counter()
+            result = self.sweep.solve(image, self.settings)
+            return result.solution, len(result.detections.flux), begun
+        found = detect(image, self.settings)
+        detected = time.perf_counter()
+        return self.identifier.identify(found.xy_px, found.flux, found.sigma_px), len(found.flux), detected
 
 
 def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:

@@ -50,29 +50,57 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "dense, V ≤ 7.8, 0.5": SceneSettings(7.8, 0.5),
     "tracking, 3 stars": SceneSettings(5.5, 0.5, kept=3),
     "tracking, 2 stars": SceneSettings(5.5, 0.5, kept=2),
+    "tracking, 2 stars, 0.05": SceneSettings(5.5, 0.05, kept=2),
+    "tracking, 1 star, 2 false": SceneSettings(5.5, 0.5, kept=1, false_stars=2),
+    "tracking, 1 star, 1 false, 0.05": SceneSettings(5.5, 0.05, kept=1, false_stars=1),
+    "dense, mirrored sky": SceneSettings(8.0, 0.5, mirrored=True),
+    "1000–1500 random points": SceneSettings(5.5, random_points=(1000, 1500)),
+    "12°, V ≤ 6, exact": SceneSettings(6.0, 0.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, 2": SceneSettings(6.0, 2.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, 3": SceneSettings(6.0, 3.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, 2, 0.3 mag": SceneSettings(6.0, 2.0, magnitude_noise=0.3),
+    "8°, V ≤ 7.5, 1, 0.4 mag": SceneSettings(7.5, 1.0, magnitude_noise=0.4),
 }
 """Row of the table → scene: "σ px, false, missing" of stars to V 5.5 in 42° where nothing else is said."""
 
-FIELD_DEG: Final = {"8°, V ≤ 7.5, 0.5": 8.0, "20°, V ≤ 6.5, 0.5": 20.0, "62°, V ≤ 5, 0.5": 62.0}
-"""Fields that differ from that of the camera given."""
+PAPERS: Final = tuple(ROWS)[-5:]
+"""Scenes of the sensors that the papers of the published algorithms simulate."""
 
-TRACKED: Final = ("tracking, 3 stars", "tracking, 2 stars")
-"""Rows in which a solver that tracks is given an attitude a few pixels off."""
+FIELDS: Final[dict[str, tuple[float, int | None]]] = {
+    "8°, V ≤ 7.5, 0.5": (8.0, None),
+    "20°, V ≤ 6.5, 0.5": (20.0, None),
+    "62°, V ≤ 5, 0.5": (62.0, None),
+    **dict.fromkeys(PAPERS[:4], (12.0, 1024)),
+    PAPERS[4]: (8.0, 512),
+}
+"""Width in degrees, and side in pixels where that differs too, of fields that are not that of the camera given."""
+
+TRACKED: Final = {
+    "tracking, 3 stars": 3.0,
+    "tracking, 2 stars": 3.0,
+    "tracking, 2 stars, 0.05": 0.3,
+    "tracking, 1 star, 2 false": 3.0,
+    "tracking, 1 star, 1 false, 0.05": 0.3,
+}
+"""Rows in which a solver that tracks is given a predicted attitude → its error, one sigma about each axis, in pixels at the
+centre of the field."""
+
+WINDOW_SIGMAS: Final = 20.0 / 3.0
+"""Largest distance of a star from its predicted position that such a solver is given, in those errors."""
 
 STANDARD: Final = tuple(ROWS)[:9]
 """Rows of the published comparison."""
 
-LEADERBOARD: Final = (*STANDARD, *tuple(ROWS)[13:])
+LEADERBOARD: Final = (*STANDARD, *tuple(ROWS)[13:22])
 """Those, and other fields, a dense one, and a few stars in tracking."""
 
 WRONG_ARCSEC: Final = 360.0
-"""A valid attitude whose boresight is off by more than this is wrong."""
+WRONG_ROLL_ARCSEC: Final = 3600.0
+"""A valid attitude whose boresight or roll is off by more than these is wrong: off the truth, and off the least-squares
+attitude of the true matches, since two or three stars close together determine no attitude better."""
 
 PEER_LIMIT_V: Final = 5.5
 """Least faint limit of the databases of peers and published algorithms: otherwise that of the scenes."""
-
-PREDICTION_PX: Final = 3.0
-"""Error of a predicted attitude, one sigma about each axis, in pixels at the centre."""
 
 _BLEND_PX: Final = 2.0
 _DEEPER_V: Final = 0.5
@@ -104,10 +132,11 @@ class Tally:
         if reply.matrix is None:
             return
         self.valid += 1
-        error = Attitude.from_matrix(_orthonormal(reply.matrix)).error_to(scene.attitude)
-        if floor is None or error.cross_boresight_arcsec > WRONG_ARCSEC:
+        found = Attitude.from_matrix(_orthonormal(reply.matrix))
+        if floor is None or (_is_wrong(found, scene.attitude) and _is_wrong(found, floor)):
             self.wrong += 1
             return
+        error = found.error_to(scene.attitude)
         bound = floor.error_to(scene.attitude)
         self.boresight.append(error.cross_boresight_arcsec)
         self.roll.append(error.roll_arcsec)
@@ -137,7 +166,7 @@ class Tally:
             "roll_floor_ratio": _ratio(roll, _median(self.floor_roll)),
             "floor_arcsec": _median(self.floor_boresight),
             "normalised_squared_error": float(np.mean(self.squared)) if self.squared else None,
-            "sky": ROWS[self.row].random_points is None,
+            "sky": ROWS[self.row].sky,
         }
 
 
@@ -150,6 +179,7 @@ def run(
     rows: Sequence[str] = STANDARD,
     camera: Camera = DEFAULT_CAMERA,
     budget_s: float = 120.0,
+    raw: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Run all solvers on the same scenes.
@@ -168,6 +198,8 @@ def run(
         Pinhole camera without distortion.
     budget_s : float
         Time per row after which a solver skips the rest of the row; its `frames` is the number completed.
+    raw : bool
+        Whether published algorithms give their answers without verification.
     progress : callable, optional
         Receives the name of each row.
 
@@ -189,10 +221,9 @@ def run(
     made: list[dict[str, Any]] = []
     skipped: dict[str, str] = {}
     # rows of one field together, so that only its solvers are held at a time; the table keeps its order
-    for (width, limit), members in _by_field(rows, camera).items():
-        seen = camera if width is None else Camera.from_fov(width, camera.width, camera.height)
+    for (seen, limit), members in _by_field(rows, camera).items():
         field_of = _Field(seen, limit)
-        field_of.add(names, made, skipped)
+        field_of.add(names, made, skipped, raw=raw)
         for row in members:
             if progress is not None:
                 progress(row)
@@ -207,14 +238,15 @@ def run(
     }
 
 
-def _by_field(rows: Sequence[str], camera: Camera) -> dict[tuple[float | None, float], list[str]]:
-    """Rows by their width of field (None: that of the camera given) and the limit of the databases for it."""
-    fields: dict[tuple[float | None, float], list[str]] = {}
+def _by_field(rows: Sequence[str], camera: Camera) -> dict[tuple[Camera, float], list[str]]:
+    """Rows by their camera and the limit of the databases for it."""
+    fields: dict[tuple[Camera, float], list[str]] = {}
     for row in rows:
-        width, limit = FIELD_DEG.get(row), ROWS[row].limiting_magnitude
-        if width is None or math.isclose(width, camera.fov_deg):
-            width, limit = None, max(limit, PEER_LIMIT_V)
-        fields.setdefault((width, limit), []).append(row)
+        (width, side), limit = FIELDS.get(row, (camera.fov_deg, None)), ROWS[row].limiting_magnitude
+        seen = Camera.from_fov(width, side or camera.width, side or camera.height)
+        if side is None and math.isclose(width, camera.fov_deg):
+            seen, limit = camera, max(limit, PEER_LIMIT_V)
+        fields.setdefault((seen, limit), []).append(row)
     return fields
 
 
@@ -235,14 +267,16 @@ class _Field:
         self.known = stars.brighter_than(limit)
         self.solvers: dict[str, Solver] = {}
 
-    def add(self, names: Sequence[str], made: list[dict[str, Any]], skipped: dict[str, str]) -> None:
+    def add(
+        self, names: Sequence[str], made: list[dict[str, Any]], skipped: dict[str, str], *, raw: bool
+    ) -> None:
         """Make solvers; append what they take to `made`, and why others are left out to `skipped`."""
         camera = self.maker.camera
         warm = self.maker.scene(SceneSettings(float(self.known.v[-1]), 0.5), np.random.default_rng(1))
         for name in names:
             before, begin = resident_bytes(), time.perf_counter()
             try:
-                solver = make_solver(name, camera, self.known)
+                solver = make_solver(name, camera, self.known, raw=raw)
             except ImportError:
                 skipped[name] = f"not installed: pip install {name}"
                 continue
@@ -278,16 +312,16 @@ def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float
     rng = np.random.default_rng(seed)
     for _ in range(frames):
         scene = maker.scene(settings, rng)
-        floor = None if settings.random_points else best_attitude(maker.camera, maker.stars, scene)
+        floor = best_attitude(maker.camera, maker.stars, scene) if settings.sky else None
         predicted = None
         if row in TRACKED:
-            turn = PREDICTION_PX * maker.camera.pixel_scale_rad * rng.standard_normal(3)
+            turn = TRACKED[row] * maker.camera.pixel_scale_rad * rng.standard_normal(3)
             predicted = scene.attitude.rotated(turn)
         for name, solver in solvers.items():
             if spent[name] > budget_s:
                 continue
             if predicted is not None and solver.track is not None:
-                reply = solver.track(scene, predicted)
+                reply = solver.track(scene, predicted, WINDOW_SIGMAS * TRACKED[row])
             else:
                 reply = solver.solve(scene)
             spent[name] += reply.seconds
@@ -318,6 +352,11 @@ def best_attitude(camera: Camera, stars: StarCatalog, scene: Scene) -> Attitude:
         residual = (scene.xy_px[true] - xy).ravel()
         attitude = attitude.rotated(np.linalg.solve(slopes.T @ slopes, slopes.T @ residual))
     return attitude
+
+
+def _is_wrong(found: Attitude, expected: Attitude) -> bool:
+    error = found.error_to(expected)
+    return error.cross_boresight_arcsec > WRONG_ARCSEC or error.roll_arcsec > WRONG_ROLL_ARCSEC
 
 
 def _orthonormal(matrix: Array) -> Array:

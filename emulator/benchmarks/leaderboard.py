@@ -15,7 +15,8 @@ Answer = Mapping[str, Any]
 _HEAD: Final = """# Leaderboard of star identification
 
 `{command}`: the same scenes for all solvers. A row is named by σ of the positions in px, false stars and missing stars of a sensor of 42°
-and stars to V 5.5 where nothing else is said. *Right* counts answers within 0.1° of the truth (of random points: none), *wrong* those farther off; the rest gave none.
+and stars to V 5.5 where nothing else is said. *Right* counts answers whose boresight is within 0.1° and whose roll within 1° of the truth (where there is no sky to
+identify: none), *wrong* the other answers; the rest gave none.
 A solver that had spent its budget answered fewer scenes.
 """
 

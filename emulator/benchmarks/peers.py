@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starhil.emulator.benchmarks import astrometry_net
 from starhil.emulator.benchmarks.scenes import Scene
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude
@@ -27,13 +28,17 @@ from starid.solution import Solution
 Array = NDArray[np.float64]
 
 OWN: Final = ("geometric", "lsi", "rsi")
-PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve")
+VARIANTS: Final = ("lsi-matlab", "lsi-sklearn")
+"""The thesis's algorithm with another solver, by name only: its verified answers are those of `lsi`."""
+PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve", "solve-field")
 ALL: Final = (*OWN, *CLASSICS, *PEERS)
 PATTERN_MAX_ERROR: Final = 0.005
 RUST_TOLERANCE_RAD: Final = 0.0015
 RUST_LOOKUP_MAGNITUDE: Final = 4.0
 RUST_MATCHES: Final = 8
 CEDAR_TIMEOUT_MS: Final = 5000.0
+LEAST_SIGMA_PX: Final = 0.1
+"""Noise that a raw published algorithm is given where there is none."""
 LEAST_FEATURE_FIELD_DEG: Final = 30.0
 """Narrowest field for which a feature database (lsi, rsi) is built here: its cells grow with the inverse square of the field."""
 
@@ -80,7 +85,8 @@ class Solver:
     reset : callable
         Makes it forget the scenes that it has seen.
     track : callable or None
-        Answers a scene near a predicted attitude, where it can.
+        Answers a scene near a predicted attitude, where it can; it is given the largest distance of a star from its
+        predicted position, pixels.
     database_bytes : int or None
         Size of its database, if known.
     build_seconds : float or None
@@ -89,7 +95,7 @@ class Solver:
 
     solve: Callable[[Scene], Reply]
     reset: Callable[[], object] = lambda: None
-    track: Callable[[Scene, Attitude], Reply] | None = None
+    track: Callable[[Scene, Attitude, float], Reply] | None = None
     database_bytes: int | None = None
     build_seconds: float | None = None
 
@@ -104,7 +110,7 @@ def resident_bytes() -> int:
     return int(pages) * resource.getpagesize()
 
 
-def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
+def make_solver(name: str, camera: Camera, stars: StarCatalog, *, raw: bool = False) -> Solver:
     """Make a solver for pinhole cameras without distortion.
 
     Parameters
@@ -116,6 +122,8 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
     stars : StarCatalog
         Catalogue for the peers' databases: doubles merged, as the scenes have them. Ours take their default, and the
         published algorithms its faintest star as the limit of the sensor.
+    raw : bool
+        Whether a published algorithm gives its answers without verification.
 
     Raises
     ------
@@ -126,10 +134,10 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog) -> Solver:
     EmulatorError
         The name is unknown.
     """
-    if name in OWN:
+    if name in (*OWN, *VARIANTS):
         return _own(name, camera)
     if name in CLASSICS:
-        return _classic(name, camera, float(stars.v[-1]))
+        return _classic(name, camera, float(stars.v[-1]), verify=not raw)
     if ":" in name:
         return _custom(name, camera, stars)
     check_name(name)
@@ -140,6 +148,8 @@ def version_of(name: str) -> str:
     """Version of an installed solver."""
     if ":" in name:
         return "custom"
+    if name == "solve-field":
+        return astrometry_net.version()
     return importlib.metadata.version(name if name in PEERS else "starhil")
 
 
@@ -151,8 +161,9 @@ def check_name(name: str) -> None:
     EmulatorError
         It is neither one of `ALL` nor MODULE:FUNCTION.
     """
-    if name not in ALL and ":" not in name:
-        raise EmulatorError(f"solver {name!r}: one of {', '.join(ALL)}, or MODULE:FUNCTION, is needed")
+    known = (*ALL, *VARIANTS)
+    if name not in known and ":" not in name:
+        raise EmulatorError(f"solver {name!r}: one of {', '.join(known)}, or MODULE:FUNCTION, is needed")
 
 
 def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
@@ -165,7 +176,7 @@ def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
     solver = maker(camera, stars)
     if not isinstance(solver, Solver):
         raise EmulatorError(
-            f"solver {name!r}: it returned {type(solver).__name__}, emulator.bench.peers.Solver needed"
+            f"solver {name!r}: it returned {type(solver).__name__}, starhil.emulator.benchmarks.peers.Solver needed"
         )
     return solver
 
@@ -178,29 +189,36 @@ def _reply(watch: Stopwatch, solution: Solution) -> Reply:
 
 
 def _own(name: str, camera: Camera) -> Solver:
-    if name in ("lsi", "rsi") and camera.fov_deg < LEAST_FEATURE_FIELD_DEG:
+    algorithm, _, solver = name.partition("-")
+    if algorithm in ("lsi", "rsi") and camera.fov_deg < LEAST_FEATURE_FIELD_DEG:
         raise UnsuitedError(f"its database is not built for fields below {LEAST_FEATURE_FIELD_DEG:g}°")
-    identifier: Any = make_identifier(name, camera)
+    options: dict[str, Any] = {"solver": solver} if solver else {}
+    identifier: Any = make_identifier(algorithm, camera, **options)
 
     def solve(scene: Scene) -> Reply:
         watch = Stopwatch()
         return _reply(watch, identifier.identify(scene.xy_px, scene.flux))
 
-    def track(scene: Scene, predicted: Attitude) -> Reply:
+    def track(scene: Scene, predicted: Attitude, window_px: float) -> Reply:
+        errors = np.full(len(scene.flux), scene.sigma_px)
         watch = Stopwatch()
-        return _reply(watch, identifier.track(scene.xy_px, scene.flux, predicted))
+        solution = identifier.track(scene.xy_px, scene.flux, predicted, errors, window_px=window_px)
+        return _reply(watch, solution)
 
     size = getattr(identifier, "database_bytes", None)
     return Solver(solve, getattr(identifier, "reset", lambda: None), track, size)
 
 
-def _classic(name: str, camera: Camera, limiting_magnitude: float) -> Solver:
-    """Make a published algorithm, its answers verified; it is given the sensor's limit and the magnitude of one unit of flux."""
-    identifier: Any = make_identifier(name, camera, limiting_magnitude=limiting_magnitude, zero_point=0.0)
+def _classic(name: str, camera: Camera, limiting_magnitude: float, *, verify: bool) -> Solver:
+    """Make a published algorithm; it is given the sensor's limit and the magnitude of one unit of flux, and raw also the noise."""
+    identifier: Any = make_identifier(
+        name, camera, limiting_magnitude=limiting_magnitude, zero_point=0.0, verify=verify
+    )
 
     def solve(scene: Scene) -> Reply:
+        errors = None if verify else np.full(len(scene.flux), max(scene.sigma_px, LEAST_SIGMA_PX))
         watch = Stopwatch()
-        return _reply(watch, identifier.identify(scene.xy_px, scene.flux))
+        return _reply(watch, identifier.identify(scene.xy_px, scene.flux, errors))
 
     return Solver(solve, database_bytes=identifier.database_bytes, build_seconds=identifier.build_seconds)
 
@@ -311,9 +329,25 @@ def _cedar_solve(camera: Camera, _: StarCatalog) -> Solver:
     return Solver(solve, database_bytes=sum(value.nbytes for value in held))
 
 
+def _solve_field(camera: Camera, _: StarCatalog) -> Solver:
+    """Make astrometry.net's program a solver; its time is that of a process for each scene, wall time also counted as processor time."""
+    if not astrometry_net.installed():
+        raise UnsuitedError("not installed: apt install astrometry.net astrometry-data-tycho2")
+    folder = tempfile.TemporaryDirectory(prefix="starhil-solve-field-")
+
+    def solve(scene: Scene) -> Reply:
+        begin = time.perf_counter()
+        matrix = astrometry_net.find_attitude(camera, scene.xy_px, scene.flux, Path(folder.name))
+        seconds = time.perf_counter() - begin
+        return Reply(matrix, seconds, seconds)
+
+    return Solver(solve)
+
+
 _MAKERS: Final[dict[str, Callable[[Camera, StarCatalog], Solver]]] = {
     "tetra3rs": _tetra3rs,
     "ruststartracker": _ruststartracker,
     "cedar-solve": _cedar_solve,
+    "solve-field": _solve_field,
 }
 """Name of a peer, as the package is called, → what makes it."""

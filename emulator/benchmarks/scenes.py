@@ -43,6 +43,8 @@ class SceneSettings:
         Share of the field behind such an edge to which the false stars keep.
     kept : int or None
         Only so many of the brightest stars are seen.
+    mirrored : bool
+        The image is mirrored: as dense and clustered as the sky, and nowhere like it.
     """
 
     limiting_magnitude: float = 5.5
@@ -55,6 +57,13 @@ class SceneSettings:
     covered: float = 0.0
     cluttered: float = 1.0
     kept: int | None = None
+    mirrored: bool = False
+
+    @property
+    def sky(self) -> bool:
+        """Whether there is an attitude to find: two true stars at least, and not mirrored."""
+        few = self.kept is not None and self.kept < 2
+        return self.random_points is None and not self.mirrored and not few
 
 
 @dataclass(frozen=True)
@@ -71,12 +80,15 @@ class Scene:
         Brightness, 1 at magnitude 0.
     star : ndarray (n,) int64
         Catalogue row of the star, −1 for false stars.
+    sigma_px : float
+        Position noise of the stars per axis, pixels.
     """
 
     attitude: Attitude
     xy_px: NDArray[np.float64]
     flux: NDArray[np.float64]
     star: NDArray[np.int64]
+    sigma_px: float
 
 
 class SceneMaker:
@@ -102,6 +114,8 @@ class SceneMaker:
             self.stars.vectors[visible] @ attitude.boresight > math.cos(self.camera.field_radius_rad)
         ]
         xy, inside = self.camera.project(attitude.to_sensor(self.stars.vectors[near]))
+        if settings.mirrored:
+            xy[:, 0] = self.camera.width - 1.0 - xy[:, 0]
         rows, xy = near[inside][: settings.kept], xy[inside][: settings.kept]
         magnitudes = self.stars.v[rows]
         if settings.random_points is not None:
@@ -154,4 +168,5 @@ class SceneMaker:
     ) -> Scene:
         order = rng.permutation(magnitudes.size)
         noisy = magnitudes[order] + settings.magnitude_noise * rng.standard_normal(magnitudes.size)
-        return Scene(attitude, xy[order], 10.0 ** (-0.4 * noisy), star[order].astype(np.int64))
+        flux = 10.0 ** (-0.4 * noisy)
+        return Scene(attitude, xy[order], flux, star[order].astype(np.int64), settings.sigma_px)

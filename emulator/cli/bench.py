@@ -239,7 +239,10 @@ _IDENTIFY_COLUMNS: Final[tuple[Column, ...]] = (
 @group.command("identify")
 def identify(
     peers: Annotated[
-        str, typer.Option(help="Third-party solvers to compare with: tetra3rs,ruststartracker,cedar-solve.")
+        str,
+        typer.Option(
+            help="Third-party solvers to compare with: tetra3rs,ruststartracker,cedar-solve,solve-field."
+        ),
     ] = "",
     solvers: Annotated[
         str,
@@ -253,12 +256,16 @@ def identify(
     row: Annotated[
         list[str] | None,
         typer.Option(
-            help="Row of the table; may be repeated. 'all' means every one; by default the standard ones, with --solvers all also other fields."
+            help="Row of the table; may be repeated. 'all' means every one, 'papers' the scenes of the published algorithms' papers; "
+            "by default the standard ones, with --solvers all also other fields."
         ),
     ] = None,
     budget: Annotated[
         float, typer.Option(help="Time per row after which a solver skips the rest of the row, seconds.")
     ] = 120.0,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Show the answers of published algorithms without verification.")
+    ] = False,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Folder for leaderboard.md, leaderboard.json and plots."),
@@ -266,7 +273,7 @@ def identify(
     as_json: AsJson = False,
 ) -> None:
     """Compare star identification solvers on the same scenes, and with the least-squares bound of the true matches."""
-    from starhil.emulator.benchmarks.identify import LEADERBOARD, ROWS, STANDARD, run
+    from starhil.emulator.benchmarks.identify import LEADERBOARD, PAPERS, ROWS, STANDARD, run
     from starhil.emulator.benchmarks.leaderboard import write_leaderboard
     from starhil.emulator.benchmarks.peers import ALL
 
@@ -278,13 +285,16 @@ def identify(
         seed,
         peers=_names(peers),
         own=ALL if everyone else _names(solvers),
-        rows=list(usual if not row else ROWS if "all" in row else row),
+        rows=list(usual if not row else ROWS if "all" in row else PAPERS if "papers" in row else row),
         budget_s=budget,
+        raw=raw,
         progress=lambda name: report(f"row {name}"),
     )
     if output is not None:
         command = (
             f"starhil bench identify --solvers {solvers} --frames {frames} --seed {seed} --budget {budget:g}"
+            + (" --raw" if raw else "")
+            + "".join(f' --row "{name}"' for name in row or [])
         )
         for path in write_leaderboard(answer, output, command):
             report(f"wrote {path}")

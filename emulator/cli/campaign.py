@@ -25,6 +25,10 @@ def lost_in_space(
     frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0,
+    unknown_field: Annotated[
+        bool,
+        typer.Option("--unknown-field", help="Identify without knowing --fov, as identify --fov auto does."),
+    ] = False,
     rate: Annotated[
         float, typer.Option(min=0, help="Body rate during the exposure, deg/s, about a random axis.")
     ] = 0.0,
@@ -67,7 +71,7 @@ def lost_in_space(
 
     from starhil.emulator.benchmarks.campaign import CampaignPlan, run_campaign, summarise
 
-    plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm, sky=sky)
+    plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm, sky=sky, unknown_field=unknown_field)
     with _backend(dask, jobs):
         chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
     rows = np.concatenate(chunks)

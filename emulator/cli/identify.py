@@ -38,7 +38,7 @@ def command(
         typer.Option(
             metavar="DEGREES|auto",
             help="For any other camera: rough horizontal field of view, edge to edge, degrees; or auto to "
-            "try 5 to 46 degrees.",
+            "try 5 to 66 degrees.",
         ),
     ] = None,
     fov_tolerance: Annotated[
@@ -209,7 +209,7 @@ def _advice(result: ImageSolution, fov: str | None, model: str) -> str:
         return "give the camera's profile with --profile, or its rough field of view in degrees with --fov"
     if fov == _ANY_FIELD:
         return (
-            "give the field of view with --fov if it is outside 5 to 46 degrees, or try --model equidistant"
+            "give the field of view with --fov if it is outside 5 to 66 degrees, or try --model equidistant"
         )
     other = next(name for name in _MODELS if name != model)
     return (

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Final, get_args, get_type_hints
+from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from starhil.emulator.errors import EmulatorError
 from starid.camera import Camera
@@ -88,7 +88,11 @@ def _known_options(algorithm: type) -> dict[str, str]:
     types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
     for held in get_args(get_type_hints(inspect.getattr_static(algorithm, "__init__")).get("options")):
         if is_dataclass(held):
-            types |= {field.name: str(field.type) for field in fields(held)}
+            hints = get_type_hints(held)
+            types |= {
+                field.name: "str" if get_origin(hints[field.name]) is Literal else str(field.type)
+                for field in fields(held)
+            }
     return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}
 
 

@@ -15,14 +15,25 @@ own choice: "fits into one field" is tested as agreement of all distances, as fo
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import ClassVar, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
+from starid.classic.neighbours import (
+    MOST_TIED,
+    add_winners,
+    bright_neighbour,
+    grouped,
+    nearest_beyond,
+    neighbours_of,
+    turned,
+)
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
+
+Table: TypeAlias = tuple[NDArray[np.int32], NDArray[np.uint16]]
+"""First entry of each cell in the second array, and the guide stars whose pattern has it."""
 
 GRID: Final = 40
 """Cells along each side of the grid."""
@@ -73,16 +84,19 @@ def occupied_cells(
 
 
 @compiled_ieee
-def _patterns(
-    vectors: NDArray[np.float64], radius: float, buffer: float
-) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
-    """Look-up table: first entry of each cell, and the stars whose pattern has it."""
+def look_up_table(
+    vectors: NDArray[np.float64], magnitude: NDArray[np.float64], radius: float, buffer: float
+) -> Table:
+    """First entry of each cell, and the stars whose pattern has it.
+
+    Each pattern is aligned with its nearest star beyond the buffer in the brighter half (`bright_neighbour`).
+    """
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     cells, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     for star in range(vectors.shape[0]):
         count = neighbours_of(vectors, star, radius, polar, rows)
-        aligned = nearest_beyond(polar, count, buffer)
+        aligned = bright_neighbour(polar, rows, count, magnitude, buffer, 0)
         if aligned < 0:
             continue
         for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
@@ -93,14 +107,28 @@ def _patterns(
     return start, owners[order].astype(np.uint16)
 
 
+@inner
+def count_votes(
+    table: Table,
+    polar: NDArray[np.float64],
+    count: int,
+    aligned: int,
+    radius: float,
+    found: NDArray[np.int64],
+    votes: NDArray[np.int32],
+) -> int:
+    """Add a vote for each star whose pattern has a cell of the observed one; return the cells of that."""
+    start, owner = table
+    cells = occupied_cells(polar, count, aligned, radius, GRID, found)
+    for k in range(cells):
+        for place in range(start[found[k]], start[found[k] + 1]):
+            votes[owner[place]] += 1
+    return cells
+
+
 @compiled_ieee
 def _vote(
-    start: NDArray[np.int32],
-    owner: NDArray[np.uint16],
-    stars: int,
-    seen: NDArray[np.float64],
-    radius: float,
-    buffer: float,
+    table: Table, stars: int, seen: NDArray[np.float64], radius: float, buffer: float
 ) -> NDArray[np.int64]:
     """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -113,9 +141,7 @@ def _vote(
         if aligned < 0:
             continue
         votes = np.zeros(stars, dtype=np.int32)
-        for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
-            for place in range(start[found[k]], start[found[k] + 1]):
-                votes[owner[place]] += 1
+        count_votes(table, polar, count, aligned, radius, found, votes)
         filled = add_winners(votes, LEAST_VOTES, pivot, matches, filled)
     return matches[:filled]
 
@@ -128,8 +154,10 @@ class GridIdentifier(ClassicIdentifier):
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad
         self._buffer = BUFFER_SHARE * self._radius
-        self.start, self.owner = _patterns(self.guide.vectors, self._radius, self._buffer)
-        return self.start, self.owner
+        # magnitudes that are all alike: the nearest neighbour, bright or faint
+        alike = np.zeros(len(self.guide))
+        self.table = look_up_table(self.guide.vectors, alike, self._radius, self._buffer)
+        return self.table
 
     def _match(self, observed: Observed) -> NDArray[np.int64]:
-        return _vote(self.start, self.owner, len(self.guide), observed.directions, self._radius, self._buffer)
+        return _vote(self.table, len(self.guide), observed.directions, self._radius, self._buffer)

@@ -22,10 +22,18 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.classic.grid import BUFFER_SHARE, GRID, MOST_NEIGHBOURS, RADIUS_SHARE, occupied_cells
-from starid.classic.neighbours import grouped, neighbours_of
+from starid.classic.grid import (
+    BUFFER_SHARE,
+    GRID,
+    MOST_NEIGHBOURS,
+    RADIUS_SHARE,
+    Table,
+    count_votes,
+    look_up_table,
+)
+from starid.classic.neighbours import bright_neighbour, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
-from starid.jit import compiled_ieee, inner
+from starid.jit import compiled_ieee
 
 ALIGNMENTS: Final = 3
 """Neighbours that an observed pattern is aligned with in turn."""
@@ -37,52 +45,9 @@ HIT_RATE: Final = 0.5
 """Probability that an observed cell is in the true pattern."""
 
 
-@inner
-def _bright_neighbour(
-    polar: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    count: int,
-    magnitude: NDArray[np.float64],
-    buffer: float,
-    rank: int,
-) -> int:
-    """Place of the neighbour beyond the buffer of given rank, by distance, in the brighter half; −1 if there is none."""
-    values = np.empty(count)
-    for i in range(count):
-        values[i] = magnitude[rows[i]]
-    middle = np.median(values) if count > 0 else 0.0
-    for i in range(count):
-        if polar[i, 0] > buffer and values[i] <= middle:
-            if rank == 0:
-                return i
-            rank -= 1
-    return -1
-
-
-@compiled_ieee
-def _patterns(
-    vectors: NDArray[np.float64], magnitude: NDArray[np.float64], radius: float, buffer: float
-) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
-    """Look-up table: first entry of each cell, and the stars whose pattern has it."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    cells, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
-    for star in range(vectors.shape[0]):
-        count = neighbours_of(vectors, star, radius, polar, rows)
-        aligned = _bright_neighbour(polar, rows, count, magnitude, buffer, 0)
-        if aligned < 0:
-            continue
-        for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
-            cells.append(found[k])
-            stars.append(np.int64(star))
-    keys, owners = np.array(cells), np.array(stars)
-    start, order = grouped(keys, GRID * GRID)
-    return start, owners[order].astype(np.uint16)
-
-
 @compiled_ieee
 def _look_up(
-    table: tuple[NDArray[np.int32], NDArray[np.uint16]],
+    table: Table,
     stars: int,
     seen: tuple[NDArray[np.float64], NDArray[np.float64]],
     radius: float,
@@ -90,7 +55,6 @@ def _look_up(
     fill: float,
 ) -> NDArray[np.int64]:
     """Matches (m, 2) whose votes pass the Bayesian threshold, the best two of each pivot and alignment."""
-    start, owner = table
     directions, magnitude = seen
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -100,14 +64,11 @@ def _look_up(
     for pivot in range(directions.shape[0]):
         count = neighbours_of(directions, pivot, radius, polar, rows)
         for rank in range(ALIGNMENTS):
-            aligned = _bright_neighbour(polar, rows, count, magnitude, buffer, rank)
+            aligned = bright_neighbour(polar, rows, count, magnitude, buffer, rank)
             if aligned < 0:
                 break
             votes = np.zeros(stars, dtype=np.int32)
-            cells = occupied_cells(polar, count, aligned, radius, GRID, found)
-            for k in range(cells):
-                for place in range(start[found[k]], start[found[k] + 1]):
-                    votes[owner[place]] += 1
+            cells = count_votes(table, polar, count, aligned, radius, found, votes)
             for _ in range(KEPT):
                 best = np.argmax(votes)
                 odds = votes[best] * hit + (cells - votes[best]) * miss
@@ -127,7 +88,7 @@ class ImprovedGridIdentifier(ClassicIdentifier):
         self._radius = RADIUS_SHARE * self.width_rad
         self._buffer = BUFFER_SHARE * self._radius
         guide = self.guide
-        self.table = _patterns(guide.vectors, guide.magnitude, self._radius, self._buffer)
+        self.table = look_up_table(guide.vectors, guide.magnitude, self._radius, self._buffer)
         # a pattern's own cell for its alignment star aside, cells are filled evenly over the circle
         inside = 0.25 * math.pi * GRID**2
         self._fill = min(self.table[1].size / (len(guide) * inside), HIT_RATE / 2.0)

@@ -98,6 +98,31 @@ def nearest_beyond(polar: NDArray[np.float64], count: int, buffer: float) -> int
     return -1
 
 
+@inner
+def bright_neighbour(
+    polar: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    count: int,
+    magnitude: NDArray[np.float64],
+    buffer: float,
+    rank: int,
+) -> int:
+    """Place of the neighbour beyond a buffer of given rank, by distance, in the brighter half; −1 if there is none.
+
+    Where all magnitudes are equal every neighbour is in the brighter half.
+    """
+    values = np.empty(count)
+    for i in range(count):
+        values[i] = magnitude[rows[i]]
+    middle = np.median(values) if count > 0 else 0.0
+    for i in range(count):
+        if polar[i, 0] > buffer and values[i] <= middle:
+            if rank == 0:
+                return i
+            rank -= 1
+    return -1
+
+
 @compiled_ieee
 def neighbour_list(
     vectors: NDArray[np.float64], pivot: int, radius: float

@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -35,6 +35,7 @@ from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.index_choice import pixels_per_radian
 from starid.geometric.pattern_index import field_solid_angle, seen_stars
+from starid.geometric.verified import VerifiedIdentifier
 from starid.solution import Reason, Solution
 from starid.solver_input import checked_detections
 from starid.wahba import covariance, solve_wahba
@@ -132,7 +133,7 @@ class Observed:
     tolerance: float
 
 
-class ClassicIdentifier(ABC):
+class ClassicIdentifier(VerifiedIdentifier):
     """Star identification by a published algorithm, for one camera against one catalogue.
 
     Parameters
@@ -289,27 +290,6 @@ class ClassicIdentifier(ABC):
                 observer_velocity=observer_velocity,
             )
         return dataclasses.replace(solution, mode="lost_in_space", elapsed=time.perf_counter() - begin)
-
-    def track(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        predicted: Attitude | ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        window_px: float | None = None,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Attitude near a predicted one, as the verification finds it; these algorithms have no tracking of their own.
-
-        Parameters
-        ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
-            As in `starid.interface.StarIdentifier.track`.
-        """
-        return self.verifier.track(
-            xy_px, flux, predicted, xy_sigma_px, window_px=window_px, observer_velocity=observer_velocity
-        )
 
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""

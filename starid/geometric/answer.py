@@ -32,7 +32,10 @@ from starid.geometric.verification import log_false_probability, worth_refining
 from starid.jit import inner
 
 LEAST_MATCHED: Final = 4
-"""Least number of matches of an answer."""
+"""Least number of matches of an answer that is not near a prediction."""
+
+LEAST_TESTED: Final = 4
+"""Detections outside the pattern with which the sequential test can reject."""
 
 
 class Answer(NamedTuple):
@@ -93,7 +96,8 @@ def test_and_refine(
     candidate: Candidate,
     tests: tuple[NDArray[np.float64], NDArray[np.int64]],
     used: tuple[int, int, int],
-    prior_volume: float,
+    least_matched: int,
+    prior: tuple[float, float],
 ) -> tuple[int, float]:
     """Test, refine and verify the attitude in ``candidate.frames[2]``.
 
@@ -105,7 +109,9 @@ def test_and_refine(
         From `starid.geometric.verification.hit_odds` and `test_order`.
     used : (int, int, int)
         Detections that the attitude was derived from.
-    prior_volume : float
+    least_matched : int
+        Least number of matches. Below `LEAST_MATCHED` a few detections are not tested one by one: the bound alone decides.
+    prior : (float, float)
         As in `log_false_probability`.
 
     Returns
@@ -118,7 +124,8 @@ def test_and_refine(
     rotation, numbers = candidate.frames[2], candidate.numbers
     faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
     odds, order = tests
-    if not worth_refining(
+    few = least_matched < LEAST_MATCHED and observed.shape[0] < least_matched + LEAST_TESTED
+    if not few and not worth_refining(
         index, raw.params, observed, rotation, numbers[SCALE], faintest, settings, odds, order, used
     ):
         return 0, 0.0
@@ -128,7 +135,7 @@ def test_and_refine(
         raw,
         observed,
         settings,
-        LEAST_MATCHED,
+        least_matched,
         seen,
         rotation,
         candidate.stars,
@@ -140,7 +147,7 @@ def test_and_refine(
     if abs(math.log(numbers[SCALE])) > 1.5 * settings[SCALE_TOLERANCE]:
         return 0, 0.0
     bound = log_false_probability(
-        index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior_volume
+        index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior
     )
     return matched, bound
 

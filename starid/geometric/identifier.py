@@ -21,7 +21,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.answer import Answer
+from starid.geometric.answer import LEAST_MATCHED, Answer
 from starid.geometric.index_choice import (
     default_limiting_magnitude,
     index_settings,
@@ -50,8 +50,8 @@ from starid.geometric.settings import (
     TOO_FEW,
     WINDOW,
 )
-from starid.geometric.tracking import track_kernel
-from starid.geometric.verification import ROTATIONS
+from starid.geometric.tracking import LEAST_TRACKED, LEAST_TRACKED_KNOWN, track_kernel
+from starid.geometric.verification import WHOLE_SKY
 from starid.solution import Mode, Reason, Solution
 from starid.solver_input import checked_detections
 
@@ -301,6 +301,9 @@ class Identifier:
     ) -> Solution:
         """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
 
+        Three stars can be enough, and two if their errors are given. Whether they are depends on the window: the narrower,
+        the less can agree by chance.
+
         Parameters
         ----------
         xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
@@ -361,20 +364,22 @@ class Identifier:
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         numbers = self._numbers_for(xy_sigma_px, observer_velocity)
         window = window_px / self._px_per_rad
-        prior = self._rotation_volume(window)
+        prior, least = self._prior(window), LEAST_TRACKED if xy_sigma_px is None else LEAST_TRACKED_KNOWN
         if anywhere:
-            prior, numbers = ROTATIONS, numbers.copy()
+            prior, least, numbers = WHOLE_SKY, LEAST_MATCHED, numbers.copy()
             numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
         answer = track_kernel(
-            self._index, self._camera.params, xy, brightness, sigmas, numbers, attitude.matrix, window, prior
-        )
+            self._index, self._camera.params, xy, brightness, sigmas, numbers,
+            attitude.matrix, window, least, prior,
+        )  # fmt: skip
         return self._solution(answer, "tracking", begin)
 
-    def _rotation_volume(self, window_rad: float) -> float:
-        """Volume of the rotations that keep every star of the field within a window, rad³."""
+    def _prior(self, window_rad: float) -> tuple[float, float]:
+        """Volume of the rotations that keep every star of the field within a window, rad³, and the window's solid angle."""
         # a star at the border of the field stays within it after a roll of window/(field's radius)
         radius = math.sqrt(self._camera.width * self._camera.height / math.pi) / self._px_per_rad
-        return min(2.0 * math.pi * window_rad**2 * min(window_rad / radius, math.pi), ROTATIONS)
+        volume = 2.0 * math.pi * window_rad**2 * min(window_rad / radius, math.pi)
+        return min(volume, WHOLE_SKY[0]), min(math.pi * window_rad**2, WHOLE_SKY[1])
 
     def warm_up(self) -> None:
         """Compile or load the kernels, so that the first image is not delayed."""

@@ -48,7 +48,7 @@ from starid.geometric.settings import (
     TEST_WINDOW,
     TOO_FEW,
 )
-from starid.geometric.verification import ROTATIONS, hit_odds, test_order
+from starid.geometric.verification import WHOLE_SKY, hit_odds, test_order
 from starid.jit import compiled_ieee, inner
 from starid.projection import HEIGHT, MODEL, WIDTH
 
@@ -188,7 +188,9 @@ def _try_patterns(
             set_sensor_frame(observed, corners, raw.params[MODEL], numbers[SCALE], frames)
             framed = True
         set_rotation(stars, (a, b, c), frames)
-        _, bound = test_and_refine(index, raw, observed, settings, candidate, tests, corners, ROTATIONS)
+        _, bound = test_and_refine(
+            index, raw, observed, settings, candidate, tests, corners, LEAST_MATCHED, WHOLE_SKY
+        )
         if bound < settings[LOG_CHANCE]:
             return bound
     return 0.0

@@ -4,6 +4,10 @@ Bright detections are paired with the catalogue stars within a window around the
 Two such pairs of equal separation determine an attitude, which goes through the same sequential test,
 refinement and verification as one found lost in space. A prediction that is off by any turn within the
 window, roll included, is followed; anything else is excluded.
+
+Three matched stars can be enough, and two where the errors of the positions are known: the bound on the probability of
+a false answer says whether they are. An answer of fewer than `LEAST_MATCHED` is compared with all others near the prediction,
+and its bound is that of the best one with which it has not even two matches in common.
 """
 
 from __future__ import annotations
@@ -56,6 +60,12 @@ PAIRED: Final = 16
 CANDIDATES: Final = 6
 """Catalogue stars considered for each of them, the brightest in its window."""
 
+LEAST_TRACKED: Final = 3
+"""Least number of matches near a prediction: two leave one residual, from which no noise can be estimated."""
+
+LEAST_TRACKED_KNOWN: Final = 2
+"""The same where the errors of the positions are known."""
+
 
 @inner
 def _stars_near(
@@ -84,6 +94,25 @@ def _stars_near(
 
 
 @inner
+def _weigh(candidate: Candidate, bound: float, best: Candidate, bounds: NDArray[np.float64]) -> None:
+    """Keep a candidate in `best` if its bound is the least; ``bounds`` are that of `best` and of its best rival."""
+    shared = 0
+    for i in range(candidate.stars.shape[0]):
+        shared += 1 if candidate.stars[i] >= 0 and candidate.stars[i] == best.stars[i] else 0
+    if bound >= bounds[0]:
+        if shared < 2:
+            bounds[1] = min(bounds[1], bound)
+        return
+    if shared < 2:
+        bounds[1] = bounds[0]
+    bounds[0] = bound
+    best.frames[:] = candidate.frames
+    best.stars[:] = candidate.stars
+    best.normal[:] = candidate.normal
+    best.numbers[:] = candidate.numbers
+
+
+@inner
 def _try_pair(
     index: IndexArrays,
     raw: Raw,
@@ -93,20 +122,20 @@ def _try_pair(
     tests: tuple[NDArray[np.float64], NDArray[np.int64]],
     detections: tuple[int, int],
     stars: tuple[int, int],
-    prior_volume: float,
-) -> float:
-    """Bound of the attitude of two pairs, left in `candidate`; 0 where it is rejected."""
+    least_matched: int,
+    prior: tuple[float, float],
+) -> tuple[int, float]:
+    """Matches and bound of the attitude of two pairs, left in `candidate`; 0 where it is rejected."""
     i, j = detections
     a, b = stars
     da = index.stars[a, STAR_MAGNITUDE] - observed[i, MAGNITUDE]
     db = index.stars[b, STAR_MAGNITUDE] - observed[j, MAGNITUDE]
     if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
-        return 0.0
+        return 0, 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
     set_sensor_frame(observed, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
     set_rotation(index.stars, (a, a, b), candidate.frames)
-    _, bound = test_and_refine(index, raw, observed, settings, candidate, tests, (i, j, j), prior_volume)
-    return bound
+    return test_and_refine(index, raw, observed, settings, candidate, tests, (i, j, j), least_matched, prior)
 
 
 @inner
@@ -120,12 +149,15 @@ def _try_detections(
     detections: tuple[int, int],
     near: NDArray[np.int64],
     counts: NDArray[np.int64],
-    prior_volume: float,
+    least_matched: int,
+    prior: tuple[float, float],
+    best: Candidate,
+    bounds: NDArray[np.float64],
     work: NDArray[np.int64],
 ) -> float:
-    """Try all pairs of stars near two detections; return the bound of the first accepted, or 0.
+    """Try all pairs of stars near two detections; return the bound of the first that needs no comparison, or 0.
 
-    `work` counts pairs, and those of equal separation.
+    The others are left to `best` and ``bounds`` (`_weigh`). `work` counts pairs, and those of equal separation.
     """
     i, j = detections
     separation = chord(observed, i, j)
@@ -138,11 +170,13 @@ def _try_detections(
             if a == b or abs(chord(index.stars, a, b) - separation) > settings[SEARCH_TOLERANCE]:
                 continue
             work[1] += 1
-            bound = _try_pair(
-                index, raw, observed, settings, candidate, tests, detections, (a, b), prior_volume
+            matched, bound = _try_pair(
+                index, raw, observed, settings, candidate, tests, detections, (a, b), least_matched, prior
             )
-            if bound < settings[LOG_CHANCE_TRACKING]:
+            if matched >= LEAST_MATCHED and bound < settings[LOG_CHANCE_TRACKING]:
                 return bound
+            if matched > 0 and bound < 0.0:
+                _weigh(candidate, bound, best, bounds)
     return 0.0
 
 
@@ -156,7 +190,8 @@ def track_kernel(
     settings: NDArray[np.float64],
     predicted: NDArray[np.float64],
     window_rad: float,
-    prior_volume: float,
+    least_matched: int,
+    prior: tuple[float, float],
 ) -> Answer:
     """Find the attitude near a predicted one.
 
@@ -166,17 +201,20 @@ def track_kernel(
         ICRS→sensor.
     window_rad : float
         Largest angle of a star from its predicted direction.
-    prior_volume : float
-        Prior volume of rotations, rad³.
+    least_matched : int
+        Least number of matches of an answer.
+    prior : (float, float)
+        As in `starid.geometric.verification.log_false_probability`.
     """
     raw = Raw(params, xy, flux, sigmas)
     observed = observe(raw)
     n = observed.shape[0]
-    candidate = new_candidate(n)
+    candidate, best, bounds = new_candidate(n), new_candidate(n), np.zeros(2)
+    best.stars[:] = -1
     tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
     near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
     counts = np.zeros(PAIRED, dtype=np.int64)
-    status, bound, work = TOO_FEW if n < LEAST_MATCHED else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
+    status, bound, work = TOO_FEW if n < least_matched else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
     for j in range(min(n, PAIRED) if status == NOTHING else 0):
         x, y, z = at_rest(
             *to_sky(predicted, observed, j), settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
@@ -184,11 +222,15 @@ def track_kernel(
         counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
         for i in range(j):
             bound = _try_detections(
-                index, raw, observed, settings, candidate, tests, (i, j), near, counts, prior_volume, work
-            )
+                index, raw, observed, settings, candidate, tests, (i, j), near, counts,
+                least_matched, prior, best, bounds, work,
+            )  # fmt: skip
             if bound < 0.0:
                 status = ACCEPTED
                 break
         if status == ACCEPTED:
-            break
-    return make_answer(status, observed, candidate, settings, bound, work[0], work[1])
+            return make_answer(status, observed, candidate, settings, bound, work[0], work[1])
+    bound = bounds[0] - bounds[1]
+    if bound < settings[LOG_CHANCE_TRACKING]:
+        status = ACCEPTED
+    return make_answer(status, observed, best, settings, bound, work[0], work[1])

@@ -16,6 +16,11 @@ the posterior's volume over the prior's), over the photometric zero point, over 
 estimated, and averaged over a few shares a. The result is a Bayes factor B whose expectation under chance
 is 1, so that by Markov's inequality chance reaches B or more with a probability of at most 1/B, however long
 the search was: 1/B is the bound reported in a solution.
+
+Near a prediction a second rival is as serious as chance: *one star*, which is where it was expected, and chance for
+all others. Its own factor is at most A·w·z/Ω, Ω being the solid angle (px²) in which the prediction lets that star
+lie, and z the share of the zero points that fit it. Where this exceeds 1, B is divided by it. Two true stars are no
+rival: they determine the attitude. Lost in space, Ω is the whole sphere and the rival never counts.
 """
 
 from __future__ import annotations
@@ -36,8 +41,8 @@ from starid.geometric.pattern_index import (
     IndexArrays,
     magnitude_bin,
 )
-from starid.geometric.refinement import SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
-from starid.geometric.settings import FIELD_PX, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
+from starid.geometric.refinement import PRIOR_FREEDOM, SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
+from starid.geometric.settings import FIELD_PX, PX_PER_RAD, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
 from starid.geometric.sky_grid import cell_of
 from starid.jit import inner
 from starid.projection import MODEL
@@ -54,14 +59,16 @@ ACCEPT_ABOVE: Final = 9.0
 MAX_TESTED: Final = 40
 """Detections tested at most."""
 
-ROTATIONS: Final = 8.0 * math.pi**2
-"""Volume of all rotations, measured in rotation vectors (rad³)."""
+WHOLE_SKY: Final = (8.0 * math.pi**2, 4.0 * math.pi)
+"""Prior of an attitude that nothing is known of: volume of all rotations, measured in rotation vectors (rad³), and solid
+angle in which one star may lie (sr)."""
 
 ZERO_POINT_RANGE: Final = 10.0
 """Magnitudes over which the photometric zero point may lie."""
 
-NOISE_RANGE: Final = math.log(5.0 / 0.05)
-"""Logarithmic range of the centroid noise where it is estimated."""
+LEAST_NOISE: Final = 0.05
+MOST_NOISE: Final = 5.0
+"""Range of the centroid noise where it is estimated, pixels."""
 
 SHARES: Final = (0.2, 0.5, 0.9)
 """Shares of true stars among the detections that the Bayes factor is averaged over."""
@@ -188,13 +195,18 @@ def _log_detections(
     rotation: NDArray[np.float64],
     stars: NDArray[np.int64],
     numbers: NDArray[np.float64],
+    deviation_of_one: float,
     field_px: float,
-) -> float:
-    """Logarithm of the product over the detections, averaged over `SHARES`; see the module."""
+) -> tuple[float, float]:
+    """Logarithm of the product over the detections, averaged over `SHARES`, and the largest A·w·z; see the module.
+
+    `deviation_of_one` is the centroid noise in units of the stated errors.
+    """
     star_table, counts = index.stars, index.counts
     cell = cell_of(rotation[2, 0], rotation[2, 1], rotation[2, 2], COUNT_CELLS)
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
-    deviation_of_one = math.sqrt(numbers[VARIANCE])
+    zero_points = math.sqrt(2.0 * math.pi) * scatter / ZERO_POINT_RANGE
+    lone = 0.0
     totals, products = np.zeros(len(SHARES)), np.ones(len(SHARES))
     for i in range(stars.shape[0]):
         gain = 0.0
@@ -206,8 +218,10 @@ def _log_detections(
             here = math.exp(-0.5 * ((r0 / su) ** 2 + (r1 / sv) ** 2)) / (2.0 * math.pi * su * sv)
             deviation = (magnitude - seen[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
             brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
-            weight = min(brightness / _stars_per_magnitude(counts, cell, magnitude), 1.0)
-            gain = field_px * weight * here
+            density = _stars_per_magnitude(counts, cell, magnitude)
+            gain = field_px * min(brightness / density, 1.0) * here
+            likeliest = min(1.0 / (math.sqrt(2.0 * math.pi) * scatter * density), 1.0)
+            lone = max(lone, field_px * likeliest * zero_points)
         for k in range(len(SHARES)):
             products[k] *= 1.0 - SHARES[k] + SHARES[k] * gain
             if not _SMALL < products[k] < 1.0 / _SMALL:
@@ -221,7 +235,26 @@ def _log_detections(
     mean = 0.0
     for k in range(len(SHARES)):
         mean += math.exp(totals[k] - best) / len(SHARES)
-    return float(best + math.log(mean))
+    return float(best + math.log(mean)), lone
+
+
+@inner
+def _noise(numbers: NDArray[np.float64], freedom: int, known: bool) -> tuple[float, float]:
+    """Variance of unit weight that the bound is computed with, and the logarithm of the factor for averaging over it.
+
+    Where the caller stated the errors, the prior of the variance is the scaled inverse χ² of `PRIOR_FREEDOM` degrees of
+    freedom about 1; else the noise is uniform in its logarithm from `LEAST_NOISE` to `MOST_NOISE`. Both averages by Laplace's
+    method, or by the integral's bound where the estimate lies below the range.
+    """
+    variance = numbers[VARIANCE]
+    if known:
+        variance = (PRIOR_FREEDOM + variance * freedom) / (PRIOR_FREEDOM + freedom)
+        density = -0.5 * PRIOR_FREEDOM * (math.log(variance) + 1.0 / variance - 1.0)
+        return variance, density + 0.5 * math.log(PRIOR_FREEDOM / (PRIOR_FREEDOM + freedom))
+    width = math.sqrt(math.pi / freedom)
+    if variance < LEAST_NOISE * LEAST_NOISE:
+        variance, width = LEAST_NOISE * LEAST_NOISE, 1.0 / freedom
+    return variance, min(math.log(width / math.log(MOST_NOISE / LEAST_NOISE)), 0.0)
 
 
 @inner
@@ -234,7 +267,7 @@ def log_false_probability(
     normal: NDArray[np.float64],
     numbers: NDArray[np.float64],
     settings: NDArray[np.float64],
-    prior_volume: float,
+    prior: tuple[float, float],
 ) -> float:
     """Logarithm of the bound on the probability that an agreement is chance; see the module.
 
@@ -244,26 +277,29 @@ def log_false_probability(
         Detections under the refined attitude (rescaled where the focal length was free).
     rotation, stars, matched, normal, numbers
         From `starid.geometric.refinement.refine`.
-    prior_volume : float
-        Prior volume of rotations, rad³: `ROTATIONS` when lost in space.
+    prior : (float, float)
+        Prior volume of rotations, rad³, and solid angle in which one star may lie, sr: `WHOLE_SKY` when lost in
+        space.
     """
     spread = settings[SCALE_TOLERANCE]
     freedom = 2 * matched - (4 if spread > 0.0 else 3)
-    variance = numbers[VARIANCE]
     determinant = (
         normal[0, 0] * (normal[1, 1] * normal[2, 2] - normal[1, 2] * normal[2, 1])
         - normal[0, 1] * (normal[1, 0] * normal[2, 2] - normal[1, 2] * normal[2, 0])
         + normal[0, 2] * (normal[1, 0] * normal[2, 1] - normal[1, 1] * normal[2, 0])
     )
-    if freedom <= 0 or not (determinant > 0.0 and variance > 0.0):
+    if freedom <= 0 or not (determinant > 0.0 and numbers[VARIANCE] > 0.0):
         return 0.0
-    log_factor = _log_detections(index, seen, rotation, stars, numbers, settings[FIELD_PX])
+    variance, noise_factor = _noise(numbers, freedom, settings[SIGMAS_KNOWN] > 0.0)
+    log_factor, lone = _log_detections(
+        index, seen, rotation, stars, numbers, math.sqrt(variance), settings[FIELD_PX]
+    )
+    log_factor += noise_factor
     half_volume = 1.5 * math.log(2.0 * math.pi * variance) - 0.5 * math.log(determinant)
-    log_factor += min(half_volume - math.log(prior_volume), 0.0)
+    log_factor += min(half_volume - math.log(prior[0]), 0.0)
+    log_factor -= math.log(max(lone / (prior[1] * settings[PX_PER_RAD] ** 2), 1.0))
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
     log_factor += min(math.log(math.sqrt(2.0 * math.pi / matched) * scatter / ZERO_POINT_RANGE), 0.0)
-    if settings[SIGMAS_KNOWN] == 0.0:
-        log_factor += min(math.log(math.sqrt(math.pi / freedom) / NOISE_RANGE), 0.0)
     if spread > 0.0:
         error = math.sqrt(variance * numbers[SCALE_VARIANCE])
         log_factor += min(math.log(math.sqrt(2.0 * math.pi) * error / (2.0 * spread)), 0.0)

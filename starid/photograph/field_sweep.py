@@ -18,10 +18,81 @@ from starid.photograph.typical_camera import FIELD_STEP
 from starid.photograph.views import Counts, views
 from starid.solution import Reason
 
-FIELDS_DEG: Final = tuple(FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21))
-"""Widths of the square fields tried, each within `TOLERANCE`: 5° to 46°, the middle ones first."""
+FIELDS_DEG: Final = tuple(
+    FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21, 22, 23)
+)
+"""Widths of the square fields tried, each within `TOLERANCE`: 5° to 66°, the common ones first."""
 
 TOLERANCE: Final = 0.1
+
+
+class FieldSweep:
+    """Identification of images of one size without their field of view; what is made for one image serves the next.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the images, pixels.
+    catalog : StarCatalog
+        The stars.
+    model : {"pinhole", "equidistant", "flat"}
+        Projection of the lens.
+    """
+
+    def __init__(self, width: int, height: int, catalog: StarCatalog, *, model: Model = "pinhole") -> None:
+        shape = (width / height) ** 0.5
+        self._cameras = [Camera.from_fov(field * shape, width, height, model) for field in FIELDS_DEG]
+        self._catalog = catalog
+        self._searches: dict[Camera, RoughSearch] = {}
+
+    def _search(self, camera: Camera) -> RoughSearch:
+        """Search for a field of about that of a camera; made when it is first needed."""
+        if camera not in self._searches:
+            self._searches[camera] = RoughSearch(camera, self._catalog, fov_tolerance=TOLERANCE)
+        return self._searches[camera]
+
+    def solve(
+        self,
+        image: Counts,
+        settings: DetectionSettings | None = None,
+        observer_velocity: ArrayLike | None = None,
+    ) -> ImageSolution:
+        """Find the stars on an image, and the attitude and field of view of its camera.
+
+        Parameters
+        ----------
+        image : ndarray (h, w) of uint8 or uint16
+            Grey.
+        settings : DetectionSettings, optional
+            For the detection.
+        observer_velocity : array (3,), optional
+            As in `starid.interface.StarIdentifier.identify`.
+
+        Raises
+        ------
+        StaridError
+            The image is invalid for detection.
+        """
+        begin = time.perf_counter()
+        first: ImageSolution | None = None
+        for view in views(image, settings):
+            if view.mirrored:
+                break
+            found = view.detections
+            for number in ALL_ROUNDS[:-1]:
+                for camera in self._cameras:
+                    search = self._search(camera)
+                    solution = search.identify(found.xy_px, found.flux, rounds=[number])
+                    if solution.valid:
+                        return refine_solution(solution, view, camera, search, begin, observer_velocity)
+                    if first is None:
+                        first = ImageSolution(solution, found, camera, search.identifier.stars)
+                    if solution.reason is Reason.TOO_FEW_STARS:
+                        break
+        if first is None:
+            raise StaridError("image: no view of it is available")
+        failed = dataclasses.replace(first.solution, elapsed=time.perf_counter() - begin)
+        return dataclasses.replace(first, solution=failed)
 
 
 def solve_any_field(
@@ -32,48 +103,14 @@ def solve_any_field(
     settings: DetectionSettings | None = None,
     observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
-    """Find the stars on an image, and the attitude and field of view of its camera.
+    """Solve one image by a `FieldSweep`.
 
     Parameters
     ----------
-    image : ndarray (h, w) of uint8 or uint16
-        Grey.
-    catalog : StarCatalog
-        The stars.
-    model : {"pinhole", "equidistant", "flat"}
-        Projection of the lens.
-    settings : DetectionSettings, optional
-        For the detection.
-    observer_velocity : array (3,), optional
-        As in `starid.interface.StarIdentifier.identify`.
-
-    Raises
-    ------
-    StaridError
-        The image is invalid for detection.
+    image, settings, observer_velocity
+        As in `FieldSweep.solve`.
+    catalog, model
+        As in `FieldSweep`.
     """
-    begin = time.perf_counter()
     height, width = image.shape
-    shape = (width / height) ** 0.5
-    cameras = [Camera.from_fov(field * shape, width, height, model) for field in FIELDS_DEG]
-    searches: dict[Camera, RoughSearch] = {}
-    first: ImageSolution | None = None
-    for view in views(image, settings):
-        if view.mirrored:
-            break
-        found = view.detections
-        for number in ALL_ROUNDS[:-1]:
-            for camera in cameras:
-                search = searches.get(camera) or RoughSearch(camera, catalog, fov_tolerance=TOLERANCE)
-                searches[camera] = search
-                solution = search.identify(found.xy_px, found.flux, rounds=[number])
-                if solution.valid:
-                    return refine_solution(solution, view, camera, search, begin, observer_velocity)
-                if first is None:
-                    first = ImageSolution(solution, found, camera, search.identifier.stars)
-                if solution.reason is Reason.TOO_FEW_STARS:
-                    break
-    if first is None:
-        raise StaridError("image: no view of it is available")
-    failed = dataclasses.replace(first.solution, elapsed=time.perf_counter() - begin)
-    return dataclasses.replace(first, solution=failed)
+    return FieldSweep(width, height, catalog, model=model).solve(image, settings, observer_velocity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,11 @@ from starid.thesis.features import FeatureVector
 from starid.thesis.frame_grid import DICTIONARY_SIZE, dictionary_cells
 from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
 from starid.thesis.matlab_lasso import matlab_path
+from starid.thesis.reference import ReferenceSearch, reference_path
 
 Precision = Literal["exact", "stored"]
 Choice = Literal["mse", "1se"]
-Solver = Literal["exact", "matlab"]
+Solver = Literal["exact", "matlab", "sklearn"]
 
 _WHOLE_SKY_DEG: Final = 720.0
 _CODES_PER_RADIAN: Final = 255.0 / (2.0 * math.pi)
@@ -448,7 +449,8 @@ class LostInSpace:
         doubt; this is what the published accuracy was made with. "stored": the 8-bit codes as they are.
     solver
         "exact": the LASSO's path, exactly. "matlab": as MATLAB's function `lasso` solves it by default, which is what
-        the published accuracy was made with.
+        the published accuracy was made with. "sklearn": nearest neighbours of the whole database and the LASSO of
+        scikit-learn, the same answers some hundred times slower (`starid.thesis.reference`).
 
     Raises
     ------
@@ -461,14 +463,17 @@ class LostInSpace:
     ) -> None:
         if precision not in ("exact", "stored"):
             raise DatabaseError(f"LSI: precision {precision!r} is unknown; one of exact, stored is needed")
-        if solver not in ("exact", "matlab"):
-            raise DatabaseError(f"LSI: solver {solver!r} is unknown; one of exact, matlab is needed")
+        if solver not in get_args(Solver):
+            raise DatabaseError(
+                f"LSI: solver {solver!r} is unknown; one of {', '.join(get_args(Solver))} is needed"
+            )
         self.database = database
         self.index = make_cell_index(database)
         self.arrays = cell_arrays(database)
         self.searched = SearchedCells(
             self.arrays, database.features, database.theta, precision == "exact", solver == "matlab"
         )
+        self._reference = ReferenceSearch(database) if solver == "sklearn" else None
 
     def solve(self, features: FeatureVector) -> LsiSolution:
         """Estimate boresight and roll from the features of one frame, searching the whole database."""
@@ -482,6 +487,8 @@ class LostInSpace:
         DatabaseError
             If the observation is not five finite numbers.
         """
+        if self._reference is not None:
+            return self.estimate(observation, *self.nearest(observation))
         self._check(observation)
         work = lsi_work()
         nearest = lsi_kernel(self.index, self.searched, observation, LAMBDAS, work)
@@ -497,11 +504,22 @@ class LostInSpace:
         if not math.isnan(theta_rad):
             cell = region_nearest(self.searched, observation, 0.0, 0.0, _WHOLE_SKY_DEG, theta_rad, found)
             return cell, float(found[0])
+        if self.searched.exact and self._reference is not None:
+            return self._reference.exact_nearest(observation)
         if self.searched.exact:
             return exact_nearest(self.index, self.arrays, observation, found), float(found[0])
-        cells = np.empty(1, dtype=np.int64)
-        stored_neighbours(self.index, observation * 2.55, found[:1], cells)
-        return int(cells[0]), math.sqrt(found[0]) / 2.55
+        distances, cells = self.neighbours(observation, 1)
+        return int(cells[0]), float(distances[0])
+
+    def neighbours(
+        self, observation: NDArray[np.float64], count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distances (count,) of the nearest cells by their stored codes, in any order, and these cells; −1 where there are fewer."""
+        if self._reference is not None:
+            return self._reference.nearest(observation, count)
+        distances, cells = np.empty(count), np.empty(count, dtype=np.int64)
+        stored_neighbours(self.index, observation * 2.55, distances, cells)
+        return np.sqrt(distances) / 2.55, cells
 
     def nearest_in_region(
         self,
@@ -525,7 +543,13 @@ class LostInSpace:
         """Dictionary, LASSO and estimates about a given cell."""
         self._check(observation)
         work = lsi_work()
-        estimate_from_cell(self.searched, cell, observation, LAMBDAS, work)
+        if self._reference is None:
+            estimate_from_cell(self.searched, cell, observation, LAMBDAS, work)
+        else:
+            fill_dictionary(self.searched, cell, work)
+            path = reference_path(work.dictionary, observation)
+            chosen = choose_lambdas(work.dictionary, observation, path, np.empty(LAMBDAS.size))
+            estimate_from_path(self.searched, cell, observation, LAMBDAS, path, chosen, work)
         return _solution(observation, cell, distance, work)
 
     def _check(self, observation: NDArray[np.float64]) -> None:

@@ -25,15 +25,15 @@ from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
+from starid.geometric.verified import VerifiedIdentifier
 from starid.solution import Reason, Solution
 from starid.solver_input import checked_detections
-from starid.thesis.cell_search import stored_neighbours
 from starid.thesis.coarse_match import next_candidate
 from starid.thesis.database import DatabaseParameters
 from starid.thesis.database_choice import given_database, obtain_database
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.frame_sky import UX, UZ
-from starid.thesis.lsi import LostInSpace
+from starid.thesis.lsi import LostInSpace, Solver
 from starid.wahba import solve_wahba
 
 STARS_PER_FIELD: Final = 60
@@ -116,6 +116,8 @@ class LsiOptions:
         Feature database to use instead of the cached one.
     cache
         Keep database and index in the cache folder.
+    solver
+        Solver of nearest neighbour and LASSO: "exact", "matlab", or "sklearn" for scikit-learn's (`LostInSpace`).
     """
 
     feature_limit: float | None = None
@@ -125,13 +127,14 @@ class LsiOptions:
     limiting_magnitude: float | None = None
     database: str | Path | None = None
     cache: bool = True
+    solver: Solver = "exact"
 
     def __post_init__(self) -> None:
         if self.neighbours < 1:
             raise StaridError(f"lsi neighbours: {self.neighbours} given, at least 1 needed")
 
 
-class LsiIdentifier:
+class LsiIdentifier(VerifiedIdentifier):
     """Star identification by the LSI algorithm, for one camera against one catalogue.
 
     Parameters
@@ -175,13 +178,13 @@ class LsiIdentifier:
             if options.database is None
             else given_database(Path(options.database), parameters, (self._catalog.identity, seen.identity))
         )
-        self.lost_in_space = LostInSpace(self.database)
+        self.lost_in_space = LostInSpace(self.database, solver=options.solver)
         self._offset_px = _OFFSET_SHARE * self.database.parameters.half_width_px
         self._neighbours = options.neighbours
         self._given_zero_point = options.zero_point
         self._zero_point = options.zero_point
         self._star_magnitude = self._magnitude_of_rank(share)
-        self.verifier = Identifier(
+        self._verifier = Identifier(
             camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
         )
         self.last_report = LsiReport(None, 0, 0, math.nan)
@@ -195,6 +198,11 @@ class LsiIdentifier:
     def catalog(self) -> StarCatalog:
         """The catalogue that `Solution.catalog_index` counts in."""
         return self._catalog
+
+    @property
+    def verifier(self) -> Identifier:
+        """What verifies and tracks."""
+        return self._verifier
 
     @property
     def zero_point(self) -> float | None:
@@ -297,27 +305,6 @@ class LsiIdentifier:
         reason = Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS
         return Solution.invalid(reason)
 
-    def track(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        predicted: Attitude | ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        window_px: float | None = None,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Attitude near a predicted one, as the verification finds it; the LSI algorithm has no tracking of its own.
-
-        Parameters
-        ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
-            As in `Identifier.track`.
-        """
-        return self.verifier.track(
-            xy_px, flux, predicted, xy_sigma_px, window_px=window_px, observer_velocity=observer_velocity
-        )
-
     def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
         """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""
         if self._given_zero_point is not None:
@@ -373,8 +360,7 @@ class LsiIdentifier:
         most = min(self._neighbours, self.database.cells)
         tried = np.empty(0)
         for count in sorted({min(stage, most) for stage in (*_STAGES, most)}):
-            distances, cells = np.empty(count), np.empty(count, dtype=np.int64)
-            stored_neighbours(self.lost_in_space.index, observation * 2.55, distances, cells)
+            distances, cells = self.lost_in_space.neighbours(observation, count)
             order = np.lexsort((cells, distances))
             centres = self.cell_centres(cells[order][cells[order] >= 0])
             spots = self._spots(centres)

@@ -3,14 +3,16 @@
 Nearest neighbour, LASSO and density-based clustering stand here in the words of their equations. The compiled code
 (`starid.thesis.cell_search`, `.lasso`, `.matlab_lasso`, `.fsf`) gives the same answers a hundred times faster; the tests
 compare the two. Use this module to read what the thesis does, or in the place of the compiled code where an answer is
-doubted.
+doubted: `LostInSpace(database, solver="sklearn")`, `solver = "sklearn"` in the table `[identifier]` of a profile, the solver
+`lsi-sklearn` of `starhil bench identify`, and `ReferenceFilter` as the filter of `starid.thesis.rsi`.
 """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,12 @@ from starid.thesis.false_stars import FilterResult, ObservedFrame
 from starid.thesis.features import FeatureVector
 from starid.thesis.fsf import EPSILON, MIN_SAMPLES_SHARE
 from starid.thesis.lasso import LAMBDAS
+
+CODES_PER_UNIT: Final = 2.55
+"""Codes of a stored feature per unit of the normalised scale."""
+
+NO_STAR: Final = 255
+"""Stored polar angle of a cell without stars."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +56,77 @@ class ReferenceAnswer:
     error_psi: float
 
 
+class ReferenceSearch:
+    """Nearest cells of a database by scikit-learn's `NearestNeighbors`, on the stored codes.
+
+    Parameters
+    ----------
+    database
+        Feature database; cells without a star are left out.
+    """
+
+    def __init__(self, database: FeatureDatabase) -> None:
+        from sklearn.neighbors import NearestNeighbors
+
+        self._database = database
+        self._cells = np.flatnonzero(database.theta != NO_STAR)
+        self._tree: Any = NearestNeighbors().fit(database.features[self._cells] / CODES_PER_UNIT)
+
+    def nearest(
+        self, observation: NDArray[np.float64], count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distances of the nearest cells, growing, and these cells, (count,) each; ∞ and −1 beyond the last."""
+        most = min(count, self._cells.size)
+        found = self._tree.kneighbors(observation[None, :], n_neighbors=most)
+        distances, cells = np.full(count, np.inf), np.full(count, -1, dtype=np.int64)
+        distances[:most], cells[:most] = found[0][0], self._cells[found[1][0]]
+        return distances, cells
+
+    def exact_nearest(self, observation: NDArray[np.float64]) -> tuple[int, float]:
+        """Cell nearest in full precision and its distance, eqs 2.12 and 2.29, of those whose codes leave it open."""
+        distances, _ = self.nearest(observation, 1)
+        # a code is off by half a step at most in each of five features: so are both distances that are compared
+        reach = distances[0] + 2.0 * np.sqrt(5.0) * (0.5 / CODES_PER_UNIT) + 1e-9
+        rows = self._tree.radius_neighbors(observation[None, :], radius=reach, return_distance=False)[0]
+        cells = np.sort(self._cells[rows])
+        vectors = [self._database.normalise(self._database.exact_features(int(cell))) for cell in cells]
+        exact = np.linalg.norm(np.array(vectors) - observation, axis=1)
+        best = int(np.argmin(exact))
+        return int(cells[best]), float(exact[best])
+
+
+def reference_path(
+    dictionary: NDArray[np.float64], observation: NDArray[np.float64], *, intercept: bool = False
+) -> NDArray[np.float64]:
+    """Weights ω of eq. 2.34 for each λ of `LAMBDAS`, (k, 9), by scikit-learn's coordinate descent.
+
+    Columns that are nearly alike keep it from the last digit of the minimum; its warning of that is not passed on.
+
+    Parameters
+    ----------
+    dictionary, observation
+        T, (5, 9), and ψ̂, (5,).
+    intercept
+        False: eq. 2.34 as printed. True: means and deviations of the columns taken out first, as MATLAB's `lasso` does.
+    """
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.linear_model import lasso_path
+
+    deviation = np.ones(dictionary.shape[1])
+    if intercept:
+        deviation = dictionary.std(axis=0)
+        dictionary, observation = dictionary - dictionary.mean(axis=0), observation - observation.mean()
+    falling = np.argsort(-LAMBDAS, kind="stable")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        _, weights, _ = lasso_path(
+            dictionary / deviation, observation, alphas=LAMBDAS[falling], tol=1e-8, max_iter=100_000
+        )
+    path = np.empty((LAMBDAS.size, deviation.size))
+    path[falling] = (weights / deviation[:, None]).T
+    return path
+
+
 @dataclass(frozen=True, eq=False)
 class ReferenceLostInSpace:
     """Algorithm 1: nearest neighbour, dictionary of nine cells, LASSO, weighted boresight.
@@ -55,37 +134,22 @@ class ReferenceLostInSpace:
     Attributes
     ----------
     database
-        Planar database of a size that fits into memory at full precision (p up to about 99 %).
+        Planar database.
     intercept
-        False: eq. 2.34 as printed. True: means and deviations of the columns taken out first, as MATLAB's `lasso` does,
-        but solved to the end.
+        As in `reference_path`; solved to the end, where MATLAB stops early.
     """
 
     database: FeatureDatabase
     intercept: bool = False
 
     @cached_property
-    def cells(self) -> NDArray[np.int64]:
-        """Cells that hold a star, (m,)."""
-        return np.flatnonzero(self.database.theta != 255)
-
-    @cached_property
-    def vectors(self) -> NDArray[np.float64]:
-        """Normalised features τ̂ of these cells in full precision, eq. 2.11, (m, 5)."""
-        rows = [self.database.normalise(self.database.exact_features(int(cell))) for cell in self.cells]
-        return np.array(rows)
-
-    @cached_property
-    def _neighbours(self) -> Any:
-        from sklearn.neighbors import NearestNeighbors
-
-        return NearestNeighbors(n_neighbors=1).fit(self.vectors)
+    def _search(self) -> ReferenceSearch:
+        return ReferenceSearch(self.database)
 
     def solve(self, features: FeatureVector) -> ReferenceAnswer:
         """Estimate boresight and polar angle from the features of one frame."""
         observation = self.database.normalise(features)
-        distance, row = self._neighbours.kneighbors(observation[None, :])
-        nearest = int(self.cells[row[0, 0]])  # eqs 2.12, 2.29
+        nearest, distance = self._search.exact_nearest(observation)  # eqs 2.12, 2.29
         grid = self.database.grid
         dictionary_cells = grid.dictionary(nearest)  # eq. 2.30
         frames = [self.database.exact_features(int(cell)) for cell in dictionary_cells]
@@ -103,7 +167,7 @@ class ReferenceLostInSpace:
             float(boresight[1]),
             float(theta),
             nearest,
-            float(distance[0, 0]),
+            distance,
             omega,
             penalty,
             float(np.linalg.norm(observation - dictionary @ omega)),  # eq. 2.20
@@ -113,17 +177,12 @@ class ReferenceLostInSpace:
         self, dictionary: NDArray[np.float64], observation: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], float]:
         """ω of least mean squared error among the λ of eq. 2.34, (9,), and its λ."""
-        from sklearn.linear_model import Lasso
-
-        deviation = dictionary.std(axis=0) if self.intercept else np.ones(dictionary.shape[1])
-        fits: list[tuple[float, NDArray[np.float64], float]] = []
-        for penalty in LAMBDAS:
-            model = Lasso(alpha=penalty, fit_intercept=self.intercept, tol=1e-8, max_iter=100_000)
-            fitted = model.fit(dictionary / deviation, observation)
-            error = float(np.mean((observation - fitted.predict(dictionary / deviation)) ** 2))
-            fits.append((error, np.asarray(fitted.coef_ / deviation, dtype=np.float64), float(penalty)))
-        _, omega, penalty = min(fits, key=lambda fit: fit[0])
-        return omega, penalty
+        path = reference_path(dictionary, observation, intercept=self.intercept)
+        residuals = observation - path @ dictionary.T
+        if self.intercept:
+            residuals -= residuals.mean(axis=1, keepdims=True)
+        best = int(np.argmin(np.mean(residuals**2, axis=1)))
+        return path[best], float(LAMBDAS[best])
 
 
 @dataclass(frozen=True, slots=True)

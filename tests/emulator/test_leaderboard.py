@@ -118,9 +118,9 @@ def test_a_solver_that_is_none_is_named(oracle, name: str, words: str) -> None:
 
 def test_every_row_of_the_leaderboard_has_its_field_and_limit() -> None:
     fields = bench._by_field(bench.LEADERBOARD, Camera.from_fov())
-    assert {width for width, _ in fields} == {None, 8.0, 20.0, 62.0}
+    assert sorted(round(camera.fov_deg) for camera, _ in fields) == [8, 20, 42, 42, 62]
     assert sorted(row for rows in fields.values() for row in rows) == sorted(bench.LEADERBOARD)
-    assert set(bench.STANDARD) <= set(fields[None, bench.PEER_LIMIT_V])
+    assert set(bench.STANDARD) <= set(fields[Camera.from_fov(), bench.PEER_LIMIT_V])
     assert set(CLASSICS) < set(ALL)
 
 
@@ -139,12 +139,13 @@ def test_scenes_keep_only_the_brightest_and_dense_ones_hold_a_thousand() -> None
 def test_a_tracking_row_gives_a_prediction_some_pixels_off(monkeypatch: pytest.MonkeyPatch) -> None:
     offsets = []
 
-    def made(name, camera, stars):
+    def made(name, camera, stars, **_):
         solver = make_solver("geometric", camera, stars)
 
-        def track(scene, predicted):
+        def track(scene, predicted, window_px):
             offsets.append(predicted.error_to(scene.attitude).total_arcsec)
-            return solver.track(scene, predicted)
+            assert window_px == pytest.approx(20.0)
+            return solver.track(scene, predicted, window_px)
 
         return type(solver)(solver.solve, track=track)
 

@@ -128,6 +128,7 @@ def test_without_a_thread_each_one_is_waited_for(factory):
         ("geometric", "blend_px", "x", r"identifier\.blend_px: 'x' given, float needed"),
         ("geometric", "blend_px", True, "True given, float needed"),
         ("lsi", "neighbours", 2.5, "2.5 given, int needed"),
+        ("lsi", "solver", 3, "3 given, str needed"),
         ("rsi", "limiting_magnitude", "x", "'x' given, float needed"),
     ],
 )

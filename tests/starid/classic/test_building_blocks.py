@@ -110,11 +110,17 @@ def test_oriented_triangles_tell_a_triangle_from_its_mirror_image() -> None:
     assert np.allclose(one[1], np.linalg.svd(stars, compute_uv=False)[1:])
 
 
-def test_a_grid_pattern_holds_each_cell_once_and_the_alignment_star_on_the_axis() -> None:
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_grid_pattern_holds_each_cell_once_and_the_alignment_star_on_the_axis(alike: bool) -> None:
     vectors = sky(400, 21)
-    start, owner = grid._patterns(vectors, 0.5, 0.05)
-    polar, _ = neighbour_list(vectors, 7, 0.5)
-    aligned = int(np.argmax(polar[:, 0] > 0.05))
+    polar, rows = neighbour_list(vectors, 7, 0.5)
+    beyond = polar[:, 0] > 0.05
+    magnitude = np.zeros(400)
+    if not alike:  # the nearest one is the faintest of all
+        magnitude = np.random.default_rng(4).random(400)
+        magnitude[rows[np.argmax(beyond)]] = 2.0
+    start, owner = grid.look_up_table(vectors, magnitude, 0.5, 0.05)
+    aligned = int(np.argmax(beyond & (magnitude[rows] <= np.median(magnitude[rows]))))
     angle = (polar[:, 1] - polar[aligned, 1]) % math.tau
     half = grid.GRID / 2
     x = half * (1.0 + polar[:, 0] / 0.5 * np.cos(angle))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -48,16 +49,23 @@ def test_bad_arrays_are_rejected_in_one_line(xy: object, flux: object, sigma: ob
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_too_few_detections_are_named(count: int) -> None:
+@pytest.mark.parametrize(
+    ("least", "ask"),
+    [
+        (4, lambda xy, flux: identifier().identify(xy, flux)),
+        (4, lambda xy, flux: identifier().verify(xy, flux, AT, window_px=12.0)),
+        (3, lambda xy, flux: identifier().track(xy, flux, AT)),
+        (2, lambda xy, flux: identifier().track(xy, flux, AT, np.full(len(flux), 0.3))),
+    ],
+)
+def test_too_few_detections_are_named(least: int, ask: Callable[..., Solution]) -> None:
     xy, flux, _ = sky(AT)
-    for solution in (
-        identifier().identify(xy[:count], flux[:count]),
-        identifier().track(xy[:count], flux[:count], AT),
-    ):
+    for count in range(least):
+        solution = ask(xy[:count], flux[:count])
         assert (solution.valid, solution.reason, solution.star_count) == (False, Reason.TOO_FEW_STARS, 0)
         with pytest.raises(StaridError, match="too_few_stars"):
             _ = solution.attitude
+    assert ask(xy[:least], flux[:least]).reason is not Reason.TOO_FEW_STARS
 
 
 def test_no_detections_may_come_as_an_empty_list() -> None:

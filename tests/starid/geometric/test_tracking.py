@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from starhil.emulator.benchmarks.scenes import SceneSettings
 from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
@@ -14,7 +16,7 @@ from starid.geometric.identifier import Effort, Identifier
 from starid.missing import missing_stars
 from starid.solution import Reason, Solution
 from starid.tracker import Tracker
-from tests.starid.geometric.sky_points import identifier, sky
+from tests.starid.geometric.sky_points import identifier, maker, sky
 
 RIGHT_ARCSEC = 60.0
 AT = Attitude.from_radec_roll(80.0, 10.0, 30.0)
@@ -175,3 +177,103 @@ def test_missing_stars_need_a_valid_solution_and_a_radius() -> None:
         missing_stars(Solution.invalid(Reason.NO_MATCH), DEFAULT_CAMERA, stars, xy)
     with pytest.raises(StaridError, match="radius_px"):
         missing_stars(identifier().identify(xy, flux), DEFAULT_CAMERA, stars, xy, radius_px=0.0)
+
+
+FEW = 300
+SCENE = SceneSettings(5.5, 0.5)
+
+
+def tracked(
+    settings: SceneSettings, prediction_px: float, *, known: bool = True, window_px: float | None = None
+) -> list[tuple[Solution, float]]:
+    """Solutions of scenes near a prediction, and the error of each in units of its own covariance."""
+    rng = np.random.default_rng(17)
+    found = []
+    for _ in range(FEW):
+        scene = maker().scene(settings, rng)
+        predicted = scene.attitude.rotated(prediction_px * PIXEL * rng.standard_normal(3))
+        errors = np.full(len(scene.flux), settings.sigma_px) if known else None
+        solution = identifier().track(scene.xy_px, scene.flux, predicted, errors, window_px=window_px)
+        off = math.nan
+        if solution.valid:
+            error = solution.attitude.error_to(scene.attitude).rotation_vector_rad
+            off = math.sqrt(float(error @ np.linalg.solve(solution.covariance, error)))
+        found.append((solution, off))
+    return found
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_three_stars_near_a_prediction_are_enough(known: bool) -> None:
+    found = tracked(replace(SCENE, kept=3), 3.0, known=known)
+    assert sum(solution.valid for solution, _ in found) >= 0.95 * FEW
+    right = [off for solution, off in found if solution.valid]
+    # a Student distribution of 3 degrees of freedom has long tails; of 13 it has not
+    assert max(right) < (30.0 if not known else 7.0)
+    assert all(solution.star_count == 3 for solution, _ in found if solution.valid)
+
+
+def test_two_stars_are_enough_where_errors_and_window_are_small() -> None:
+    found = tracked(replace(SCENE, sigma_px=0.05, kept=2), 0.3, window_px=2.0)
+    assert sum(solution.valid for solution, _ in found) >= 0.5 * FEW
+    assert max(off for solution, off in found if solution.valid) < 7.0
+
+
+def test_two_stars_in_a_wide_window_or_of_unknown_error_are_not() -> None:
+    wide = tracked(replace(SCENE, kept=2), 3.0)
+    assert not any(solution.valid for solution, _ in wide)
+    assert {solution.reason for solution, _ in wide} == {Reason.PREDICTION_LOST}
+    unknown = tracked(replace(SCENE, sigma_px=0.05, kept=2), 0.3, known=False, window_px=2.0)
+    assert {solution.reason for solution, _ in unknown} == {Reason.TOO_FEW_STARS}
+
+
+@pytest.mark.parametrize(("true", "false"), [(0, 3), (1, 2), (1, 1), (0, 2)])
+@pytest.mark.parametrize(("sigma_px", "prediction_px", "window_px"), [(0.5, 3.0, 20.0), (0.05, 0.3, 2.0)])
+def test_false_stars_do_not_make_an_answer_with_one_true_star(
+    true: int, false: int, sigma_px: float, prediction_px: float, window_px: float
+) -> None:
+    settings = SceneSettings(5.5, sigma_px, kept=max(true, 1), missing_stars=1 - true, false_stars=false)
+    found = tracked(settings, prediction_px, window_px=window_px)
+    assert not any(solution.valid for solution, _ in found)
+
+
+@pytest.mark.parametrize(("least", "most", "answered"), [(0.0, 0.05, False), (1.0, 1.2, True)])
+def test_a_pair_that_could_as_well_be_turned_about_is_not_answered(
+    least: float, most: float, answered: bool
+) -> None:
+    lenient = identifier().with_camera(DEFAULT_CAMERA, effort=Effort(max_false_probability_tracking=1e-3))
+    stars = identifier().stars.brighter_than(4.0)
+    separation_px = np.arccos(np.clip(stars.vectors @ stars.vectors.T, -1.0, 1.0)) / PIXEL
+    unlike = np.abs(stars.v[:, None] - stars.v[None, :])
+    near = (separation_px > 110.0) & (separation_px < 130.0)
+    answers = []
+    for pair in np.argwhere(near & (unlike >= least) & (unlike <= most))[:10]:
+        x, y, z = stars.vectors[pair].sum(axis=0)
+        ra, dec = math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
+        attitude = Attitude.from_radec_roll(ra, dec, 0.0)
+        xy, _ = DEFAULT_CAMERA.project(attitude.to_sensor(stars.vectors[pair]))
+        flux, errors = 10.0 ** (-0.4 * stars.v[pair]), np.full(2, 1e-4)
+        # within 140 px each star could be the other
+        answers.append(lenient.track(xy, flux, attitude, errors, window_px=140.0).valid)
+    assert len(answers) >= 6
+    assert sum(answers) >= 0.8 * len(answers) if answered else not any(answers)
+
+
+def test_three_stars_of_the_whole_sky_are_not_enough() -> None:
+    scene = maker().scene(replace(SCENE, sigma_px=0.05, kept=3), np.random.default_rng(2))
+    errors = np.full(3, 0.05)
+    assert identifier().identify(scene.xy_px, scene.flux, errors).reason is Reason.TOO_FEW_STARS
+    few = identifier().verify(scene.xy_px, scene.flux, scene.attitude, errors, window_px=12.0)
+    assert few.reason is Reason.TOO_FEW_STARS
+    assert identifier().track(scene.xy_px, scene.flux, scene.attitude, errors).valid
+
+
+def test_the_narrower_the_window_the_less_can_agree_by_chance() -> None:
+    scene = maker().scene(replace(SCENE, kept=3), np.random.default_rng(2))
+    errors = np.full(3, 0.5)
+    bounds = [
+        identifier()
+        .track(scene.xy_px, scene.flux, scene.attitude, errors, window_px=window)
+        .probability_false
+        for window in (5.0, 10.0, 20.0)
+    ]
+    assert 0.0 < bounds[0] < bounds[1] < bounds[2] < 1e-5

@@ -64,6 +64,21 @@ def test_lsi_at_the_poles_and_at_the_wrap(ra, dec):
     assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
 
 
+def test_the_solver_of_scikit_learn_gives_the_verified_answers_of_the_compiled_code():
+    reference = make_identifier("lsi", solver="sklearn")
+    rng = np.random.default_rng(8)
+    attitude = random_attitude(rng)
+    xy, flux = points(rng, attitude)
+    ours, theirs = lsi().identify(xy, flux), reference.identify(xy, flux)
+    assert theirs.valid
+    assert theirs.quaternion_xyzw == pytest.approx(ours.quaternion_xyzw, abs=1e-12)
+
+
+def test_an_unknown_solver_of_an_identifier_is_rejected():
+    with pytest.raises(DatabaseError, match="'octave' is unknown; one of exact, matlab, sklearn"):
+        make_identifier("lsi", solver="octave")
+
+
 def test_rsi_follows_a_turning_sensor_among_false_stars():
     rng = np.random.default_rng(6)
     recursion = RsiIdentifier()

@@ -93,5 +93,5 @@ def test_the_accuracy_of_the_1701_frames_is_the_published_one():
 
 
 def test_an_unknown_solver_is_rejected():
-    with pytest.raises(DatabaseError, match="one of exact, matlab"):
+    with pytest.raises(DatabaseError, match="one of exact, matlab, sklearn"):
         LostInSpace(database(96.0), solver="octave")

@@ -10,7 +10,8 @@ from sklearn.linear_model import Lasso
 
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.lasso import LAMBDAS, lasso_path
-from starid.thesis.reference import ReferenceFilter, ReferenceLostInSpace
+from starid.thesis.lsi import LostInSpace
+from starid.thesis.reference import ReferenceFilter, ReferenceLostInSpace, reference_path
 from starid.thesis.simulation import NoiseModel, moved_frames
 from tests.starid.thesis.thesis_sky import database, lost_in_space
 
@@ -77,3 +78,49 @@ def test_the_filter_is_the_clustering_of_scikit_learn(false_stars, factor):
         np.testing.assert_array_equal(result.true_before, expected.true_before)
         np.testing.assert_array_equal(result.true_now, expected.true_now)
         np.testing.assert_array_equal(result.matches, expected.matches)
+
+
+@pytest.mark.parametrize("precision", ["exact", "stored"])
+def test_the_solver_of_scikit_learn_finds_the_cells_and_weights_of_the_compiled_code(precision):
+    made = database(96.0)
+    compiled, reference = (
+        LostInSpace(made, precision=precision, solver=name) for name in ("exact", "sklearn")
+    )
+    for ra, dec in ((115.0, -65.0), (201.7, 40.2), (359.1, -20.6), (37.3, 11.9)):
+        observation = made.normalise(made.sky.features(ra, dec))
+        ours, theirs = (lsi.solve_normalised(observation) for lsi in (compiled, reference))
+        assert theirs.nearest == ours.nearest
+        assert theirs.distance == pytest.approx(ours.distance, abs=1e-6)
+        np.testing.assert_allclose(theirs.dictionary, ours.dictionary)
+        least, found = (
+            minimised(ours.dictionary, observation, omega, ours.mse.penalty)
+            for omega in (ours.mse.omega, theirs.mse.omega)
+        )
+        assert theirs.mse.penalty == ours.mse.penalty
+        assert least - 1e-9 <= found <= least + 1e-3
+
+
+def test_the_search_of_scikit_learn_lists_the_nearest_cells():
+    made = database(96.0)
+    compiled, reference = (LostInSpace(made, solver=name) for name in ("exact", "sklearn"))
+    observation = made.normalise(made.sky.features(88.0, 3.0))
+    for count in (1, 30, made.cells + 5):
+        ours, theirs = (np.sort(lsi.neighbours(observation, count)[0]) for lsi in (compiled, reference))
+        np.testing.assert_allclose(theirs, ours, atol=1e-6)
+    cells = reference.neighbours(observation, made.cells + 5)[1]
+    assert np.count_nonzero(cells < 0) >= 5
+
+
+def test_the_intercept_takes_the_means_out():
+    made = database(96.0)
+    cells = made.grid.dictionary(734)
+    dictionary = np.array([made.normalise(made.exact_features(int(cell))) for cell in cells]).T
+    observation = made.normalise(made.sky.features(115.0, -65.0))
+    path = reference_path(dictionary, observation, intercept=True)
+    shifted = reference_path(dictionary + 7.0, observation - 3.0, intercept=True)
+    np.testing.assert_allclose(shifted, path, atol=1e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        deviation = dictionary.std(axis=0)
+        expected = Lasso(alpha=5.0, tol=1e-8, max_iter=100_000).fit(dictionary / deviation, observation)
+    np.testing.assert_allclose(path[-1] * deviation, expected.coef_, atol=1e-3)
