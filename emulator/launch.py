@@ -1,18 +1,21 @@
-"""The composition root: makes an emulation with its truth log, faults, scenario and control channel."""
+"""The composition root: makes an emulation with its truth log, faults, scenario, control channel and console."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from starhil.emulator.console.obc import HOST_ADDRESS, MakeClient, ObcClient
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.faults import Faults
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
+from starhil.emulator.links.can import CanLink
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth_log import TruthLog
@@ -35,6 +38,12 @@ class RunOptions:
         Token that each request on the control channel must carry; empty for none.
     scenario
         Name or path of a scenario; empty for none.
+    view
+        Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT.
+    record
+        MCAP file of images, truth, telemetry and events.
+    make_client
+        Makes the OBC of console and recording; needed for these two.
     """
 
     truth_log: Path | None = None
@@ -42,6 +51,9 @@ class RunOptions:
     control: str = "off"
     control_token: str = ""
     scenario: str = ""
+    view: str = "off"
+    record: Path | None = None
+    make_client: MakeClient | None = None
 
 
 class Run:
@@ -71,6 +83,8 @@ class Run:
         self.control: ControlServer | None = None
         self._faults: Faults | None = None
         self._truth_log: TruthLog | None = None
+        self._closers: list[Callable[[], object]] = []
+        """Closers of console and recording, in the order of opening."""
 
     @property
     def faults(self) -> Faults:
@@ -109,6 +123,8 @@ class Run:
             if options.control != "off":
                 self.control = ControlServer(emulation, self._faults, self.ended.set, options.control_token)
                 emulation.ready_fields["control"] = await self.control.start(options.control)
+            if options.view != "off" or options.record is not None:
+                await self._open_console(self._faults)
         except (EmulatorError, ProtocolError):
             device.withdraw_start()
             raise
@@ -116,9 +132,57 @@ class Run:
 
     async def close(self) -> None:
         """Close the control channel, the emulation and the truth log, whatever fails to close."""
-        closers: list[Callable[[], object]] = [self.emulation.close]
+        closers: list[Callable[[], object]] = [*reversed(self._closers), self.emulation.close]
+        self._closers.clear()
         if self.control is not None:
             closers.insert(0, self.control.close)
         if self._truth_log is not None:
             closers.append(self._truth_log.close)
         await close_all(closers)
+
+    async def _open_console(self, faults: Faults) -> None:
+        """Open console and recording, with an OBC on the bus of the run."""
+        options, emulation = self.options, self.emulation
+        client = await self._open_obc()
+        if options.record is not None:
+            from starhil.emulator.console.recorder import Recorder
+
+            recorder = Recorder(emulation, client, options.record, overwrite=options.overwrite)
+            self._closers.append(recorder.close)
+            recorder.start()
+        if options.view != "off":
+            from starhil.emulator.console.console import Console
+            from starhil.emulator.console.server import ConsoleServer
+
+            control = ControlServer(emulation, faults, self.ended.set)
+            console = Console(emulation, control.execute, client)
+            self._closers.append(console.close)
+            console.start()
+            server = ConsoleServer(console)
+            self._closers.append(server.close)
+            emulation.ready_fields["view"] = await server.start(options.view)
+
+    async def _open_obc(self) -> ObcClient:
+        """Open an OBC on the CAN bus of the run, or on a virtual bus of its own if the run has none.
+
+        Raises
+        ------
+        EmulatorError
+            The caller has given no `make_client`.
+        """
+        make_client, emulation = self.options.make_client, self.emulation
+        if make_client is None:
+            raise EmulatorError("run: console and recording need make_client")
+        device = emulation.device
+        channel = emulation.ready_fields["can"] if emulation.can is not None else ""
+        if not channel:
+            from starhil.protocol.transports.can import open_can
+
+            channel = f"virtual:starhil-console-{os.getpid()}"
+            link = CanLink(emulation.requests, open_can(channel))
+            self._closers.append(link.close)
+            await link.start()
+        client = make_client(channel, device.icd, HOST_ADDRESS, lambda: int(device.parameters["can_address"]))
+        self._closers.append(client.close)
+        await client.start()
+        return client

@@ -63,13 +63,29 @@ def command(
         Path | None,
         typer.Option(help=output_help("CSV file of true and measured attitudes, one row per frame.")),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing truth log.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Overwrite an existing truth log or recording.")
+    ] = False,
     scenario: Annotated[
         str,
         typer.Option(
             help="Scenario of timed faults and attitude changes: a TOML file, or a name in configs/scenarios."
         ),
     ] = "",
+    view: Annotated[
+        str,
+        typer.Option(
+            metavar="[HOST:PORT]",
+            help="Serve the console, a web page, at this address; default 127.0.0.1 and a free port. The ready line "
+            "has the page's address with its token.",
+        ),
+    ] = "off",
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help=output_help("MCAP file of images, truth, telemetry and events, as Foxglove reads it.")
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Override a key of the profile: section.key=value. May be repeated."),
@@ -88,6 +104,7 @@ def command(
     import gc
     import logging
 
+    from starhil.emulator.cli.console_client import ConsoleClient
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.launch import Run, RunOptions
     from starhil.emulator.profile import load_profile
@@ -115,19 +132,22 @@ def command(
         overrides.append(f"run.seed={seed}")
     loaded = load_profile(profile, overrides)
     links = loaded.links
-    if (links.serial.port, links.can.channel, control) == ("off", "off", "off") and not (
-        links.canopen.node or truth_log
+    if (links.serial.port, links.can.channel, control, view) == ("off", "off", "off", "off") and not (
+        links.canopen.node or truth_log or record
     ):
         raise EmulatorError(
             "no link: the device cannot be reached and nothing is recorded; "
-            "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
+            "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
 
     if control_token is not None and not control_token:
         raise EmulatorError("--control-token: empty; give a text, or leave the option out")
-    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario)
-    if truth_log is not None:
-        prepare_output(truth_log, "--truth-log")
+    options = RunOptions(
+        truth_log, overwrite, control, control_token or "", scenario, view, record, ConsoleClient
+    )
+    for path, option in ((truth_log, "--truth-log"), (record, "--record")):
+        if path is not None:
+            prepare_output(path, option)
 
     async def run() -> None:
         import signal

@@ -60,11 +60,13 @@ class ScenarioEvent(Strict):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
-    def prepare(self, faults: Faults, set_truth: Callable[[TruthSource], None], folder: Path) -> Action:
-        """Return the action of the event; what it needs is read and checked now."""
+    def prepare(
+        self, faults: Faults, set_truth: Callable[[TruthSource], None], folder: Path, at_s: float
+    ) -> Action:
+        """Return the action of the event at a simulation time; what it needs is read and checked now."""
         if self.fault is not None:
             faults.check(self.fault)
-        truth = None if self.truth is None else self.truth.build(self.run_time_s, folder)
+        truth = None if self.truth is None else self.truth.build(at_s, folder)
 
         def act(_due_ns: int) -> None:
             if self.clear_faults:
@@ -73,7 +75,7 @@ class ScenarioEvent(Strict):
                 faults.inject(self.fault)
             if truth is not None:
                 set_truth(truth)
-            log.info("scenario at %g s", self.run_time_s)
+            log.info("scenario at %g s", at_s)
 
         return act
 
@@ -92,6 +94,7 @@ class Scenario(Strict):
         faults: Faults,
         set_truth: Callable[[TruthSource], None],
         folder: Path,
+        start_s: float = 0.0,
     ) -> None:
         """Schedule all events; files that they need are read and checked now.
 
@@ -105,6 +108,8 @@ class Scenario(Strict):
             Called with a new truth source.
         folder
             Folder that relative paths of truth files start from.
+        start_s
+            Simulation time from which the times of the events count, seconds.
 
         Raises
         ------
@@ -112,11 +117,12 @@ class Scenario(Strict):
             An event names a link that this run does not have, or a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
+            at_s = start_s + event.run_time_s
             try:
-                action = event.prepare(faults, set_truth, folder)
+                action = event.prepare(faults, set_truth, folder, at_s)
             except (EmulatorError, StaridError) as error:
                 raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
-            scheduler.at(round(event.run_time_s * NANOSECONDS), action)
+            scheduler.at(round(at_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:

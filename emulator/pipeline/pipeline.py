@@ -28,6 +28,7 @@ from starhil.emulator.pipeline.messages import (
     SolverSettings,
 )
 from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
+from starhil.emulator.pipeline.preview import make_preview
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame, Renderer
@@ -149,13 +150,16 @@ class Pipeline:
         self._last = frame
         rendered = time.perf_counter()
         if not request.solve:
-            return FrameResult(request.index, solved=False, render_s=rendered - begin)
+            preview = make_preview(frame, self.camera, sensor, sky) if request.preview else None
+            return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
         found = detect(frame.image, detection_settings(sensor, request.settings))
         detected = time.perf_counter()
         identifier, current = self._identifiers.get(self._identifier_setup(request.settings))
         solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
         result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        if request.preview:
+            result = replace(result, preview=make_preview(frame, self.camera, sensor, sky, found, solution))
         return result if current else replace(result, index_pending=True)
 
     def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
