@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -51,6 +52,8 @@ class Emulation:
         Profile of the unit.
     worker
         Pipeline worker that was started earlier; by default one is started here.
+    previews
+        Somebody may look at the frames.
 
     Attributes
     ----------
@@ -62,8 +65,11 @@ class Emulation:
         self,
         profile: Profile,
         worker: WorkerProcess | None = None,
+        *,
+        previews: bool = False,
     ) -> None:
         self.profile = profile
+        self._previews = previews
         self.clock: Clock = make_clock(profile.run.clock)
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
@@ -108,7 +114,7 @@ class Emulation:
         return self.requests.device
 
     def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
-        setup = pipeline_setup(self.profile)
+        setup = replace(pipeline_setup(self.profile), previews=self._previews)
         if self.profile.run.worker == "process":
             return ProcessImager(setup, worker or WorkerProcess())
         if worker is not None:

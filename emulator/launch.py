@@ -55,6 +55,11 @@ class RunOptions:
     record: Path | None = None
     make_client: MakeClient | None = None
 
+    @property
+    def watched(self) -> bool:
+        """Whether a console or a recording looks at the frames."""
+        return self.view != "off" or self.record is not None
+
 
 class Run:
     """An emulation with its truth log, faults, scenario and control channel.
@@ -77,8 +82,8 @@ class Run:
     def __init__(
         self, profile: Profile, options: RunOptions | None = None, worker: WorkerProcess | None = None
     ) -> None:
-        self.emulation = Emulation(profile, worker)
         self.options = options or RunOptions()
+        self.emulation = Emulation(profile, worker, previews=self.options.watched)
         self.ended = asyncio.Event()
         self.control: ControlServer | None = None
         self._faults: Faults | None = None
@@ -123,7 +128,7 @@ class Run:
             if options.control != "off":
                 self.control = ControlServer(emulation, self._faults, self.ended.set, options.control_token)
                 emulation.ready_fields["control"] = await self.control.start(options.control)
-            if options.view != "off" or options.record is not None:
+            if options.watched:
                 await self._open_console(self._faults)
         except (EmulatorError, ProtocolError):
             device.withdraw_start()

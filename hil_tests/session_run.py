@@ -26,6 +26,7 @@ from starhil.hil_tests.results import (
     prepare_report,
     write_junit,
 )
+from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
@@ -51,6 +52,8 @@ class SessionRequest:
     truth: Path | None = None
     keep_going: bool = False
     quiet: bool = False
+    view: str | None = None
+    """Address of the console that shows the results; `auto` with `start`: that of the started emulator."""
 
 
 def find_script(path: Path) -> Path:
@@ -107,6 +110,8 @@ def run_session(request: SessionRequest) -> SessionResult:
             bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
             for link in bench.links:
                 bench.client(link)  # report a missing port before the first step
+            if request.view is not None:
+                show = _shown_on_console(request.view, script, bench, stack, show)
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
     except EmulatorProcessError as error:
         if result is None:
@@ -125,6 +130,31 @@ def run_session(request: SessionRequest) -> SessionResult:
     if not request.quiet:
         _print_summary(result, folder)
     return result
+
+
+def _shown_on_console(
+    view: str, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
+) -> Callable[[StepResult], None]:
+    """Return what shows a result on the console too."""
+    address = console_address(view, bench.emulator)
+    unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
+    planned = len(script.steps) * (len(bench.links) if script.link == "both" else 1)
+    feed = stack.enter_context(
+        RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
+    )
+
+    def show_on_both(result: StepResult) -> None:
+        show(result)
+        feed.result(
+            result.name,
+            result.status,
+            result.detail,
+            identity=str(result.number),
+            link=result.link,
+            seconds=result.seconds,
+        )
+
+    return show_on_both
 
 
 def _options(request: SessionRequest, script: Script) -> LinkOptions:
@@ -162,6 +192,7 @@ def _emulator(
             settings=wanted.settings,
             state_dir=state,
             truth_log=truth_log,
+            extra=["--view", "auto"] if request.view == "auto" else (),
         )
     )
 

@@ -39,6 +39,8 @@ class PipelineSetup:
     build_in_background
         Solve with the current star index while another is built. If false, frames wait for the new index, so
         that a run on the stepped clock is reproducible byte for byte.
+    previews
+        Somebody may look at the frames: be ready to make previews.
     """
 
     camera: dict[str, Any]
@@ -50,6 +52,7 @@ class PipelineSetup:
     algorithm: str
     seed: int
     build_in_background: bool = False
+    previews: bool = False
 
 
 @dataclass(frozen=True)

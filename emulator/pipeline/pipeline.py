@@ -116,6 +116,7 @@ class Pipeline:
             exposure_s=0.1,
             gain=self._sensor.gain,
             settings=settings,
+            preview=self._setup.previews,
         )
         if helper is not None:
             for rate in _WARM_UP_RATES_RAD_S:
