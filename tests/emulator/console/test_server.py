@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from contextlib import AsyncExitStack
 
 import aiohttp
 import numpy as np
@@ -81,6 +82,10 @@ class Page:
         return await self.until(
             lambda: next((item for item in self.messages if item["type"] == kind and condition(item)), None)
         )
+
+    async def until_frame(self, number):
+        """Wait for the frame of a number."""
+        await self.until(lambda: self.frames and column(self.frames[-1][0]["row"], "frame") == number)
 
     async def get(self, path):
         async with self.session.get(self.url(path)) as response:
@@ -341,7 +346,7 @@ def test_the_wire_is_decoded_for_those_who_look_and_saved_as_a_candump_log(run):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:
             await page.ask(do="subscribe", wire=True)
-            peer = open(emulation.ready_fields["serial"], "r+b", buffering=0)  # noqa: ASYNC230, PTH123, SIM115
+            peer = open(emulation.ready_fields["serial"], "r+b", buffering=0)  # noqa: PTH123, SIM115
             peer.write(bytes.fromhex("1F7FE61FFF"))
             request = await page.message(
                 "wire", lambda item: any("quaternion?" in line["text"] for line in item["lines"])
@@ -360,19 +365,14 @@ def test_five_pages_receive_every_frame(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
-        pages = [Page(emulation) for _ in range(5)]
-        for page in pages:
-            await page.__aenter__()
-            await page.ask(do="subscribe", frames=True)
-        for _ in range(3):
-            await emulation.stepper.step(1.0)
-            number = emulation.device.cycle.published
+        async with AsyncExitStack() as stack:
+            pages = [await stack.enter_async_context(Page(emulation)) for _ in range(5)]
             for page in pages:
-                await page.until(
-                    lambda page=page: page.frames and column(page.frames[-1][0]["row"], "frame") == number
-                )
-        for page in pages:
-            await page.__aexit__()
+                await page.ask(do="subscribe", frames=True)
+            for _ in range(3):
+                await emulation.stepper.step(1.0)
+                for page in pages:
+                    await page.until_frame(emulation.device.cycle.published)
 
     run(scenario, options=OPTIONS)
 
