@@ -25,7 +25,7 @@ export class Telecommands {
     this.log = this.log || make("ol", { class: "log scroll", id: "sent" });
     this.steps = make("output", { class: "num dim", text: "0 sent" });
     const save = make("a", { class: "button", id: "save-session", href: address("/session.toml"), download: "session.toml", title: "what this console has sent, for `starhil session`", text: "save as session" });
-    const clear = make("button", { type: "button", text: "clear", onclick: () => this.clear() });
+    const clear = make("button", { type: "button", id: "clear-session", text: "clear", onclick: () => this.clear() });
     this.host.replaceChildren(this.select, this.form, make("div", { class: "bar" }, make("h2", { text: "Sent" }), this.steps, make("span", { class: "spacer" }), save, clear), this.log);
     this.choose(this.chosen && this.rows.has(this.chosen) ? this.chosen : hello.telecommands[0].name);
   }
