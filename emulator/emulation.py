@@ -34,7 +34,7 @@ from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveFeed, LiveTruth
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.values import Value
 
 log = logging.getLogger("starhil.run")
@@ -57,6 +57,8 @@ class Emulation:
 
     Attributes
     ----------
+    icd
+        Interface definition of the profile's unit.
     ready_fields
         Fields of the ready line: which port, bus or address was opened for what.
     """
@@ -70,6 +72,7 @@ class Emulation:
     ) -> None:
         self.profile = profile
         self._previews = previews
+        self.icd = load_unit(profile.unit_source)
         self.clock: Clock = make_clock(profile.run.clock)
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
@@ -133,7 +136,7 @@ class Emulation:
         truth = await self.open_truth(self.profile.truth)
         stepped = isinstance(self.clock, SteppedClock)
         background = run_at_once if stepped else self._in_background()
-        device = Device(self.profile, load_icd(), self.clock, self.imager, store, truth, background)
+        device = Device(self.profile, self.icd, self.clock, self.imager, store, truth, background)
         self._requests = Requests(device)
         device.on_frame.append(_log_frame)
         device.power_on()
@@ -225,7 +228,8 @@ class Emulation:
         stepped = isinstance(
             self.clock, SteppedClock
         )  # no time passes between two frames or bytes of one event
-        if links.serial.port != "off":
+        self._check_links()
+        if links.serial.port != "off" and self.icd.link.serial is not None:
             from starhil.protocol.transports.serial import open_serial
 
             baud = int(device.parameters["serial_baud"])
@@ -236,16 +240,39 @@ class Emulation:
             transport = open_serial(links.serial.port, baud, symlink=symlink, paced=paced)
             self.serial = SerialLink(requests, transport, seed)
             self.ready_fields["serial"] = await self.serial.start()
-            self.ready_fields["dialect"] = str(device.parameters["serial_dialect"])
-        if links.can.channel != "off":
+            if self.serial.dialect is not None:
+                self.ready_fields["dialect"] = self.serial.dialect.value
+        if links.can.channel != "off" and self.icd.link.can is not None:
             from starhil.protocol.transports.can import open_can
 
             self.can = CanLink(
                 requests, open_can(links.can.channel), 0.0 if stepped else links.can.frame_gap_s, seed
             )
             self.ready_fields["can"] = await self.can.start()
-        if links.canopen.node:
+        if self._canopen_wanted:
             await self._open_canopen(requests)
+
+    @property
+    def _canopen_wanted(self) -> bool:
+        """Whether a node is asked for, or CANopen is the only link that the unit has."""
+        links, has = self.profile.links, self.icd.link
+        only = self.icd.canopen is not None and has.serial is None and has.can is None
+        return bool(links.canopen.node) or (only and links.can.channel != "off")
+
+    def _check_links(self) -> None:
+        """Check that the unit has the links that the profile asks for by more than `auto`, and any at all."""
+        links, has = self.profile.links, self.icd.link
+        for key, wanted, there in (
+            ("serial.port", links.serial.port not in ("off", "auto"), has.serial is not None),
+            (
+                "can.channel",
+                links.can.channel not in ("off", "auto") and not links.canopen.node,
+                has.can is not None or self.icd.canopen is not None,
+            ),
+            ("canopen.node", bool(links.canopen.node), self.icd.canopen is not None),
+        ):
+            if wanted and not there:
+                raise EmulatorError(f"links.{key}: unit {self.icd.name} has no such link")
 
     async def _open_canopen(self, requests: Requests) -> None:
         """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""

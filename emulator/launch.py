@@ -7,8 +7,9 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from starhil.emulator.console.obc import HOST_ADDRESS, MakeClient, ObcClient
+from starhil.emulator.console.obc import MakeClient, ObcClient, ObcPort
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.faults import Faults
 from starhil.emulator.control.scenario import load_scenario
@@ -16,6 +17,7 @@ from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth_log import TruthLog
@@ -168,7 +170,7 @@ class Run:
             emulation.ready_fields["view"] = await server.start(options.view)
 
     async def _open_obc(self) -> ObcClient:
-        """Open an OBC on the CAN bus of the run, or on a virtual bus of its own if the run has none.
+        """Open an OBC on the CAN bus of the run, or on a link of its own if the unit has no bus there.
 
         Raises
         ------
@@ -178,16 +180,30 @@ class Run:
         make_client, emulation = self.options.make_client, self.emulation
         if make_client is None:
             raise EmulatorError("run: console and recording need make_client")
-        device = emulation.device
-        channel = emulation.ready_fields["can"] if emulation.can is not None else ""
-        if not channel:
-            from starhil.protocol.transports.can import open_can
+        device, has = emulation.device, emulation.icd.link
+        bus: Literal["can", "serial", ""] = "can" if has.can is not None else ""
+        where = emulation.ready_fields["can"] if emulation.can is not None else ""
+        own: SerialLink | CanLink | None = None
+        from starhil.protocol.transports.can import open_can
+        from starhil.protocol.transports.serial import open_serial
 
-            channel = f"virtual:starhil-console-{os.getpid()}"
-            link = CanLink(emulation.requests, open_can(channel))
-            self._closers.append(link.close)
-            await link.start()
-        client = make_client(channel, device.icd, HOST_ADDRESS, lambda: int(device.parameters["can_address"]))
+        if bus and not where:
+            where = f"virtual:starhil-console-{os.getpid()}"
+            own = CanLink(emulation.requests, open_can(where))
+        elif not bus and has.serial is not None:
+            bus = "serial"
+            own = SerialLink(emulation.requests, open_serial("auto", paced=False))
+        if own is not None:
+            self._closers.append(own.close)
+            where = await own.start()
+        port = ObcPort(
+            bus,
+            where,
+            emulation.icd,
+            device_address=lambda: int(device.parameters["can_address"]),
+            dialect=lambda: own.dialect if isinstance(own, SerialLink) else None,
+        )
+        client = make_client(port)
         self._closers.append(client.close)
         await client.start()
         return client

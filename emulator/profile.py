@@ -17,6 +17,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import FixedConfig, Strict, TruthConfig
 from starhil.emulator.validation_messages import explain
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_EXTENDS_DEPTH: Final = 8
@@ -167,6 +168,8 @@ class Profile(Strict):
 
     name: str = DEFAULT_PROFILE
     """Name in messages and on the control channel."""
+    unit: str = DEFAULT_UNIT
+    """Interface definition: the name of a unit that ships with starhil, or a folder relative to the profile."""
     run: RunConfig = RunConfig()
     """Seed, clock, algorithm, files."""
     catalog: CatalogConfig = CatalogConfig()
@@ -189,6 +192,8 @@ class Profile(Strict):
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)
     """Notes that `starhil calibrate` writes for people; not used."""
+    health: dict[str, float] = Field(default_factory=dict)
+    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit; 0 unless given."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Defaults of device parameters, named as in the interface definition."""
 
@@ -198,6 +203,12 @@ class Profile(Strict):
     def source(self) -> str:
         """The profile's file, or its name if it has none, for messages."""
         return self.name if self._source is None else str(self._source)
+
+    @property
+    def unit_source(self) -> str:
+        """The unit for `load_unit`: a folder beside the profile's file, else its name or path as given."""
+        beside = self.folder / Path(self.unit).expanduser()
+        return str(beside) if "/" in self.unit or beside.is_dir() else self.unit
 
     @property
     def folder(self) -> Path:

@@ -13,8 +13,9 @@ from starhil.hil_tests.errors import BadReplyError, BenchError, NackError, NoRep
 from starhil.hil_tests.images import Image, download_by_bursts, download_by_frames
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
+from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import Value
 
@@ -35,8 +36,8 @@ class AsyncObcClient:
     ----------
     link : HostLink
         A serial line or a CAN bus.
-    icd : InterfaceDefinition, optional
-        Names and layouts; default: the one of the package.
+    icd : InterfaceDefinition
+        Names and layouts of the unit.
     timeout_s : float
         Default time-out of a reply, s.
     retries : int
@@ -46,13 +47,13 @@ class AsyncObcClient:
     def __init__(
         self,
         link: HostLink[Any],
-        icd: InterfaceDefinition | None = None,
+        icd: InterfaceDefinition,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         retries: int = 0,
     ) -> None:
         self.link = link
-        self.icd = load_icd() if icd is None else icd
+        self.icd = icd
         self.timeout_s = timeout_s
         self.retries = retries
         self.transactions: deque[Transaction] = deque(maxlen=HISTORY_LENGTH)
@@ -84,7 +85,7 @@ class AsyncObcClient:
         NackError, NoReplyError, BadReplyError, LinkLostError
         """
         row = self.icd.telemetry[name]
-        request = Request(RequestKind.TELEMETRY, row.id)
+        request = self.icd.request(row)
         reply, latency = await self.transact(
             request, row.name, row.size, timeout_s=timeout_s, retries=retries
         )
@@ -131,7 +132,10 @@ class AsyncObcClient:
     ) -> Ack:
         """Send a telecommand with its parameters as bytes, well-formed or not."""
         row = self.icd.telecommands[name]
-        request = Request(RequestKind.TELECOMMAND, row.id, data)
+        request = self.icd.request(row, data)
+        if not row.answers:
+            self.link.request(request, 0)
+            return Ack(row.name, 0.0)
         _reply, latency = await self.transact(request, row.name, 0, timeout_s=timeout_s, retries=retries)
         return Ack(row.name, latency)
 
@@ -271,8 +275,7 @@ class AsyncObcClient:
         if reply.kind is not ReplyKind.NACK:
             self.transactions.append(Transaction(name, "ok", latency))
             return reply, latency
-        names = self.icd.enums["error_code"].names
-        code_name = names.get(int(reply.code), "unpublished code")
+        code_name = self.icd.error_name(int(reply.code))
         self.transactions.append(Transaction(name, code_name, latency))
         raise NackError(name, int(reply.code), code_name)
 
@@ -286,14 +289,14 @@ class AsyncObcClient:
             return
         if self._pending is not None:
             request, future = self._pending
-            fits = reply.id is None or reply.id == request.id
+            fits = reply.id is None or (reply.id, reply.klass) == (request.id, request.klass)
             if fits and reply.kind in _ANSWERS[request.kind] and not future.done():
                 future.set_result((reply, now))
                 return
         self.stray_replies.append(reply)
 
     def _on_unsolicited(self, reply: Reply) -> None:
-        row = self.icd.row_by_id(reply.id) if reply.id is not None else None
+        row = self._row_of(reply)
         if row is None or row.kind != "telemetry" or len(reply.data) != row.size:
             self.stray_replies.append(reply)
         else:
@@ -302,8 +305,11 @@ class AsyncObcClient:
                 self.unsolicited_dropped += 1
             self.unsolicited.put_nowait(self._reading(reply, 0.0))
 
+    def _row_of(self, reply: Reply) -> Row | None:
+        return None if reply.id is None else self.icd.rows_by_key.get((reply.klass, reply.id))
+
     def _reading(self, reply: Reply, latency: float) -> Reading:
-        row = self.icd.telemetry_by_id[reply.id] if reply.id is not None else None
+        row = self._row_of(reply)
         if row is None:
             raise BadReplyError("a reply without an identifier")
         try:

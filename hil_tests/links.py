@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Generic, Protocol, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
-from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_stack import CubeSpaceStack, HostEnd, build_serial_stack
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -30,7 +32,7 @@ Item_contra = TypeVar("Item_contra", bytes, CanFrame, contravariant=True)
 class Receiver(Protocol[Item_contra]):
     """The host side of a framing: items in, replies and faults out."""
 
-    def feed(self, item: Item_contra, now: float, /) -> list[Reply | LinkFault]:
+    def feed(self, item: Item_contra, now: float, /) -> Sequence[Reply | LinkFault]:
         """Decode an item received at a time in seconds."""
 
     def flush(self, now: float) -> list[LinkFault]:
@@ -140,14 +142,16 @@ class HostLink(ABC, Generic[Item]):
 
 
 class SerialHostLink(HostLink[bytes]):
-    """A serial line in one of the three reply dialects.
+    """A serial line, framed as the unit's definition says.
 
     Parameters
     ----------
+    icd : InterfaceDefinition
+        The unit.
     spec : str
         `/dev/…` or `socket://host:port`.
     dialect : Dialect
-        Form of the replies.
+        Form of the replies, for units of the CubeSpace family.
     baud : int
         Bit rate of a real line.
     log : WireLog, optional
@@ -158,6 +162,7 @@ class SerialHostLink(HostLink[bytes]):
 
     def __init__(
         self,
+        icd: InterfaceDefinition,
         spec: str,
         *,
         dialect: Dialect = Dialect.B,
@@ -165,21 +170,22 @@ class SerialHostLink(HostLink[bytes]):
         log: WireLog | None = None,
     ) -> None:
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
-        self._dialect = dialect
-        self._host_receiver = HostReceiver(dialect)
+        self._stack = build_serial_stack(icd)
+        self._dialect = dialect if isinstance(self._stack, CubeSpaceStack) else None
+        self._host_receiver = self._stack.host(self._dialect)
 
     @property
-    def _receiver(self) -> HostReceiver:
+    def _receiver(self) -> HostEnd:
         return self._host_receiver
 
     def request(self, request: Request, reply_size: int) -> None:
         """Frame and send a request."""
         self._host_receiver.expect(request, reply_size)
-        self.send(encode_request(request))
+        self.send(self._stack.encode_request(request))
 
     def reset_receiver(self) -> None:
         """Discard the beginning of a reply."""
-        self._host_receiver = HostReceiver(self._dialect)
+        self._host_receiver = self._stack.host(self._dialect)
 
 
 class CanHostLink(HostLink[CanFrame]):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from functools import cached_property
 from typing import Any, Final, Literal
 
@@ -32,17 +33,29 @@ from starhil.protocol.values import (
 RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
-_SCALARS: Final[dict[str, Any]] = {
-    "u8": construct.Int8ul,
-    "i8": construct.Int8sl,
-    "u16": construct.Int16ul,
-    "i16": construct.Int16sl,
-    "u32": construct.Int32ul,
-    "i32": construct.Int32sl,
-    "u64": construct.Int64ul,
-    "i64": construct.Int64sl,
-    "f32": construct.Float32l,
-    "f64": construct.Float64l,
+Order = Literal["little", "big"]
+
+_SCALARS: Final[dict[tuple[str, Order], Any]] = {
+    ("u8", "little"): construct.Int8ul,
+    ("i8", "little"): construct.Int8sl,
+    ("u16", "little"): construct.Int16ul,
+    ("i16", "little"): construct.Int16sl,
+    ("u32", "little"): construct.Int32ul,
+    ("i32", "little"): construct.Int32sl,
+    ("u64", "little"): construct.Int64ul,
+    ("i64", "little"): construct.Int64sl,
+    ("f32", "little"): construct.Float32l,
+    ("f64", "little"): construct.Float64l,
+    ("u8", "big"): construct.Int8ub,
+    ("i8", "big"): construct.Int8sb,
+    ("u16", "big"): construct.Int16ub,
+    ("i16", "big"): construct.Int16sb,
+    ("u32", "big"): construct.Int32ub,
+    ("i32", "big"): construct.Int32sb,
+    ("u64", "big"): construct.Int64ub,
+    ("i64", "big"): construct.Int64sb,
+    ("f32", "big"): construct.Float32b,
+    ("f64", "big"): construct.Float64b,
 }
 
 
@@ -58,6 +71,7 @@ class Slot:
     """First byte in the row."""
     size: int
     """Number of bytes."""
+    order: Order = "little"
 
     @cached_property
     def bits_key(self) -> str:
@@ -93,6 +107,16 @@ class Field:
     wrap: bool = False
     """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
     nearest limit."""
+    value: str | None = None
+    """Name of the quantity that a telemetry field reports."""
+    argument: str | None = None
+    """Name of the action's argument that a telecommand field gives."""
+    const: int | float | None = None
+    """The only value of the field."""
+    telecommand: str | None = None
+    """Telecommand whose last accepted value a telemetry field reports."""
+    aliases: Mapping[str, str] = dataclass_field(default_factory=dict)
+    """Values of the quantity that go out as another member of the enumeration."""
 
     @property
     def type(self) -> str:
@@ -118,10 +142,11 @@ class Field:
     def raw_limits(self) -> tuple[int, int]:
         """Lowest and highest raw value of an integer, flag, bit group or enumeration."""
         low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
-        if self.minimum is not None:
-            low = max(low, round((self.minimum - self.bias) / self.scale))
-        if self.maximum is not None:
-            high = min(high, round((self.maximum - self.bias) / self.scale))
+        lowest, highest = (self.minimum, self.maximum) if self.scale > 0.0 else (self.maximum, self.minimum)
+        if lowest is not None:
+            low = max(low, round((lowest - self.bias) / self.scale))
+        if highest is not None:
+            high = min(high, round((highest - self.bias) / self.scale))
         return low, high
 
     @cached_property
@@ -132,7 +157,8 @@ class Field:
             low = -widest if self.minimum is None else self.minimum
             return low, widest if self.maximum is None else self.maximum
         low_raw, high_raw = self.raw_limits
-        return low_raw * self.scale + self.bias, high_raw * self.scale + self.bias
+        low, high = low_raw * self.scale + self.bias, high_raw * self.scale + self.bias
+        return (low, high) if self.scale > 0.0 else (high, low)
 
     @cached_property
     def _divisor(self) -> int | None:
@@ -143,6 +169,8 @@ class Field:
     @cached_property
     def empty(self) -> bool | int | float | str | bytes:
         """The value if none is given: the default, else the value nearest zero within the limits."""
+        if self.const is not None:
+            return self.const
         if self.default is not None:
             return self.default
         match self.kind:
@@ -166,7 +194,7 @@ class Field:
         if self.wrap:
             return False
         low, high = self.physical_limits
-        margin = self.scale / 2.0 if self.kind == "integer" else 0.0
+        margin = abs(self.scale) / 2.0 if self.kind == "integer" else 0.0
         return not low - margin <= value <= high + margin
 
     def to_raw(
@@ -311,10 +339,12 @@ def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
                 for field in reversed(fields)  # construct declares the most significant bit first
             )
         )
-        return slot.bits_key / construct.ByteSwapped(bits)
+        return slot.bits_key / (construct.ByteSwapped(bits) if slot.order == "little" else bits)
     if not fields[0].name:
         return construct.Padding(slot.size)
-    return fields[0].name / (construct.Bytes(slot.size) if slot.type == "bytes" else _SCALARS[slot.type])
+    return fields[0].name / (
+        construct.Bytes(slot.size) if slot.type == "bytes" else _SCALARS[slot.type, slot.order]
+    )
 
 
 @dataclass(frozen=True, repr=False)
@@ -333,6 +363,14 @@ class Row:
     doc: str = ""
     provenance: str = "ours"
     source: str = ""
+    klass: str = ""
+    """Name of the row's class, where the unit's rows have classes."""
+    action: str | None = None
+    """What a telecommand does."""
+    arguments: Mapping[str, bool | int | float | str] = dataclass_field(default_factory=dict)
+    """Arguments of the action that no field gives."""
+    answers: tuple[str, ...] = ("reply",)
+    """Answers in their order: `echo`, `reply`, `row:NAME`."""
 
     def __repr__(self) -> str:
         """Return kind, id and name."""
@@ -384,7 +422,7 @@ class Row:
             where = f"{self.name}.{name}"
             value = given.get(name)
             if value is None:
-                if self.kind == "telecommand" and item.default is None:
+                if self.kind == "telecommand" and item.default is None and item.const is None:
                     raise FieldError(f"{where}: no value given", index=index)
                 value = item.empty
             group = raw[item.slot.bits_key] if item.width else raw

@@ -1,4 +1,4 @@
-"""Schema of interface definition files; it rejects unknown keys and wrong types."""
+"""Schema of the files of a unit's interface definition; it rejects unknown keys and wrong types."""
 
 from __future__ import annotations
 
@@ -6,26 +6,66 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from starhil.protocol.link_schema import LinkModel
+
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Provenance = Literal["confirmed", "proxy", "ours"]
 ScalarType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 FieldType = Literal[
     "u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64",
-    "enum8", "enum16", "bits8", "bits16", "bits32", "bytes", "text",
+    "enum8", "enum16", "enum32", "bits8", "bits16", "bits32", "bytes", "text",
 ]  # fmt: skip
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
+Kind = Literal["telecommand", "telemetry"]
+Order = Literal["little", "big"]
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+Scalar = bool | int | float | str
+Code = Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
 class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class DefinitionModel(_Model):
-    """Header of a definition: its name, version and description."""
+class UnitModel(_Model):
+    """Name, version and description of a unit."""
 
     name: str
     version: str
     doc: str
+    first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    """Ids from this one up are telemetry, those below are telecommands; left out if classes or rows decide."""
+    plugin: str | None = None
+    """Python file beside the definition, with quantities, actions, framings or checks of the unit's own."""
+
+
+class ConventionsModel(_Model):
+    """How the unit reports attitude, vectors and time, in all rows alike."""
+
+    quaternion: Literal["rotation", "attitude"] = "rotation"
+    """`rotation`: v_sensor = q v q*; `attitude`: its conjugate, as in a textbook's A(q)."""
+    scalar_sign: Literal["positive", "any"] = "positive"
+    """Whether the scalar part is never negative, or the sign is that of the solution."""
+    axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] = ["+x", "+y", "+z"]
+    """Axes of the reported frame in terms of the sensor's."""
+    epoch: str = "unix"
+    """Zero of times: `unix`, `gps`, `j2000`, `midnight` (of the day), or a date such as 2000-01-01."""
+    byte_order: Order = "little"
+
+
+class ClassModel(_Model):
+    """A class of rows, by which a request says what it is."""
+
+    name: Name
+    kind: Kind
+    code: Code | None = None
+    """Its code in a request."""
+    reply: Code | None = None
+    """Its code in a reply; that of the request unless given."""
+    unsolicited: Code | None = None
+    """Its code in unsolicited telemetry; that of the reply unless given."""
+    answer: list[str] | None = None
+    """Answers of its rows: `echo`, `reply`, `row:NAME`; `["reply"]` unless given."""
 
 
 class EnumModel(_Model):
@@ -33,74 +73,102 @@ class EnumModel(_Model):
 
     name: Name
     doc: str
-    values: dict[Name, Annotated[int, Field(ge=0, le=0xFFFF)]] = Field(min_length=1)
+    values: dict[Name, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(min_length=1)
 
 
-class BitModel(_Model):
-    """One bit or a group of bits; unused if it has no name."""
+class _BoundModel(_Model):
+    """What fields and bits have in common: where their value comes from, or goes to."""
 
     name: Name | None = None
-    width: Annotated[int, Field(ge=1, le=31)] = 1
     enum: str | None = None
-    default: bool | int | str | None = None
+    default: Scalar | None = None
     parameter: str | None = None
+    """Name of the parameter that the field sets or reports."""
+    value: str | None = None
+    """Quantity that the field of a telemetry row reports."""
+    argument: str | None = None
+    """Argument of the row's action that the field of a telecommand gives."""
+    const: int | float | None = None
+    """Value that is always sent, and required in a telecommand."""
+    map: dict[str, Scalar | list[Scalar]] | None = None
+    """Number on the wire → value of the quantity or argument, or several values for one number."""
     doc: str = ""
 
 
-class FieldModel(_Model):
+class BitModel(_BoundModel):
+    """One bit or a group of bits, the lowest first; unused if it has no name."""
+
+    width: Annotated[int, Field(ge=1, le=31)] = 1
+
+
+class RepeatModel(_Model):
+    """A group of fields that follows `count` times; `[n]` in a quantity's name is the number of the repetition."""
+
+    count: Annotated[int, Field(ge=1, le=256)]
+    fields: list[FieldModel] = Field(min_length=1)
+
+
+class FieldModel(_BoundModel):
     """One field of a row; unused and sent as zeros if it has no name."""
 
-    name: Name | None = None
     count: Annotated[int, Field(ge=2, le=64)] | None = None
     """Expands to the fields name_1 … name_count."""
-    type: FieldType
+    repeat: RepeatModel | None = None
+    """A repeated group in place of one field."""
+    type: FieldType | None = None
     size: Annotated[int, Field(ge=1, le=4096)] | None = None
     """Bytes of a `bytes` or `text` field."""
+    order: Order | None = None
+    """Order of the bytes; that of the unit unless given."""
     unit: str = ""
-    scale: Annotated[float, Field(gt=0)] = 1.0
+    scale: float = 1.0
+    """Physical = raw * scale + offset."""
     offset: float = 0.0
     min: float | None = None
     max: float | None = None
-    default: bool | int | float | str | None = None
-    enum: str | None = None
     bits: list[BitModel] = []
-    parameter: str | None = None
-    """Name of the parameter that the field sets or reports."""
     wrap: bool = False
     """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
     nearest limit."""
     provenance: Provenance | None = None
-    doc: str = ""
 
 
 class RowModel(_Model):
     """A telecommand or telemetry row."""
 
-    id: Annotated[int, Field(ge=0, le=255)]
-    last_id: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Expands to the rows name_1 … for the ids id … last_id, all with the same layout."""
+    id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    """Expands to the rows name_1 … for the ids id … last_id, all with the same layout; `[n]` is their number."""
     name: Name
+    class_: str | None = Field(default=None, alias="class")
     doc: str
     provenance: Provenance
     source: str = ""
-    size: Annotated[int, Field(ge=0, le=4096)]
+    size: Annotated[int, Field(ge=0, le=4096)] | None = None
+    """Bytes of data, to check the fields against."""
     fields: list[FieldModel] | None = None
     include: list[str] | None = None
     """Names of rows whose fields this row concatenates, in order."""
+    action: str | None = None
+    """What a telecommand does."""
+    arguments: dict[Name, Scalar] = {}
+    """Arguments of the action that no field gives; the text `[n]` is the number of an expanded row."""
+    answer: list[str] | None = None
+    """Answers in their order: `echo`, `reply`, `row:NAME`; those of the class unless given."""
 
 
 class ParameterModel(_Model):
-    """A parameter of the device."""
+    """A parameter of the device that the unit exposes; what is left out is as in the device model."""
 
     id: Annotated[int, Field(ge=1, le=254)]
     name: Name
-    type: ParameterType
-    unit: str = ""
+    type: ParameterType | None = None
+    unit: str | None = None
     min: float | None = None
     max: float | None = None
-    default: bool | int | float | str
+    default: Scalar | None = None
     enum: str | None = None
-    doc: str
+    doc: str | None = None
 
 
 class SectionModel(_Model):
@@ -115,11 +183,74 @@ class SectionModel(_Model):
 class FileModel(_Model):
     """One file of a definition."""
 
-    definition: DefinitionModel | None = None
+    unit: UnitModel | None = None
+    conventions: ConventionsModel | None = None
+    class_: list[ClassModel] = Field(default=[], alias="class")
+    errors: dict[str, Annotated[int, Field(ge=0, le=0xFFFF)]] | None = None
+    """Number on the wire of each error: ok, invalid_id, invalid_length …, and `other` for the rest."""
     enum: list[EnumModel] = []
     telecommand: list[RowModel] = []
     telemetry: list[RowModel] = []
     parameter: list[ParameterModel] = []
     section: list[SectionModel] = []
+    link: LinkModel | None = None
     canopen: dict[str, object] | None = None
     """The CANopen mapping, read by `starhil.protocol.canopen.layout`."""
+
+
+class QuantityModel(_Model):
+    """A quantity of the device model."""
+
+    name: str
+    """Dotted; `[n]` stands for a number from 1 to `count`."""
+    type: Literal["bool", "int", "float", "text", "bytes"]
+    enum: str | None = None
+    unit: str = ""
+    count: Annotated[int, Field(ge=1)] | None = None
+    doc: str
+
+
+class ArgumentModel(_Model):
+    """An argument of an action."""
+
+    name: str
+    type: Literal["bool", "int", "float", "text", "bytes"]
+    enum: str | None = None
+    unit: str = ""
+    count: Annotated[int, Field(ge=1)] | None = None
+    default: Scalar | None = None
+    required: bool = False
+    doc: str
+
+
+class ActionModel(_Model):
+    """An action of the device model."""
+
+    name: Name
+    doc: str
+    arguments: list[ArgumentModel] = []
+
+
+class DeviceParameterModel(_Model):
+    """A parameter of the device model."""
+
+    name: Name
+    type: ParameterType
+    unit: str = ""
+    min: float | None = None
+    max: float | None = None
+    default: Scalar
+    enum: str | None = None
+    doc: str
+
+
+class DeviceModelFile(_Model):
+    """`configs/units/model.toml`."""
+
+    enum: list[EnumModel]
+    parameter: list[DeviceParameterModel]
+    quantity: list[QuantityModel]
+    action: list[ActionModel]
+
+
+RepeatModel.model_rebuild()

@@ -53,6 +53,8 @@ class ReplyKind(Enum):
     UNSOLICITED = "unsolicited"
     EVENT = "event"
     BURST = "burst"
+    ECHO = "echo"
+    """The request itself, sent back."""
 
 
 class FaultKind(Enum):
@@ -64,6 +66,10 @@ class FaultKind(Enum):
     """A message began and did not end."""
     UART_OVERLONG = "uart_overlong"
     """A message longer than the receiver accepts."""
+    UART_CHECK = "uart_check"
+    """A message whose check is wrong."""
+    UART_ADDRESS = "uart_address"
+    """A message to another address."""
     CAN_SEQUENCE = "can_sequence"
     """A segment out of order."""
     CAN_INCOMPLETE = "can_incomplete"
@@ -85,7 +91,13 @@ class Request:
     """Id on the wire, 0 to 255."""
     data: bytes = b""
     source: int = 0
-    """CAN address of the sender; 0 on serial."""
+    """Address of the sender; 0 on a serial line whose messages carry none."""
+    klass: str = ""
+    """Class of the row, where the unit's rows have classes."""
+    sequence: int = 0
+    """Number of the message, where its header has one; the reply repeats it."""
+    flags: int = 0
+    """Flags of its header; the reply repeats them."""
 
     @classmethod
     def of(cls, row_id: int, data: bytes = b"", source: int = 0) -> Request:
@@ -106,9 +118,46 @@ class Reply:
     code: ErrorCode | int = ErrorCode.OK
     """Error code of a NACK; an unpublished code is a plain number."""
     destination: int = 0
-    """CAN address of the receiver (set on the device side); 0 on serial."""
+    """Address of the receiver (set on the device side); 0 on a serial line whose messages carry none."""
     source: int = 0
-    """CAN address of the sender (set on the OBC side); 0 on serial."""
+    """Address of the sender (set on the OBC side); 0 on a serial line whose messages carry none."""
+    klass: str = ""
+    """Class of the row, where the unit's rows have classes."""
+    sequence: int = 0
+    flags: int = 0
+    final: bool = True
+    """Whether no further reply to the same request follows."""
+    uptime_ns: int = 0
+    """Time since the device started, where the header carries `ticks`."""
+    time_ns: int = 0
+    """Time of the device's clock since the unit's epoch, where the header carries `time`."""
+
+    @classmethod
+    def echo(cls, request: Request) -> Reply:
+        """Return the repetition of a request."""
+        return cls(
+            ReplyKind.ECHO,
+            request.id,
+            request.data,
+            destination=request.source,
+            klass=request.klass,
+            sequence=request.sequence,
+            flags=request.flags,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MessageClass:
+    """A class of rows: the codes that stand for it on the wire, None where the header has no class."""
+
+    name: str
+    kind: RequestKind
+    code: int | None = None
+    """In a request."""
+    reply: int | None = None
+    """In the reply; that of the request unless given."""
+    unsolicited: int | None = None
+    """In telemetry that nobody asked for; that of the reply unless given."""
 
 
 @dataclass(frozen=True, slots=True)

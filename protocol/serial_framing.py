@@ -88,9 +88,13 @@ class Deframer:
         first_is_id: bool,
         max_size: int = DEFAULT_MAX_SIZE,
         timeout_s: float = DEFAULT_TIMEOUT_S,
+        escape: int = ESCAPE,
+        end: int = END,
     ) -> None:
         check_receiver_limits(max_size, timeout_s)
         self._starts = starts
+        self._escape = escape
+        self._end = end
         self._first_is_id = first_is_id
         self._max_size = max_size
         self._timeout_s = timeout_s
@@ -125,7 +129,11 @@ class Deframer:
         if state is _State.IDLE:
             return []
         if state is _State.IDLE_ESCAPED:
-            return [] if in_junk else [LinkFault(FaultKind.UART_PROTOCOL, "escape byte 1F outside a message")]
+            return (
+                []
+                if in_junk
+                else [LinkFault(FaultKind.UART_PROTOCOL, f"escape byte {self._escape:02X} outside a message")]
+            )
         text = f"message of {size} bytes without end after {self._timeout_s:g} s of silence"
         return [LinkFault(FaultKind.UART_INCOMPLETE, text)]
 
@@ -133,14 +141,14 @@ class Deframer:
         """Process one byte, or all up to the next escape byte; return the position after it."""
         match self._state:
             case _State.IDLE | _State.BODY:
-                escape = data.find(ESCAPE, position)
+                escape = data.find(self._escape, position)
                 end = len(data) if escape < 0 else escape
                 if end > position:
                     self._add_plain_bytes(data[position:end])
                     return end
                 self._state = _State.BODY_ESCAPED if self.busy else _State.IDLE_ESCAPED
             case _State.FIRST:
-                if data[position] == ESCAPE:
+                if data[position] == self._escape:
                     self._state = _State.FIRST_ESCAPED if self._first_is_id else _State.BODY_ESCAPED
                 else:
                     self._state = _State.BODY
@@ -166,22 +174,22 @@ class Deframer:
         if byte in self._starts:
             self._start_message(byte)
             return
-        self._report_junk(ESCAPE)
-        if byte != ESCAPE:
+        self._report_junk(self._escape)
+        if byte != self._escape:
             self._state = _State.IDLE
 
     def _after_first_escape(self, byte: int) -> None:
-        if byte == END or byte in self._starts:
+        if byte == self._end or byte in self._starts:
             self._after_body_escape(byte)
             return
         self._state = _State.BODY
-        self._add_plain_bytes(bytes((ESCAPE,) if byte == ESCAPE else (ESCAPE, byte)))
+        self._add_plain_bytes(bytes((self._escape,) if byte == self._escape else (self._escape, byte)))
 
     def _after_body_escape(self, byte: int) -> None:
         self._state = _State.BODY
-        if byte == ESCAPE:
-            self._add_plain_bytes(bytes((ESCAPE,)))
-        elif byte == END:
+        if byte == self._escape:
+            self._add_plain_bytes(bytes((self._escape,)))
+        elif byte == self._end:
             body = bytes(self._body)
             self._reset(in_junk=False)
             if body:

@@ -1,60 +1,68 @@
-"""The console's OBC: the client of the bench on the bus of a run."""
+"""The console's OBC: the client of the bench on a link of a run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from typing import Any
 
-from starhil.emulator.console.obc import Exchange
+from starhil.emulator.console.obc import HOST_ADDRESS, Exchange, ObcPort
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
-from starhil.hil_tests.links import CanHostLink
+from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
 from starhil.protocol.codec import Row
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.messages import Request, RequestKind
+from starhil.protocol.serial_framing import Dialect
 
 
 class ConsoleClient:
-    """An OBC for the console on a CAN channel.
+    """An OBC for console and recording.
 
     Parameters
     ----------
-    channel
-        Channel of the bus.
-    icd
-        Interface definition.
-    host_address
-        CAN address of this OBC.
-    device_address
-        Returns the device's present CAN address, which a telecommand may change.
+    port
+        Where the device is found.
     """
 
-    def __init__(
-        self, channel: str, icd: InterfaceDefinition, host_address: int, device_address: Callable[[], int]
-    ) -> None:
-        self._device_address = device_address
-        self._link = CanHostLink(channel, host_address=host_address, device_address=device_address())
-        self._client = AsyncObcClient(self._link, icd)
+    def __init__(self, port: ObcPort) -> None:
+        self._port = port
+        self._client: AsyncObcClient | None = None
+        self._settings: tuple[object, ...] = ()
+        """Settings of the device for which the client was made."""
 
     async def start(self) -> None:
-        """Join the bus."""
+        """Open the link."""
+        port = self._port
+        self._settings = self._present_settings()
+        link: HostLink[Any]
+        if port.bus == "can":
+            link = CanHostLink(port.where, host_address=HOST_ADDRESS, device_address=port.device_address())
+        elif port.bus == "serial":
+            link = SerialHostLink(port.icd, port.where, dialect=port.dialect() or Dialect.B)
+        else:
+            return
+        self._client = AsyncObcClient(link, port.icd)
         await self._client.start()
 
     async def close(self) -> None:
-        """Leave the bus."""
-        await self._client.close()
+        """Close the link."""
+        if self._client is not None:
+            await self._client.close()
+            self._client = None
+
+    def _present_settings(self) -> tuple[object, ...]:
+        return self._port.device_address(), self._port.dialect()
 
     async def exchange(self, row: Row, data: bytes) -> Exchange:
         """Send a telecommand, or request telemetry, and wait for the reply."""
-        telecommand = row.kind == "telecommand"
-        kind = RequestKind.TELECOMMAND if telecommand else RequestKind.TELEMETRY
-        if self._link.device_address != self._device_address():
-            self._link.device_address = self._device_address()
-            self._link.reset_receiver()
+        if self._settings != self._present_settings():  # a telecommand has changed them
+            await self.close()
+            await self.start()
+        if self._client is None:
+            return Exchange("no_link", f"{row.name}: the unit has CANopen only; use a CANopen master")
+        request = self._port.icd.request(row, data)
         begin = time.perf_counter()
         try:
             reply, latency = await self._client.transact(
-                Request(kind, row.id, data), row.name, 0 if telecommand else row.size
+                request, row.name, 0 if row.kind == "telecommand" else row.size
             )
         except NackError as error:
             return Exchange(error.code_name, str(error), time.perf_counter() - begin, refused=True)

@@ -25,7 +25,6 @@ from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import log_internal_error, one_line
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.serial_framing import Dialect
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.console")
@@ -67,7 +66,9 @@ class Console:
         self.history = History()
         self.runs = Runs(self._broadcast)
         self.trace = WireTrace(
-            device.icd, emulation.links, lambda: Dialect(str(device.parameters["serial_dialect"]))
+            device.icd,
+            emulation.links,
+            lambda: None if emulation.serial is None else emulation.serial.dialect,
         )
         self.stepping = StepRunner(execute)
         self.viewers: set[Viewer] = set()
@@ -287,8 +288,8 @@ class Console:
 
     async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
-        device = int(self._emulation.device.parameters["can_address"])
-        return {"problem": problem, **request_bytes(row, data, HOST_ADDRESS, device)}
+        icd, address = self._emulation.icd, int(self._emulation.device.parameters["can_address"])
+        return {"problem": problem, **request_bytes(icd, row, data, HOST_ADDRESS, address)}
 
     async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         exchange = await self.obc.send(str(request.get("row")), _table(request, "values"))

@@ -63,6 +63,7 @@ def describe_row(row: Row, icd: InterfaceDefinition) -> dict[str, Any]:
     return {
         "id": row.id,
         "name": row.name,
+        "class": row.klass,
         "size": row.size,
         "doc": row.doc,
         "provenance": row.provenance,
@@ -77,7 +78,7 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
         "type": field.type,
         "unit": field.unit,
         "doc": field.doc,
-        "default": field.default,
+        "default": field.default if field.const is None else field.const,
     }
     if field.kind in ("integer", "bits", "float"):
         low, high = field.physical_limits
@@ -97,8 +98,8 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
 
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
     """Return the controls of the faults by level: name, kind and range of each value."""
-    causes = list(icd.enums["reset_cause"].values)
-    errors = [name for name, code in icd.enums["device_error"].values.items() if code != NO_ERROR]
+    causes = list(icd.enum("reset_cause").values)
+    errors = [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR]
     device = [
         {**control, "values": {"error": errors, "reset": causes}.get(control["name"])}
         for control in _model_controls(DeviceFault)

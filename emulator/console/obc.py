@@ -6,11 +6,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal, Protocol
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.values import FieldError, Value
 
 HOST_ADDRESS: Final = 253
@@ -61,8 +62,33 @@ class ObcClient(Protocol):
         """Send a telecommand, or request telemetry, and wait for the reply."""
 
 
-MakeClient = Callable[[str, InterfaceDefinition, int, Callable[[], int]], ObcClient]
-"""Makes an OBC from a CAN channel, the interface definition, its own address, and a function of the device's."""
+@dataclass(frozen=True)
+class ObcPort:
+    """Where an OBC finds the device.
+
+    Attributes
+    ----------
+    bus
+        `can`, `serial`, or empty for a unit that an OBC cannot speak to without CANopen.
+    where
+        Channel or port.
+    icd
+        Interface definition of the device.
+    device_address
+        Returns the device's present CAN address, which a telecommand may change.
+    dialect
+        Returns the present dialect of serial replies; None for a unit that has no dialects.
+    """
+
+    bus: Literal["can", "serial", ""]
+    where: str
+    icd: InterfaceDefinition
+    device_address: Callable[[], int]
+    dialect: Callable[[], Dialect | None]
+
+
+MakeClient = Callable[[ObcPort], ObcClient]
+"""Makes the OBC at a port."""
 
 
 @dataclass(frozen=True)

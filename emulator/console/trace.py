@@ -24,7 +24,8 @@ from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver, encode_request
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_stack import HostEnd, build_serial_stack
 
 KEPT_ITEMS: Final = 20_000
 """Newest items of the trace, for export."""
@@ -34,6 +35,15 @@ DECODED_PER_TURN: Final = 200
 
 SHOWN_VALUES: Final = 8
 """Most values of a row in one line."""
+
+MOST_ADDRESSES: Final = 64
+"""Addresses whose segments are joined; random identifiers of a wire fault would make ever new ones."""
+
+_REQUEST_TYPES: Final = (
+    MessageType.TELECOMMAND,
+    MessageType.TELEMETRY_REQUEST,
+    MessageType.TELECOMMAND_EXTENDED,
+)
 
 _CANOPEN: Final = (
     (0x080, "SYNC or EMCY"), (0x180, "TPDO 1"), (0x200, "RPDO 1"), (0x280, "TPDO 2"), (0x300, "RPDO 2"),
@@ -75,11 +85,11 @@ class WireTrace:
     links
         Links of the device.
     dialect
-        Returns the present dialect of serial replies.
+        Returns the present dialect of serial replies; None for a unit that has no dialects.
     """
 
     def __init__(
-        self, icd: InterfaceDefinition, links: Sequence[Link], dialect: Callable[[], Dialect]
+        self, icd: InterfaceDefinition, links: Sequence[Link], dialect: Callable[[], Dialect | None]
     ) -> None:
         self._links = links
         self._decoder = Decoder(icd, dialect)
@@ -136,14 +146,15 @@ class Decoder:
     icd
         Interface definition.
     dialect
-        Returns the present dialect of serial replies.
+        Returns the present dialect of serial replies; None for a unit that has no dialects.
     """
 
-    def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect]) -> None:
+    def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect | None]) -> None:
         self._icd = icd
         self._dialect = dialect
-        self._to_device = DeviceReceiver()
-        self._from_device: tuple[Dialect, HostReceiver] | None = None
+        self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
+        self._to_device = self._stack.device() if self._stack is not None else None
+        self._from_device: tuple[Dialect | None, HostEnd] | None = None
         self._can: dict[tuple[bool, int], CanDeviceReceiver | CanHostReceiver] = {}
 
     def line(self, entry: WireItem) -> dict[str, Any]:
@@ -166,34 +177,32 @@ class Decoder:
         }
 
     def _serial_text(self, data: bytes, now: float, *, outgoing: bool) -> tuple[str, str]:
+        if self._stack is None or self._to_device is None:
+            return "part", "bytes"
         dialect = self._dialect()
         if self._from_device is None or self._from_device[0] is not dialect:
-            self._from_device = (dialect, HostReceiver(dialect))
+            self._from_device = (dialect, self._stack.host(dialect))
         host = self._from_device[1]
-        events: Sequence[Request | Reply | LinkFault]
         if outgoing:
-            events = host.feed(data, now)
-        else:
-            events = self._to_device.feed(data, now)
-            for event in events:
-                if isinstance(event, Request):
-                    row = self._icd.row_by_id(event.id)
-                    size = row.size if row is not None and event.kind is RequestKind.TELEMETRY else 0
-                    host.expect(event, size)
-        return self._texts(events, "part of a message")
+            return self._texts(host.feed(data, now), "part of a message")
+        requests = self._to_device.feed(data, now)
+        for event in requests:
+            if isinstance(event, Request):
+                row = self._row(event)
+                telemetry = row is not None and row.kind == "telemetry"
+                host.expect(event, row.size if row is not None and telemetry else 0)
+        return self._texts(requests, "part of a message")
 
     def _can_text(self, frame: CanFrame, now: float) -> tuple[str, str]:
         if not frame.extended:
             return "canopen", canopen_text(frame)
+        if self._icd.link.can is None:
+            return "part", "29-bit frame"
         can_id = CanId.unpack(frame.id)
-        request = can_id.type in (
-            MessageType.TELECOMMAND,
-            MessageType.TELEMETRY_REQUEST,
-            MessageType.TELECOMMAND_EXTENDED,
-        )
+        request = can_id.type in _REQUEST_TYPES
         key = (request, can_id.destination)
         if key not in self._can:
-            if len(self._can) >= 64:
+            if len(self._can) >= MOST_ADDRESSES:
                 self._can.clear()
             self._can[key] = (CanDeviceReceiver if request else CanHostReceiver)(can_id.destination)
         row = self._icd.row_by_id(can_id.id)
@@ -207,17 +216,23 @@ class Decoder:
             return "part", nothing
         return found[-1][0], "; ".join(text for _, text in found)
 
+    def _row(self, message: Request | Reply) -> Row | None:
+        """Return the row of a message, by class and id, else by its id alone."""
+        if message.id is None:
+            return None
+        return self._icd.rows_by_key.get((message.klass, message.id)) or self._icd.row_by_id(message.id)
+
     def _text(self, event: Request | Reply | LinkFault) -> tuple[str, str]:
         if isinstance(event, LinkFault):
             return "fault", f"{event.kind.value}: {event.detail}"
-        row = None if event.id is None else self._icd.row_by_id(event.id)
+        row = self._row(event)
         name = row.name if row is not None else f"id {event.id}"
         if isinstance(event, Request):
-            values = "" if event.kind is RequestKind.TELEMETRY else _values(row, event.data)
-            return event.kind.value, f"{name}{values}{'' if event.kind is RequestKind.TELECOMMAND else '?'}"
+            if event.kind is RequestKind.TELEMETRY:
+                return "telemetry", f"{name}?"
+            return "telecommand", f"{name}{_values(row, event.data)}"
         if event.kind is ReplyKind.NACK:
-            code = self._icd.enums["error_code"].names.get(int(event.code), str(int(event.code)))
-            return "nack", f"{name} refused: {code}"
+            return "nack", f"{name} refused: {self._icd.error_name(int(event.code))}"
         if event.kind is ReplyKind.ACK:
             return "ack", f"{name} accepted"
         return "reply", f"{name}{_values(row, event.data)}"
@@ -255,12 +270,13 @@ def canopen_text(frame: CanFrame) -> str:
     return f"COB-ID {frame.id:03X}"
 
 
-def request_bytes(row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
-    """Return a telecommand as it goes over a serial line, and as arguments of cansend."""
-    request = Request.of(row.id, data, host)
-    frames = encode_request_frames(request, host, device)
+def request_bytes(icd: InterfaceDefinition, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
+    """Return a telecommand as it goes over the links of the unit: bytes in hexadecimal, arguments of cansend."""
+    request = icd.request(row, data, host)
+    serial = build_serial_stack(icd).encode_request(request).hex(" ").upper() if icd.link.serial else ""
+    frames = encode_request_frames(request, host, device) if icd.link.can else []
     return {
         "data": data.hex(" ").upper(),
-        "serial": encode_request(request).hex(" ").upper(),
+        "serial": serial,
         "cansend": [f"{frame.id:08X}#{frame.data.hex().upper()}" for frame in frames],
     }

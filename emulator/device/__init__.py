@@ -1,1 +1,1 @@
-"""The device: modes, parameters, time, frames, and the handlers of every row of the interface definition."""
+"""The device: modes, parameters, time, frames, and the quantities and actions that rows are bound to."""

@@ -12,6 +12,8 @@ _FLAG_OF_FAULT: Final[dict[FaultKind, str]] = {
     FaultKind.UART_PROTOCOL: "uart_protocol_error",
     FaultKind.UART_OVERLONG: "uart_protocol_error",
     FaultKind.UART_INCOMPLETE: "uart_incomplete",
+    FaultKind.UART_CHECK: "uart_check_error",
+    FaultKind.UART_ADDRESS: "uart_address_error",
     FaultKind.CAN_SEQUENCE: "can_telecommand_error",
     FaultKind.CAN_INCOMPLETE: "can_telecommand_error",
     FaultKind.CAN_LENGTH: "can_telecommand_error",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
@@ -15,15 +16,19 @@ from starhil.emulator.device.modes import Mode, Modes, Transition
 from starhil.emulator.device.parameters import Parameters, ParameterValue
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.state_store import StateStore
+from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, log_internal_error, one_line
 from starhil.emulator.pipeline.imager import Imager
-from starhil.emulator.pipeline.messages import FrameRequest
+from starhil.emulator.pipeline.messages import IDENTITY, FrameRequest, Quaternion
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.truth.source import TruthSource
+from starhil.protocol.codec import Field
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import Value
+from starid.camera import Camera
 
 log = logging.getLogger("starhil.device")
 
@@ -128,12 +133,19 @@ class Device:
             lambda: float(self.parameters["exposure"]) / 1000.0,
         )
         self.files = FileDownload(self.images)
+        self.subscriptions = Subscriptions(self.scheduler, clock.now_ns)
         self.latest: Measurement | None = None
-        self.selected_parameter = next(iter(icd.parameters_by_id))
+        self.reported_quaternion: Quaternion = IDENTITY
+        """The last valid quaternion that was reported, for the sign of the next."""
+        self.selected_parameter = next(iter(icd.parameters_by_id), 0)
+        self.accepted: dict[str, Mapping[str, Value]] = {}
+        """Values with which telecommands were last accepted, of those that telemetry reports."""
         self.boot_count = 0
         self.reset_cause = "power_on"
         self.mode_changes = 0
         self.frames_valid = 0
+        self.valid_in_a_row = 0
+        """Frames with a valid attitude since the last without one."""
         self.started_ns = clock.now_ns()
         self.warm = False
         """Whether the pipeline is ready."""
@@ -144,6 +156,8 @@ class Device:
         self.on_reset: list[Callable[[], None]] = []
         self.unresponsive = False
         """A fault: requests are neither counted nor answered."""
+        self.rate_fields = rate_fields(icd)
+        """Integer fields that report a body rate: field, axis, and its unit in one rad/s."""
         self._background = background
         self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
@@ -177,12 +191,13 @@ class Device:
         self.counters.clear()
         self.acknowledge = Acknowledge()
         self.latest = None
-        self.selected_parameter = next(iter(self.icd.parameters_by_id))
+        self.selected_parameter = next(iter(self.icd.parameters_by_id), 0)
         self.started_ns = self.clock.now_ns()
         self.time.offset_ns = round(self.profile.run.start_unix_s * NANOSECONDS) - self.started_ns
         self.time.was_set = False
+        self.accepted.clear()
         self.modes.reset()
-        self.mode_changes = self.frames_valid = 0
+        self.mode_changes = self.frames_valid = self.valid_in_a_row = 0
         for name in self.parameters.restore(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
         for observer in self.on_start:
@@ -263,6 +278,11 @@ class Device:
 
     # --- frames ---
 
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera of the profile."""
+        return Camera.from_dict(self.profile.camera.values())
+
     @property
     def fresh(self) -> Measurement | None:
         """The last measurement, or None if it is out of date or the mode makes no images."""
@@ -281,6 +301,7 @@ class Device:
     def _frame_published(self, measurement: Measurement) -> None:
         self.latest = measurement
         self.frames_valid += measurement.valid
+        self.valid_in_a_row = self.valid_in_a_row + 1 if measurement.valid else 0
         self.modes.solved(
             valid=measurement.valid,
             tracked=measurement.mode is Mode.TRACKING,
@@ -314,6 +335,17 @@ class Device:
             self.cycle.retime()
 
 
+def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
+    """Return the integer fields that report a body rate, which may be beyond their range: field, axis, factor."""
+    axes = {"rate.x": 0, "rate.y": 1, "rate.z": 2}
+    return [
+        (field, axes[str(field.value)], factor("rad/s", field.unit) or 1.0)
+        for row in icd.telemetry.values()
+        for field in row.named_fields.values()
+        if field.value in axes and field.kind == "integer"
+    ]
+
+
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
     """Return the parameter defaults of a profile: its `[parameters]` and the settings of its `[links]`.
 
@@ -323,20 +355,20 @@ def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Va
         The table names an unknown parameter.
     """
     links = profile.links
+    serial, unit_serial = links.serial, icd.link.serial
+    baud = serial.baud if unit_serial is None or "baud" in serial.model_fields_set else unit_serial.baud
     of_links: dict[str, Value] = {
         "serial_dialect": links.serial.dialect,
-        "serial_baud": links.serial.baud,
+        "serial_baud": baud,
         "can_address": links.can.address,
         "host_address": links.can.host_address,
     }
     if links.canopen.node:
         of_links["canopen_node"] = links.canopen.node
-    known = {
-        name: value for name, value in of_links.items() if name in icd.parameters and name in LINK_PARAMETERS
-    }
+    known = {name: value for name, value in of_links.items() if name in LINK_PARAMETERS}
     try:
         for name in profile.parameters:
-            icd.parameters[name]
+            icd.device_parameters[name]
     except ProtocolError as error:
         raise EmulatorError(f"parameters: {error}") from None
     return {**profile.parameters, **known}

@@ -59,8 +59,10 @@ class Parameters(Mapping[str, ParameterValue]):
     """
 
     def __init__(self, icd: InterfaceDefinition, defaults: Mapping[str, Value] | None = None) -> None:
-        self._definitions = icd.parameters
-        self._defaults: dict[str, ParameterValue] = {name: p.default for name, p in icd.parameters.items()}
+        self._definitions = icd.device_parameters
+        self._defaults: dict[str, ParameterValue] = {
+            name: p.default for name, p in icd.device_parameters.items()
+        }
         self._stored: dict[str, ParameterValue] = {}
         self._observers: list[Callable[[frozenset[str]], None]] = []
         try:

@@ -1,4 +1,4 @@
-"""The exception by which a handler refuses a request."""
+"""The exception by which an action or quantity refuses a request."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ class Refused(Exception):  # noqa: N818 (an answer on the bus, not an error of t
     Attributes
     ----------
     code
-        The published error code.
+        The error.
+    argument
+        Name of the argument or parameter at fault, if it is one.
     index
         Index of the telecommand field at fault, for the acknowledge telemetry.
     """
 
-    def __init__(self, code: ErrorCode, index: int = 0) -> None:
+    def __init__(self, code: ErrorCode, argument: str | None = None) -> None:
         super().__init__(code.name.lower())
         self.code = code
-        self.index = index
+        self.argument = argument
+        self.index = 0

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import as_quaternion
@@ -12,6 +14,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple
+from starhil.protocol.conventions import Conventions
 from starid.attitude import Attitude
 
 
@@ -24,7 +27,7 @@ class Reported:
     valid, reason
         Whether the attitude is valid, and the reason if not.
     quaternion_xyzw
-        ICRS → reported frame, scalar last and not negative; zeros where invalid.
+        ICRS → reported frame in the unit's convention, scalar last; zeros where invalid.
     rate_rad_s
         Body rate in the reported frame, rad/s; zeros where unknown.
     mid_unix_s
@@ -39,7 +42,7 @@ class Reported:
 
 
 def reported(device: Device) -> Reported:
-    """Return the attitude that the device reports now."""
+    """Return the attitude that the device reports now, in the conventions of its unit."""
     last = device.fresh
     if last is None:
         running = device.modes.mode.makes_frames
@@ -50,12 +53,42 @@ def reported(device: Device) -> Reported:
         return Reported(False, last.reason, mid_unix_s=mid_unix_s)  # noqa: FBT003
     attitude = Attitude(np.array(last.result.quaternion_xyzw))
     rate = np.array(last.rate_rad_s)
-    turns = mounting_turns(device.parameters)
+    turns = mounting_turns(device.parameters) + axes_turns(device.icd.conventions)
     for turn in turns:
         attitude = attitude.rotated(turn)
         rate = Attitude.identity().rotated(turn).to_sensor(rate)
     x, y, z = rate.tolist()
-    return Reported(True, "ok", as_quaternion(attitude), (x, y, z), mid_unix_s)  # noqa: FBT003
+    return Reported(True, "ok", _in_convention(attitude, device), (x, y, z), mid_unix_s)  # noqa: FBT003
+
+
+def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
+    """Turn a vector (3,) from the sensor frame to the reported frame."""
+    for turn in mounting_turns(device.parameters) + axes_turns(device.icd.conventions):
+        vector = Attitude.identity().rotated(turn).to_sensor(vector)
+    return vector
+
+
+def _in_convention(attitude: Attitude, device: Device) -> Quaternion:
+    """Return a quaternion in direction and sign of the unit's convention."""
+    conventions = device.icd.conventions
+    x, y, z, w = as_quaternion(attitude)
+    if conventions.quaternion == "attitude":
+        x, y, z = -x, -y, -z
+    if conventions.scalar_sign == "any":
+        before = device.reported_quaternion
+        if x * before[0] + y * before[1] + z * before[2] + w * before[3] < 0.0:
+            x, y, z, w = -x, -y, -z, -w
+        device.reported_quaternion = (x, y, z, w)
+    return x, y, z, w
+
+
+@cache
+def axes_turns(conventions: Conventions) -> list[np.ndarray]:
+    """Return the rotation vector from the sensor's axes to those of the reported frame, radians, if they differ."""
+    matrix = np.array(conventions.rows, dtype=np.float64)
+    if np.array_equal(matrix, np.eye(3)):
+        return []
+    return [Rotation.from_matrix(matrix.T).as_rotvec()]
 
 
 def mounting_turns(parameters: Parameters) -> list[np.ndarray]:

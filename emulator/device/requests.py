@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
-from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.bindings import TelecommandBinding, TelemetryBinding
 from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.refusal import Refused
-from starhil.emulator.device.scheduler import Event
-from starhil.emulator.device.telecommands import ANSWERED_WHEN_DONE, TELECOMMANDS
-from starhil.emulator.device.telemetry import TELEMETRY
+from starhil.emulator.device.subscriptions import Subscription
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, log_internal_error
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.codec import Row
+from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import MessageError
 
 log = logging.getLogger("starhil.device")
+
+BY_PARAMETERS = "parameters"
+"""Origin of the subscription that the parameters unsolicited_selection and unsolicited_rate make."""
 
 
 class Requests:
@@ -38,19 +41,23 @@ class Requests:
     Raises
     ------
     EmulatorError
-        The interface definition has a row without a handler.
+        A row of the interface definition is not bound to the device.
     """
 
     def __init__(self, device: Device) -> None:
-        missing = missing_handlers(device.icd)
+        icd = device.icd
+        missing = unbound(icd)
         if missing:
-            raise EmulatorError(
-                f"interface definition {device.icd.name}: the device has no handler for {missing[0]}"
-            )
+            raise EmulatorError(missing[0])
         self.device = device
         self.unsolicited_receivers: list[Callable[[Reply], None]] = []
-        self._next_unsolicited: Event | None = None
-        device.on_start.append(self._schedule_unsolicited)
+        self.telemetry_bindings = {row.name: TelemetryBinding(row, icd) for row in icd.telemetry.values()}
+        self.telecommand_bindings = {
+            row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
+        }
+        device.subscriptions.send = self._send_unsolicited
+        device.on_start.append(self._restart_subscriptions)
+        device.on_frame.append(lambda _measurement: device.subscriptions.frame_published())
         device.parameters.observe(self._parameters_changed)
 
     def handle(self, request: Request, later: Callable[[Reply], None] | None = None) -> list[Reply] | None:
@@ -66,16 +73,29 @@ class Requests:
         device = self.device
         if device.unresponsive:
             return []
+        row = device.icd.rows_by_key.get((request.klass, request.id))
+        if row is not None and row.kind != request.kind.value:
+            row = None
         if request.kind is RequestKind.TELEMETRY:
             device.counters.telemetry = (device.counters.telemetry + 1) & 0xFFFF
-            return [self._answer_telemetry(request)]
+            return self._replies(request, row, self._answer_telemetry(request, row))
         device.counters.telecommands = (device.counters.telecommands + 1) & 0xFFFF
-        code, replies = self._execute(request)
+        code, replies = self._execute(request, row)
         if code is not None:
-            return [_answer(request, code), *replies]
+            answered = self._answers_with_data(request, replies) or self._replies(
+                request, row, self._answer(request, code)
+            )
+            following = [replace(item, destination=request.source) for item in replies if item.id is not None]
+            return answered + following
         if later is not None:
-            device.acknowledge.on_end = lambda code: later(_answer(request, code))
+            device.acknowledge.on_end = partial(self._answer_later, request, row, later)
         return None
+
+    def _answer_later(
+        self, request: Request, row: Row | None, later: Callable[[Reply], None], code: ErrorCode
+    ) -> None:
+        for reply in self._replies(request, row, self._answer(request, code)):
+            later(reply)
 
     def count_fault(self, fault: LinkFault) -> None:
         """Count input on a link that was not a valid request."""
@@ -92,37 +112,89 @@ class Requests:
             The row cannot be read now.
         """
         try:
-            return self.device.icd.telemetry[name].encode(TELEMETRY[name](self.device), saturate=True)
+            return self.telemetry_bindings[name].encode(self.device)
         except Refused:
             raise
         except Exception as error:
             log_internal_error(f"telemetry {name}", error)
             raise Refused(ErrorCode.INTERNAL) from error
 
-    def _answer_telemetry(self, request: Request) -> Reply:
-        row = self.device.icd.telemetry_by_id.get(request.id)
+    def _replies(self, request: Request, row: Row | None, reply: Reply) -> list[Reply]:
+        """Return the answers of a row in their order, with its reply, or its refusal, among them."""
+        if row is None or row.answers == ("reply",):
+            return [reply]
+        replies: list[Reply] = []
+        for answer in row.answers:
+            if answer == "echo":
+                replies.append(Reply.echo(request))
+            elif answer == "reply":
+                replies.append(reply)
+            elif reply.kind is not ReplyKind.NACK:
+                other = self.device.icd.telemetry[answer.partition(":")[2]]
+                as_request = replace(
+                    request, kind=RequestKind.TELEMETRY, id=other.id, klass=other.klass, data=b""
+                )
+                replies.append(self._answer_telemetry(as_request, other))
+        return [replace(item, final=item is replies[-1]) for item in replies]
+
+    def _answers_with_data(self, request: Request, replies: Sequence[Reply]) -> list[Reply]:
+        """Return the answers whose data an action of a plugin has made; no id says that they are answers."""
+        data = [reply.data for reply in replies if reply.id is None]
+        return [
+            replace(self._reply(request, ReplyKind.ACK, item), final=number == len(data))
+            for number, item in enumerate(data, 1)
+        ]
+
+    def _answer_telemetry(self, request: Request, row: Row | None) -> Reply:
         if row is None:
-            return _answer(request, ErrorCode.INVALID_ID)
+            return self._answer(request, ErrorCode.INVALID_ID)
         if request.data:
-            return _answer(request, ErrorCode.INVALID_LENGTH)
+            return self._answer(request, ErrorCode.INVALID_LENGTH)
         try:
             data = self.telemetry(row.name)
         except Refused as refused:
-            return _answer(request, refused.code)
-        return Reply(ReplyKind.TELEMETRY, request.id, data, destination=request.source)
+            return self._answer(request, refused.code)
+        return self._reply(request, ReplyKind.TELEMETRY, data)
 
-    def _execute(self, request: Request) -> tuple[ErrorCode | None, list[Reply]]:
+    def _answer(self, request: Request, code: ErrorCode) -> Reply:
+        kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
+        return self._reply(request, kind, code=self.device.icd.error_number(code))
+
+    def _reply(
+        self, request: Request, kind: ReplyKind, data: bytes = b"", code: ErrorCode | int = ErrorCode.OK
+    ) -> Reply:
+        uptime_ns, time_ns = self._times()
+        return Reply(
+            kind,
+            request.id,
+            data,
+            code,
+            request.source,
+            klass=request.klass,
+            sequence=request.sequence,
+            flags=request.flags,
+            uptime_ns=uptime_ns,
+            time_ns=time_ns,
+        )
+
+    def _times(self) -> tuple[int, int]:
+        """Return the time since start-up and the device's clock since the unit's epoch, nanoseconds."""
+        device = self.device
+        uptime_ns = device.clock.now_ns() - device.started_ns
+        return uptime_ns, device.icd.conventions.reported_ns(device.time.unix_ns())
+
+    def _execute(self, request: Request, row: Row | None) -> tuple[ErrorCode | None, Sequence[Reply]]:
         """Execute a telecommand and record its outcome; the code is None while the outcome is open."""
         device = self.device
         if not device.acknowledge.processed:
             device.counters.overrun()
         acknowledge = device.acknowledge = Acknowledge(request.id, processed=False)
-        row = device.icd.telecommands_by_id.get(request.id)
         if row is None:
             acknowledge.end(ErrorCode.INVALID_ID)
             return ErrorCode.INVALID_ID, []
+        binding = self.telecommand_bindings[row.name]
         try:
-            replies = TELECOMMANDS[row.name](device, row.decode(request.data), acknowledge)
+            replies = binding.execute(device, request.data, acknowledge)
         except (Refused, MessageError) as refused:
             acknowledge.end(refused.code, refused.index)
             return refused.code, []
@@ -132,47 +204,43 @@ class Requests:
             return ErrorCode.INTERNAL, []
         if replies is not None:
             acknowledge.end()
-            return ErrorCode.OK, [replace(reply, destination=request.source) for reply in replies]
-        if row.name not in ANSWERED_WHEN_DONE:
+            return ErrorCode.OK, replies
+        if not binding.answered_when_done:
             return ErrorCode.OK, []
         return acknowledge.error if acknowledge.processed else None, []
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if names & {"unsolicited_rate", "unsolicited_selection"}:
-            self._schedule_unsolicited()
+            self._subscribe_by_parameters()
 
-    def _schedule_unsolicited(self) -> None:
-        if self._next_unsolicited is not None:
-            self._next_unsolicited.cancel()
-            self._next_unsolicited = None
+    def _restart_subscriptions(self) -> None:
+        self.device.subscriptions.clear()
+        self._subscribe_by_parameters()
+
+    def _subscribe_by_parameters(self) -> None:
         device = self.device
-        if float(device.parameters["unsolicited_rate"]) > 0.0:
-            self._next_unsolicited = device.scheduler.at(device.clock.now_ns(), self._send_unsolicited)
+        rate_hz = float(device.parameters["unsolicited_rate"])
+        row = device.icd.telemetry_row(int(device.parameters["unsolicited_selection"]))
+        wanted = [Subscription(row, rate_hz)] if row is not None and rate_hz > 0.0 else []
+        device.subscriptions.replace(BY_PARAMETERS, wanted)
 
-    def _send_unsolicited(self, due_ns: int) -> None:
-        device, parameters = self.device, self.device.parameters
-        period_ns = max(1, round(NANOSECONDS / float(parameters["unsolicited_rate"])))
-        missed = max(0, (device.clock.now_ns() - due_ns) // period_ns)
-        self._next_unsolicited = device.scheduler.at(
-            due_ns + (missed + 1) * period_ns, self._send_unsolicited
-        )
-        row = device.icd.telemetry_by_id.get(int(parameters["unsolicited_selection"]))
-        if row is None or device.unresponsive:
+    def _send_unsolicited(self, row: Row) -> None:
+        device = self.device
+        if device.unresponsive:
             return
         try:
             data = self.telemetry(row.name)
         except Refused:  # the row cannot be read now, for example while an image is being opened
             return
-        reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=int(parameters["host_address"]))
+        uptime_ns, time_ns = self._times()
+        reply = Reply(
+            ReplyKind.UNSOLICITED,
+            row.id,
+            data,
+            destination=int(device.parameters["host_address"]),
+            klass=row.klass,
+            uptime_ns=uptime_ns,
+            time_ns=time_ns,
+        )
         for receiver in self.unsolicited_receivers:
             call_guarded("unsolicited telemetry", receiver, reply)
-
-
-def _answer(request: Request, code: ErrorCode) -> Reply:
-    kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-    return Reply(kind, request.id, code=code, destination=request.source)
-
-
-def missing_handlers(icd: InterfaceDefinition) -> list[str]:
-    """Return the names of the rows of a definition that the device has no handler for."""
-    return sorted((set(icd.telemetry) - set(TELEMETRY)) | (set(icd.telecommands) - set(TELECOMMANDS)))

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
@@ -34,7 +35,7 @@ class Receiver(Protocol[Arriving_contra]):
         """Whether a message is incomplete."""
         ...
 
-    def feed(self, item: Arriving_contra, now: float, /) -> list[Request | LinkFault]:
+    def feed(self, item: Arriving_contra, now: float, /) -> Sequence[Request | LinkFault]:
         """Decode received input; return the requests and faults that it completes."""
         ...
 

@@ -30,7 +30,8 @@ from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import Reply, Request, RequestKind
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.values import MessageError, Value
 
@@ -40,20 +41,21 @@ MILLISECOND_NS: Final = NANOSECONDS // 1000
 STORAGE_FILE: Final = "canopen.json"
 DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes of the error mode; the number of `device_error` is added."""
-STATUS_ROW: Final = "device_status"
-FRAME_ROWS: Final = (
-    "precise_attitude",
-    "identified_stars",
-    "star_magnitudes",
-    "star_performance_1",
-    "star_performance_2",
-    "star_timing",
-    "quaternion",
-    "rates",
-)
-"""Telemetry that changes with each exposure: TPDOs that map any of it are triggered then."""
+FRAME_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
+"""How the names of quantities begin that change with each exposure: TPDOs that map a row with one are triggered then."""
+STATUS_QUANTITY: Final = "mode"
+"""TPDOs that map a row with this quantity are triggered when it or the validity of the attitude changes."""
 
 Action: TypeAlias = Callable[[float], list[CanFrame]]
+
+
+def rows_reporting(icd: InterfaceDefinition, prefixes: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the telemetry rows with a quantity whose name begins with one of these."""
+    return tuple(
+        row.name
+        for row in icd.telemetry.values()
+        if any(field.value is not None and field.value.startswith(prefixes) for field in row.fields)
+    )
 
 
 def not_before(deadline: float) -> int:
@@ -106,7 +108,7 @@ class DeviceApplication:
                 refusal = abort
             self._finish_write(deferred, refusal)
 
-        replies = self._requests.handle(Request(RequestKind.TELECOMMAND, row.id, payload), done)
+        replies = self._requests.handle(self._device.icd.request(row, payload), done)
         if replies is None:
             return deferred
         for reply in replies[:1]:
@@ -214,6 +216,10 @@ class CanopenLink:
         self._actions: deque[Action] = deque()
         self._busy = False
         self._resetting = False
+        self._status_rows = rows_reporting(device.icd, (STATUS_QUANTITY,))
+        self._frame_rows = tuple(
+            name for name in rows_reporting(device.icd, FRAME_QUANTITIES) if name not in self._status_rows
+        )
         self._attitude_valid = False
         self._timer: Event | None = None
         self._reconnects = 0
@@ -326,10 +332,10 @@ class CanopenLink:
         self._run_action(lambda now: self.slave.notify(keys, now))
 
     def _frame_published(self, measurement: Measurement) -> None:
-        rows: tuple[str, ...] = FRAME_ROWS
+        rows = self._frame_rows
         if measurement.valid != self._attitude_valid:
             self._attitude_valid = measurement.valid
-            rows = (*rows, STATUS_ROW)
+            rows = (*rows, *self._status_rows)
         self._notify_rows(rows)
 
     def _mode_changed(self, transition: Transition) -> None:
@@ -338,16 +344,16 @@ class CanopenLink:
             self._device.scheduler.at(self._device.clock.now_ns(), self._device_failed)
             return
         if transition.before is Mode.ERROR:
-            for number in self._device.icd.enums["device_error"].names:
+            for number in self._device.icd.enum("device_error").names:
                 self._run_action(partial(self._clear_emergency, DEVICE_ERROR + number))
-        self._notify_rows([STATUS_ROW])
+        self._notify_rows(self._status_rows)
 
     def _device_failed(self, _due_ns: int) -> None:
-        numbers = self._device.icd.enums["device_error"].values
+        numbers = self._device.icd.enum("device_error").values
         code = DEVICE_ERROR + numbers.get(self._device.modes.error, 0)
         if self._device.modes.mode is Mode.ERROR:
             self._run_action(partial(self._raise_emergency, code, ErrorRegister.MANUFACTURER))
-            self._notify_rows([STATUS_ROW])
+            self._notify_rows(self._status_rows)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:
@@ -355,7 +361,8 @@ class CanopenLink:
                 self.slave.store.clear_lss()
             except StorageError as error:
                 log.warning("%s", error)
-        keys = frozenset(self._dictionary.parameters[name] for name in names)
+        placed = self._dictionary.parameters
+        keys = frozenset(placed[name] for name in names if name in placed)
         self._run_action(lambda now: self.slave.notify(keys, now))
 
     def _device_reset(self) -> None:

@@ -1,4 +1,4 @@
-"""The serial link: passes requests from a serial line to the device and sends replies in its dialect."""
+"""The serial link: passes requests from a serial line to the device and sends replies, as the unit frames them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
-from starhil.emulator.links.base import DeviceLink
+from starhil.emulator.links.base import DeviceLink, Receiver
 from starhil.protocol.messages import Reply
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
 from starhil.protocol.transports.paced import SerialTransport
 
 JUNK_BYTES: Final = 8
@@ -33,15 +34,16 @@ class SerialDamage:
         return [item[start : start + size] for start in range(0, len(item), size)]
 
 
-class SerialLink(DeviceLink[bytes, Dialect]):
+class SerialLink(DeviceLink[bytes, Dialect | None]):
     """Connects a device to a serial transport, at the bit rate in its parameter `serial_baud`.
 
-    Unsolicited telemetry is sent in dialect c only.
+    The CubeSpace family has three dialects of replies, of which only c carries unsolicited telemetry.
     """
 
     bus: ClassVar[str] = "serial"
 
     def __init__(self, requests: Requests, transport: SerialTransport, seed: int = 0) -> None:
+        self._stack = build_serial_stack(requests.device.icd)
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
@@ -59,15 +61,24 @@ class SerialLink(DeviceLink[bytes, Dialect]):
             self._baud = self._wanted_baud()
             self._port.set_baud(self._baud)
 
-    def _new_receiver(self) -> DeviceReceiver:
-        return DeviceReceiver()
+    def _new_receiver(self) -> Receiver[bytes]:
+        return self._stack.device()
 
-    def _reply_style(self) -> Dialect:
-        return Dialect(str(self._device.parameters["serial_dialect"]))
+    @property
+    def dialect(self) -> Dialect | None:
+        """The present dialect of replies; None for a unit that has no dialects."""
+        if not isinstance(self._stack, CubeSpaceStack):
+            return None
+        return self._stack.dialect or Dialect(str(self._device.parameters["serial_dialect"]))
 
-    def _send(self, reply: Reply, style: Dialect) -> None:
-        self.wire.send(encode_reply(reply, style))
+    def _reply_style(self) -> Dialect | None:
+        return self.dialect
+
+    def _send(self, reply: Reply, style: Dialect | None) -> None:
+        data = self._stack.encode_reply(reply, style)
+        if data:  # the unit may have no such reply
+            self.wire.send(data)
 
     def _send_unsolicited(self, reply: Reply) -> None:
-        if self._reply_style().supports_unsolicited:
+        if self._stack.supports_unsolicited(self.dialect):
             super()._send_unsolicited(reply)

@@ -48,7 +48,9 @@ class PdoDefault:
     Attributes
     ----------
     enabled
-        Whether the PDO exists. The first four PDOs have the predefined COB-IDs.
+        Whether the PDO exists.
+    can_id
+        CAN ID, to which the node-ID is added; None for the predefined one, which the first four PDOs have.
     transmission_type
         0 to 240 synchronous, 254 or 255 by event.
     inhibit, event_ms
@@ -59,6 +61,7 @@ class PdoDefault:
 
     name: str
     enabled: bool = False
+    can_id: int | None = None
     transmission_type: int = EVENT_DRIVEN
     inhibit: int = 0
     event_ms: int = 0
@@ -225,15 +228,22 @@ def _add_services(od: ObjectDictionary, identity: Identity) -> None:
     )
 
 
+def _can_id(predefined: Sequence[int], number: int, default: PdoDefault) -> int:
+    """Return a PDO's CAN ID without the node-ID, 0 for none."""
+    if default.can_id is not None:
+        return default.can_id
+    return predefined[number] if number < len(predefined) else 0
+
+
 def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
     index = 0x1400 + number
-    predefined = number < len(RPDO_CAN_IDS)
-    cob_id = (RPDO_CAN_IDS[number] if predefined else 0) | (0 if default.enabled else INVALID)
+    can_id = _can_id(RPDO_CAN_IDS, number, default)
+    cob_id = can_id | (0 if default.enabled else INVALID)
     add_record(
         od,
         f"RPDO {number + 1} communication parameter: {default.name}",
         [
-            variable("COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=predefined),
+            variable("COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=bool(can_id)),
             variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
             variable("Event timer", index, 5, U16, "rw", default.event_ms),
         ],
@@ -243,13 +253,13 @@ def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
 
 def _add_tpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
     index = 0x1800 + number
-    predefined = number < len(TPDO_CAN_IDS)
-    cob_id = BIT_30 | (TPDO_CAN_IDS[number] if predefined else 0) | (0 if default.enabled else INVALID)
+    can_id = _can_id(TPDO_CAN_IDS, number, default)
+    cob_id = BIT_30 | can_id | (0 if default.enabled else INVALID)
     add_record(
         od,
         f"TPDO {number + 1} communication parameter: {default.name}",
         [
-            variable("COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=predefined),
+            variable("COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=bool(can_id)),
             variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
             variable("Inhibit time", index, 3, U16, "rw", default.inhibit),
             variable("Event timer", index, 5, U16, "rw", default.event_ms),

@@ -20,9 +20,16 @@ from starhil.protocol.canopen.communication import (
     variable,
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from starhil.protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, load_layout
+from starhil.protocol.canopen.layout import (
+    CanopenModel,
+    PackedField,
+    PdoModel,
+    PlacedMember,
+    PlacedObject,
+    read_layout,
+)
 from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, Value, to_f32
 
 DATA_TYPES: Final[dict[str, int]] = {
@@ -131,8 +138,12 @@ class DeviceDictionary(Dictionary):
             self._place_image(objects, placed, placed.image)
         elif placed.packed:
             self._place_packed(objects, placed)
+        elif placed.members:
+            self._place_members(objects, placed)
         else:
-            self._place_value(objects, placed)
+            key = (placed.index, 0)
+            objects.add_object(self._value_variable(placed.name, key, placed.value, placed.telecommand))
+            self._names[f"{placed.index:04x}"] = key
 
     def _place_requests(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         members: list[ODVariable] = []
@@ -159,48 +170,63 @@ class DeviceDictionary(Dictionary):
             members.append(member)
         add_record(objects, placed.name, members)
 
-    def _place_value(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        key = (placed.index, 0)
-        if placed.telecommand is not None:
-            member = self._telecommand_variable(placed.name, key, self.icd.telecommands[placed.telecommand])
-        if placed.value is not None:
-            row, slot, fields = self._slot_of(placed.value)
-            if placed.telecommand is None:
-                member = variable(placed.name, *key, DATA_TYPES[slot.type], "ro", mappable=True)
+    def _value_variable(self, name: str, key: Key, value: str | None, telecommand: str | None) -> ODVariable:
+        """Return the variable that reads a field, executes a telecommand when written, or both."""
+        if telecommand is not None:
+            member = self._telecommand_variable(name, key, self.icd.telecommands[telecommand])
+        if value is not None:
+            row, slot, fields = self._slot_of(value)
+            if telecommand is None:
+                member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
                 _describe(member, fields)
             elif member.data_type != DATA_TYPES[slot.type]:
-                raise IcdError(
-                    f"canopen.toml: {placed.index:04X}h: {placed.value} and {placed.telecommand} differ in type"
-                )
+                raise IcdError(f"canopen.toml: {key[0]:04X}h: {value} and {telecommand} differ in type")
             else:
                 member.access_type = "rw"
-            self._bind_reader(key, row, "", partial(self._read_slot, row, slot))
-        objects.add_object(member)
-        self._names[f"{placed.index:04x}"] = key
+            self._bind_reader(key, row, name, partial(self._read_slot, row, slot))
+        return member
+
+    def _place_members(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
+        members: list[ODVariable] = []
+        subindex = 0
+        for model in placed.members:
+            subindex = subindex + 1 if model.subindex is None else model.subindex
+            members.append(self._member_variable(model, (placed.index, subindex)))
+            self._names[f"{placed.index:04x}.{model.name.lower()}"] = (placed.index, subindex)
+        add_record(objects, placed.name, members)
+
+    def _member_variable(self, model: PlacedMember, key: Key) -> ODVariable:
+        if model.parameter is None:
+            return self._value_variable(model.name, key, model.value, model.telecommand)
+        return self._parameter_variable(model.name, key, self.icd.parameters[model.parameter])
 
     def _place_parameters(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         members: list[ODVariable] = []
         for number, parameter in sorted(self.icd.parameters_by_id.items()):
             key = (placed.index, number)
-            default = parameter.to_number(parameter.default)
-            if parameter.type not in {"f32", "f64"}:
-                default = int(default)
-            data_type = DATA_TYPES[parameter.type]
-            member = variable(parameter.name, *key, data_type, "rw", default, mappable=True)
-            low, high = parameter.minimum, parameter.maximum
-            if parameter.type == "f32":
-                low, high = min(low, to_f32(low)), max(high, to_f32(high))
-            set_limits(member, low, high)
-            member.unit = parameter.unit
-            member.description = parameter.doc
-            if parameter.enum is not None:
-                member.value_descriptions = dict(parameter.enum.names)
             self._names[f"{placed.index:04x}.{parameter.name}"] = key
-            self.parameters[parameter.name] = key
-            self._readers[key] = partial(self._read_parameter, parameter, data_type)
-            self._writers[key] = partial(self._write_parameter, parameter, data_type)
-            members.append(member)
+            members.append(self._parameter_variable(parameter.name, key, parameter))
         add_record(objects, placed.name, members)
+
+    def _parameter_variable(self, name: str, key: Key, parameter: Parameter) -> ODVariable:
+        """Return the variable that reads and sets a parameter."""
+        default = parameter.to_number(parameter.default)
+        if parameter.type not in {"f32", "f64"}:
+            default = int(default)
+        data_type = DATA_TYPES[parameter.type]
+        member = variable(name, *key, data_type, "rw", default, mappable=True)
+        low, high = parameter.minimum, parameter.maximum
+        if parameter.type == "f32":
+            low, high = min(low, to_f32(low)), max(high, to_f32(high))
+        set_limits(member, low, high)
+        member.unit = parameter.unit
+        member.description = parameter.doc
+        if parameter.enum is not None:
+            member.value_descriptions = dict(parameter.enum.names)
+        self.parameters[parameter.name] = key
+        self._readers[key] = partial(self._read_parameter, parameter, data_type)
+        self._writers[key] = partial(self._write_parameter, parameter, data_type)
+        return member
 
     def _read_parameter(self, parameter: Parameter, data_type: int) -> bytes:
         return encode(data_type, parameter.to_number(self.application.parameter(parameter.name)))
@@ -262,7 +288,7 @@ class DeviceDictionary(Dictionary):
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
             _describe(member, fields)
-            self._writers[key] = partial(self._execute, row)
+            self._writers[key] = partial(self._execute_scalar, row)
         else:
             member = variable(name, *key, datatypes.OCTET_STRING, "wo")
             self._sizes[key] = row.size
@@ -279,11 +305,14 @@ class DeviceDictionary(Dictionary):
             raise abort_of(error) from None
         return self.application.telecommand(row, payload)
 
+    def _execute_scalar(self, row: Row, payload: bytes) -> Deferred | None:
+        return self._execute(row, _in_order(row.slots[0], payload))
+
     def _execute_without_data(self, row: Row, _data: bytes) -> Deferred | None:
         return self._execute(row, b"")
 
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
-        return self.row_bytes(row)[_span(slot)]
+        return _in_order(slot, self.row_bytes(row)[_span(slot)])
 
     def _bind_reader(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
         self._readers[key] = reader
@@ -308,6 +337,7 @@ class DeviceDictionary(Dictionary):
         return PdoDefault(
             name=model.name,
             enabled=model.enabled,
+            can_id=model.can_id,
             transmission_type=model.transmission_type,
             inhibit=round(model.inhibit_ms * 10),
             event_ms=model.event_ms,
@@ -336,7 +366,7 @@ class _Packer:
     def __call__(self) -> bytes:
         data = self._dictionary.row_bytes(self._row)
         if self._field is None:
-            raw = int.from_bytes(data[_span(self._slot)], "little")
+            raw = int.from_bytes(data[_span(self._slot)], self._slot.order)
         else:
             value = self._row.decode(data)[self._field.name]
             number = value if isinstance(value, int | float) else self._raw(value)
@@ -367,19 +397,16 @@ def identity_of(layout: CanopenModel) -> Identity:
 
 
 def build_dictionary(
-    icd: InterfaceDefinition | None = None,
+    icd: InterfaceDefinition,
     layout: CanopenModel | None = None,
     *,
     serial_number: int = 1,
     software_version: str = "1",
 ) -> DeviceDictionary:
-    """Build the object dictionary of the device .
-
-    By default from the definition that ships with the package.
-    """
-    layout = load_layout() if layout is None else layout
+    """Build the object dictionary of the device that serves a definition, by default with the definition's layout."""
+    layout = read_layout(icd) if layout is None else layout
     identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
-    return DeviceDictionary(load_icd() if icd is None else icd, layout, identity)
+    return DeviceDictionary(icd, layout, identity)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
@@ -394,6 +421,11 @@ def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
 
 def _span(slot: Slot) -> slice:
     return slice(slot.offset, slot.offset + slot.size)
+
+
+def _in_order(slot: Slot, data: bytes) -> bytes:
+    """Change bytes between the order of a slot and that of CANopen, little-endian."""
+    return data[::-1] if slot.order == "big" and slot.type != "bytes" else data
 
 
 def _describe(member: ODVariable, fields: list[Field]) -> None:

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starhil.protocol.export import export
-from starhil.protocol.icd import IcdError, load_icd
+from starhil.protocol.icd import IcdError, load_unit
 from starhil.protocol.values import Section
 from starid.attitude import Attitude
 
-ICD = load_icd()
+ICD = load_unit()
 SECTIONS = {section.heading: section for section in ICD.sections}
 DIGITS = 0.6e-7
 
@@ -124,8 +124,8 @@ def test_texts_for_people_have_the_convention(name):
 
 def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
     (tmp_path / "a.toml").write_text(
-        'definition = { name = "x", version = "1", doc = "x" }\n'
+        'unit = { name = "x", version = "1", doc = "x" }\n'
         '[[section]]\nheading = "Frames"\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
     )
     with pytest.raises(IcdError, match="section Frames: row 2 has 1 cells, must have 2"):
-        load_icd(tmp_path)
+        load_unit(tmp_path)

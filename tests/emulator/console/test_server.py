@@ -16,7 +16,7 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.run_feed import RunFeed
 from starhil.hil_tests.script import load_script
 from starhil.protocol.candump import parse_candump
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from tests.emulator.conftest import PREVIEW
 from tests.emulator.runs import command, read
 
@@ -263,7 +263,7 @@ def test_what_the_console_sent_is_a_session_script(run, tmp_path):
             await page.ask(do="read", row="device_status")
             path = tmp_path / "session.toml"
             path.write_text(await page.get("/session.toml"))
-            script = load_script(path, load_icd())
+            script = load_script(path, load_unit())
             names = [step.name for step in script.steps]
             assert len(names) == 5  # the pause is a step too
             assert script.steps[2].action.refused == "invalid_parameter"

@@ -4,11 +4,11 @@ import pytest
 
 from starhil.emulator.console.trace import Decoder, WireItem, canopen_text
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
 
-ICD = load_icd()
+ICD = load_unit()
 MODE = ICD.telecommands["set_mode"]
 STATUS = ICD.telemetry["device_status"]
 

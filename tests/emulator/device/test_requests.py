@@ -2,23 +2,21 @@
 
 import pytest
 
-from starhil.emulator.device.requests import missing_handlers
-from starhil.emulator.device.telecommands import TELECOMMANDS
-from starhil.emulator.device.telemetry import TELEMETRY
+from starhil.emulator.device.actions import ACTIONS
+from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.profile import Profile
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 
-def test_every_row_of_the_definition_is_served():
-    icd = load_icd()
-    assert missing_handlers(icd) == []
-    assert set(TELEMETRY) == set(icd.telemetry)
-    assert set(TELECOMMANDS) == set(icd.telecommands)
+def test_the_device_has_what_its_model_declares():
+    model = load_unit().model
+    assert set(QUANTITIES) == set(model.quantities)
+    assert set(ACTIONS) == set(model.actions)
 
 
 @pytest.mark.parametrize("mode", ["standby", "lost_in_space"])
-@pytest.mark.parametrize("name", load_icd().telemetry)
+@pytest.mark.parametrize("name", load_unit().telemetry)
 def test_every_telemetry_row_answers_in_every_state(make_bench, name, mode):
     bench = make_bench().start()
     bench.command("set_mode", mode=mode)
@@ -119,7 +117,7 @@ def test_unsolicited_image_frame_is_left_out_while_an_image_is_opened(bench):
 def test_a_telecommand_that_fails_unexpectedly_ends_with_an_error_code_and_is_logged(
     bench, monkeypatch, caplog
 ):
-    monkeypatch.setitem(TELECOMMANDS, "set_mode", lambda *_: 1 / 0)
+    monkeypatch.setattr(bench.requests.telecommand_bindings["set_mode"], "execute", lambda *_: 1 / 0)
     assert bench.command("set_mode", mode="standby") is ErrorCode.INTERNAL
     assert bench.read("acknowledge") == {
         "last_telecommand": 96, "processed": True, "error": "internal", "parameter_index": 0,
@@ -132,7 +130,7 @@ def test_a_telecommand_that_fails_unexpectedly_ends_with_an_error_code_and_is_lo
 def test_telemetry_that_fails_unexpectedly_is_answered_with_an_error_code_and_logged(
     bench, monkeypatch, caplog
 ):
-    monkeypatch.setitem(TELEMETRY, "rates", lambda _device: 1 / 0)
+    monkeypatch.setattr(bench.requests.telemetry_bindings["rates"], "encode", lambda _device: 1 / 0)
     (reply,) = bench.requests.handle(Request.of(bench.icd.telemetry["rates"].id))
     assert (reply.kind, reply.code) == (ReplyKind.NACK, ErrorCode.INTERNAL)
     assert "telemetry rates: internal error: ZeroDivisionError" in caplog.text

@@ -14,15 +14,16 @@ from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.canopen import (
-    FRAME_ROWS,
-    STATUS_ROW,
+    FRAME_QUANTITIES,
+    STATUS_QUANTITY,
     CanopenLink,
     not_before,
     open_canopen,
+    rows_reporting,
 )
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import FileStorage, MemoryStorage, NmtState
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.transports.base import Transport
 
 NODE = 44
@@ -367,9 +368,13 @@ def test_heartbeats_go_on_whatever_their_deadlines_add_up_to(linked, period_ms):
     linked(test)
 
 
-def test_rows_that_make_events_exist():
-    icd = load_icd()
-    assert {*FRAME_ROWS, STATUS_ROW} <= set(icd.telemetry)
+def test_rows_that_make_events_follow_from_their_quantities():
+    icd = load_unit()
+    assert rows_reporting(icd, (STATUS_QUANTITY,)) == ("device_status",)
+    frame = {"precise_attitude", "identified_stars", "star_magnitudes", "star_timing", "quaternion", "rates"}
+    assert frame <= set(rows_reporting(icd, FRAME_QUANTITIES))
+    assert rows_reporting(load_unit("oresat"), (STATUS_QUANTITY,)) == ("status",)
+    assert rows_reporting(load_unit("oresat"), FRAME_QUANTITIES) == ("orientation",)
 
 
 def test_storage_in_the_folder_of_the_state(make_bench, tmp_path):

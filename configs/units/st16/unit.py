@@ -1,0 +1,109 @@
+"""Replies of the ST-16 whose data depend on the request: memory, and the result structure by address or by parts.
+
+Layout of the result: `sinclair_stt_result_operational` in hsfl/cosmos-core, libraries/device/sinclair_lib.h.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.plugin import action
+
+VALID = 0x01 | 0x02 | 0x04 | 0x08 | 0x10 | 0x40
+"""Return code of a full and consistent solution from two good images."""
+FAILED = 0x10
+"""Return code where full processing found no attitude."""
+
+PARTS = ((0x00, 4), (0x04, 4), (0x08, 32), (0x28, 24), (0x40, 8), (0x48, 56), (0x80, 172))
+"""Offset and size of the part for each bit of a combination, the lowest first."""
+RESULT_SIZE = 0x80 + 172
+ANALOG_ADDRESS = 0x04
+LENGTH_ADDRESS = 0x4C
+EDAC_SIZE = 0x50
+LARGEST_FRAME = 256
+"""Bytes of the result in one frame (ours)."""
+
+
+def reader(device: Any) -> Callable[[str], float]:
+    """Return a function that reads quantities of the device by name; 0 where there is no value."""
+    # Imported here: whoever only reads the definition needs no emulator.
+    from starhil.emulator.device.quantities import getter_of
+    from starhil.emulator.device.snapshot import Snapshot
+
+    shot = Snapshot(device)
+
+    def value(name: str) -> float:
+        found = getter_of(name)(shot)
+        return float(found) if isinstance(found, (int, float)) else 0.0
+
+    return value
+
+
+def result(device: Any) -> bytes:
+    """Return the result structure of the last measurement."""
+    value = reader(device)
+    head = struct.pack(
+        "<II4d3dd",
+        int(value("frame.counter")),
+        VALID if value("attitude.valid") else FAILED,
+        *(value(f"attitude.{axis}") for axis in "xyzw"),
+        *(value(f"rate.{axis}") for axis in "xyz"),
+        value("frame.time"),
+    )
+    temperature = round(10.0 * value("health.detector_temperature"))
+    hardware = bytes(12) + struct.pack("<h", temperature) + bytes(42)
+    return head + hardware + bytes(172)
+
+
+def edac(device: Any) -> bytes:
+    """Return the memory that is read in flight: analog values, and the length of the result."""
+    value = reader(device)
+    names = ("mcu_current", "bus_voltage", "core_voltage", "mcu_voltage", "io_voltage", "mcu_temperature",
+             "supervisor_voltage", "detector_voltage")  # fmt: skip
+    analog = struct.pack("<8f", *(value(f"health.{name}") for name in names))
+    memory = bytearray(EDAC_SIZE)
+    memory[ANALOG_ADDRESS : ANALOG_ADDRESS + len(analog)] = analog
+    memory[LENGTH_ADDRESS:] = struct.pack("<I", RESULT_SIZE)
+    return bytes(memory)
+
+
+def placed(memory: bytes, address: int, count: int) -> bytes:
+    """Return the address and the bytes at it."""
+    from starhil.emulator.device.refusal import Refused
+
+    if address + count > len(memory):
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="address")
+    return struct.pack("<H", address) + memory[address : address + count]
+
+
+@action("read_edac")
+def read_edac(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
+    """Answer with the address and the memory at it."""
+    return [placed(edac(device), arguments["address"], arguments["count"])]
+
+
+@action("go")
+def go(_device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
+    """Answer with the command."""
+    return [bytes((arguments["command"],))]
+
+
+@action("read_result")
+def read_result(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
+    """Answer with the offset and the bytes of the result, in as many frames as it takes."""
+    start, end = arguments["address"], arguments["address"] + arguments["count"]
+    memory = result(device)
+    starts = range(start, max(end, start + 1), LARGEST_FRAME)
+    return [placed(memory, at, min(LARGEST_FRAME, end - at)) for at in starts]
+
+
+@action("combination")
+def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
+    """Answer with the parts of the result that the bits name, a frame each."""
+    wanted = arguments["parts_low"] | arguments["parts_high"] << 16
+    memory = result(device)
+    frames = [placed(memory, *part) for bit, part in enumerate(PARTS) if wanted >> bit & 1]
+    return frames or [placed(memory, 0, 0)]

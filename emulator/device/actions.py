@@ -1,0 +1,241 @@
+"""The actions of the device: a function for each name that `configs/units/model.toml` declares.
+
+An action gets its arguments by name, range-checked and in the declared units. It returns the messages that follow
+the answer (mostly none), or None if it continues in the background and ends the acknowledge itself. It raises
+`Refused` to answer with an error; `argument` in it names the argument at fault. A telecommand that continues is
+answered at once, unless its action is in `ANSWERED_WHEN_DONE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeAlias
+
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.counters import Acknowledge
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.images import edge_of
+from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.subscriptions import Subscription
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.messages import ErrorCode, Reply
+from starhil.protocol.values import MessageError, Value
+
+Arguments: TypeAlias = Mapping[str, Any]
+"""Values by argument; `parameters` has those of fields that name a parameter."""
+Action: TypeAlias = Callable[[Device, Arguments, Acknowledge], list[Reply] | None]
+
+PARAMETERS: Final = "parameters"
+"""Key under which an action finds the values of fields that name a parameter."""
+
+SRAM_STORED: Final = 0
+"""Bank of the image that save_image stored; the other bank holds the last exposure."""
+
+
+def nothing(_device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Accept the telecommand and do nothing."""
+    return []
+
+
+def reset(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Restart once the answer is sent."""
+    device.scheduler.at(device.clock.now_ns(), lambda _due_ns: device.reset("command"))
+    return []
+
+
+def set_clock(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Set the clock to the sum of the arguments, since the unit's epoch."""
+    reported_ns = round(float(arguments.get("unix") or 0.0) * NANOSECONDS)
+    for name, nanoseconds in (("seconds", NANOSECONDS), ("milliseconds", 1_000_000), ("microseconds", 1_000)):
+        reported_ns += round((arguments.get(name) or 0) * nanoseconds)
+    reported_ns += round(arguments.get("nanoseconds") or 0)
+    device.time.set_unix_ns(device.icd.conventions.unix_ns(reported_ns, device.time.unix_ns()))
+    return []
+
+
+def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Set the parameters that the row's fields name, all or none."""
+    changes: Mapping[str, Value] = arguments[PARAMETERS]
+    try:
+        device.parameters.set(changes)
+    except MessageError as error:
+        culprit = str(error).partition(":")[0]
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument=culprit) from None
+    return []
+
+
+def open_image(device: Device, arguments: Arguments, acknowledge: Acknowledge) -> list[Reply] | None:
+    """Open an image for download in numbered chunks."""
+    images = device.images
+    if images.busy:
+        raise Refused(ErrorCode.BUSY)
+    edge = edge_of(str(arguments["image_size"]))
+    if int(arguments["sram"]) == SRAM_STORED:
+        if images.stored is None:
+            raise Refused(ErrorCode.SEQUENCE)
+        if not images.open_stored(edge):
+            raise Refused(ErrorCode.INVALID_PARAMETER, argument="image_size")
+        return []
+
+    def opened(found: bool) -> None:
+        acknowledge.end(ErrorCode.OK if found else ErrorCode.SEQUENCE)
+
+    images.open_last(edge, opened)
+    return None
+
+
+def load_image_chunk(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Load a chunk of the open image."""
+    images = device.images
+    if images.busy and images.download is None:
+        raise Refused(ErrorCode.BUSY)
+    if images.download is None:
+        raise Refused(ErrorCode.SEQUENCE)
+    if int(arguments["number"]) >= images.frames:
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="number")
+    images.frame = int(arguments["number"])
+    return []
+
+
+def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Capture an image and store it."""
+    if arguments["camera"] != "star":
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="camera")
+    if device.modes.mode in {Mode.BOOT, Mode.ERROR}:
+        raise Refused(ErrorCode.SEQUENCE)
+    if device.images.busy:
+        raise Refused(ErrorCode.BUSY)
+    device.images.save(edge_of(str(arguments["image_size"])))
+    return []
+
+
+def set_mode(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Command a mode."""
+    if not device.command_mode(Mode(str(arguments["mode"]))):
+        raise Refused(ErrorCode.SEQUENCE)
+    return []
+
+
+def set_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Set one parameter and select it."""
+    chosen = device.icd.parameters_by_id.get(int(arguments["parameter"]))
+    if chosen is None:
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="parameter")
+    try:
+        device.parameters.set({chosen.name: arguments["value"]})
+    except MessageError:
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="value") from None
+    device.selected_parameter = chosen.id
+    return []
+
+
+def select_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Select the parameter that telemetry reports."""
+    chosen = int(arguments["parameter"])
+    if chosen not in device.icd.parameters_by_id:
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="parameter")
+    device.selected_parameter = chosen
+    return []
+
+
+def save_parameters(device: Device, _arguments: Arguments, acknowledge: Acknowledge) -> None:
+    """Store all parameters; answered once they are on disk or storing has failed."""
+
+    def done(error: EmulatorError | None) -> None:
+        acknowledge.end(ErrorCode.OK if error is None else ErrorCode.INTERNAL)
+
+    device.save_parameters(done)
+
+
+def restore_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Load the stored parameters."""
+    device.restore_parameters()
+    return []
+
+
+def default_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Set all parameters to their defaults."""
+    device.parameters.set_defaults()
+    return []
+
+
+def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Clear the counters and flags of the links."""
+    device.counters.clear()
+    return []
+
+
+def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Send a list of telemetry rows unasked, in place of the last list."""
+    rate_hz = float(arguments["rate"])
+    wanted = []
+    for name, row_id in arguments.items():
+        if not name.startswith("telemetry[") or not row_id:
+            continue
+        row = device.icd.telemetry_row(int(row_id), arguments.get("class"))
+        if row is None:
+            raise Refused(ErrorCode.INVALID_PARAMETER, argument=name)
+        wanted.append(Subscription(row, rate_hz or None))
+    device.subscriptions.replace("request", wanted)
+    return []
+
+
+def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Select one telemetry row and its rate by the parameters for them."""
+    row_id = int(arguments["telemetry"])
+    if device.icd.telemetry_row(row_id) is None:
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="telemetry")
+    device.parameters.set({"unsolicited_selection": row_id, "unsolicited_rate": arguments["rate"]})
+    return []
+
+
+def load_file_block(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Load a block of a file."""
+    offset, length = int(arguments["offset"]), int(arguments["length"])
+    if not device.files.load(str(arguments["file_type"]), int(arguments["file_counter"]), offset, length):
+        raise Refused(ErrorCode.INVALID_PARAMETER)
+    return []
+
+
+def start_burst(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Send the loaded block in packets."""
+    if not device.files.ready:
+        raise Refused(ErrorCode.SEQUENCE)
+    return device.files.burst(ignore_hole_map=bool(arguments["ignore_hole_map"]))
+
+
+def set_hole_map(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+    """Report which packets have arrived."""
+    device.files.arrived.set_part(int(arguments["section"]), bytes(arguments["map"]))
+    return []
+
+
+ACTIONS: Final[dict[str, Action]] = {
+    action.__name__: action
+    for action in (
+        nothing,
+        reset,
+        set_clock,
+        set_mode,
+        set_parameters,
+        set_parameter,
+        select_parameter,
+        save_parameters,
+        restore_parameters,
+        default_parameters,
+        clear_counters,
+        subscribe,
+        select_unsolicited,
+        save_image,
+        open_image,
+        load_image_chunk,
+        load_file_block,
+        start_burst,
+        set_hole_map,
+    )
+}
+"""Name → function."""
+
+ANSWERED_WHEN_DONE: Final = frozenset({"save_parameters"})
+"""Actions whose telecommands are answered with their outcome instead of their acceptance."""

@@ -1,0 +1,169 @@
+"""Rows of the unit bound to the device: telemetry to quantities, telecommands to actions. Compiled once, at the start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from starhil.emulator.device.actions import ACTIONS, ANSWERED_WHEN_DONE, PARAMETERS, Action
+from starhil.emulator.device.counters import Acknowledge
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.quantities import Getter, getter_of
+from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.snapshot import Snapshot
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.device_model import PARAMETER
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd_bindings import quantity_of
+from starhil.protocol.icd_layout import text_of
+from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.units_of_measure import factor
+from starhil.protocol.values import Value
+
+
+class TelemetryBinding:
+    """A telemetry row and the quantities of its fields."""
+
+    def __init__(self, row: Row, icd: InterfaceDefinition) -> None:
+        self.row = row
+        self._getters = [
+            (field.name, getter)
+            for field in row.named_fields.values()
+            if (getter := _field_getter(field, icd)) is not None
+        ]
+
+    def encode(self, device: Device) -> bytes:
+        """Return the row's present bytes; numbers beyond a field's range are clipped, or wrap.
+
+        Raises Refused if the row cannot be read now.
+        """
+        snapshot = Snapshot(device)
+        values: dict[str, Value] = {}
+        for name, getter in self._getters:
+            value = getter(snapshot)
+            if value is not None:
+                values[name] = value
+        return self.row.encode(values, saturate=True)
+
+
+def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
+    """Return the function that gives a field's value in its unit, or None for a field that is not bound."""
+    if field.telecommand is not None:
+        return _accepted(field.telecommand, field.name)
+    name = field.value if field.parameter is None else PARAMETER + field.parameter
+    if name is None:
+        return None
+    own = icd.plugin.quantities.get(name)
+    getter: Getter = getter_of(name) if own is None else own.function
+    declared = quantity_of(name, icd.model, icd.plugin)
+    scale = None if declared is None else factor(declared.unit, field.unit)
+    if scale not in (None, 1.0):
+        getter = _scaled(getter, float(scale or 1.0))
+    return getter if field.enum is None else _named(getter, field)
+
+
+def _accepted(telecommand: str, name: str) -> Getter:
+    """Return the getter of a value with which a telecommand was last accepted."""
+    return lambda shot: shot.device.accepted.get(telecommand, {}).get(name)
+
+
+def _scaled(getter: Getter, scale: float) -> Getter:
+    def scaled(snapshot: Snapshot) -> Value | None:
+        value = getter(snapshot)
+        return value * scale if isinstance(value, (int, float)) else value
+
+    return scaled
+
+
+def _named(getter: Getter, field: Field) -> Getter:
+    """Return a getter whose values are members of the field's enumeration, or its default."""
+    members = {} if field.enum is None else field.enum.values
+    aliases = field.aliases
+
+    def named(snapshot: Snapshot) -> Value | None:
+        value = getter(snapshot)
+        if value is None:
+            return None
+        text = text_of(value)
+        name = aliases.get(text, text)
+        if name in members:
+            return name
+        return None if isinstance(value, str) else value
+
+    return named
+
+
+class TelecommandBinding:
+    """A telecommand row and its action."""
+
+    def __init__(self, row: Row, icd: InterfaceDefinition) -> None:
+        self.row = row
+        name = row.action or "nothing"
+        own = icd.plugin.actions.get(name)
+        self._action: Action = ACTIONS[name] if own is None else _plugin_action(own)
+        self.answered_when_done = name in ANSWERED_WHEN_DONE
+        self._reported = any(
+            field.telecommand == row.name for other in icd.telemetry.values() for field in other.fields
+        )
+        model = icd.model.actions.get(name)
+        declared = {} if model is None else {item.name: item for item in model.arguments}
+        self._fixed: dict[str, Any] = {
+            key: item.default
+            for key, item in declared.items()
+            if item.default is not None and "[n]" not in key
+        } | dict(row.arguments)
+        self._arguments: list[tuple[str, str, Callable[[Any], Any]]] = []
+        self._parameters: list[tuple[str, str]] = []
+        self._index: dict[str, int] = {}
+        for index, field in enumerate(row.named_fields.values()):
+            if field.argument is not None:
+                item = None if model is None else icd.model.argument(model, field.argument)
+                convert = _argument_converter(
+                    field, "" if item is None else item.unit, item is not None and item.type == "bool"
+                )
+                self._arguments.append((field.name, field.argument, convert))
+                self._index[field.argument] = index
+            elif field.parameter is not None:
+                self._parameters.append((field.name, field.parameter))
+                self._index[field.parameter] = index
+
+    def execute(self, device: Device, data: bytes, acknowledge: Acknowledge) -> list[Reply] | None:
+        """Decode and perform the telecommand, as the functions in `actions` do.
+
+        Raises Refused or MessageError with the index of the field at fault.
+        """
+        values = self.row.decode(data)
+        arguments = dict(self._fixed)
+        for name, argument, convert in self._arguments:
+            arguments[argument] = convert(values[name])
+        arguments[PARAMETERS] = {parameter: values[name] for name, parameter in self._parameters}
+        try:
+            replies = self._action(device, arguments, acknowledge)
+        except Refused as refused:
+            if refused.argument is not None:
+                refused.index = self._index.get(refused.argument, 0)
+            raise
+        if self._reported:
+            device.accepted[self.row.name] = values
+        return replies
+
+
+def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any], Any]:
+    scale = factor(field.unit, unit) if unit else 1.0
+    if is_bool:
+        return lambda value: value == "true" if isinstance(value, str) else bool(value)
+    if scale in (None, 1.0):
+        return lambda value: value
+    return lambda value: value * scale
+
+
+def _plugin_action(function: Callable[[Any, Mapping[str, Any]], Any]) -> Action:
+    """Return a plugin's function as an action; bytes that it returns are the data of the answer, or of each of them."""
+
+    def action(device: Device, arguments: Mapping[str, Any], _acknowledge: Acknowledge) -> list[Reply]:
+        return [
+            Reply(ReplyKind.ACK, None, item) if isinstance(item, bytes) else item
+            for item in function(device, arguments) or ()
+        ]
+
+    return action

@@ -1,0 +1,137 @@
+"""Checks of messages: sum, XOR, cyclic redundancy check and XXH32, as functions from bytes to check bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, reduce
+from operator import xor
+from typing import Final, Literal, assert_never
+
+import xxhash
+
+from starhil.protocol.link_schema import (
+    CheckModel,
+    CrcCheck,
+    CustomCheck,
+    NoCheck,
+    SumCheck,
+    XorCheck,
+    XxHashCheck,
+)
+from starhil.protocol.values import IcdError
+
+ByteOrder = Literal["little", "big"]
+CheckFunction = Callable[[bytes], bytes]
+
+WIDTHS: Final = {"u8": 1, "u16": 2, "u32": 4, "u64": 8}
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check: its size, what it covers and how it is computed."""
+
+    size: int
+    """Bytes of the check."""
+    covers: frozenset[str]
+    """`start`, `header`, `data`."""
+    compute: CheckFunction
+
+
+NO_CHECK: Final = Check(0, frozenset(), lambda _covered: b"")
+
+
+def build_check(
+    model: CheckModel, byte_order: ByteOrder, custom: Mapping[str, CheckFunction] | None = None
+) -> Check:
+    """Return the check that a definition selects; `custom` holds those of its plugin by name.
+
+    Raises
+    ------
+    IcdError
+        A value does not fit the check's width, or the plugin has no check of that name.
+    """
+    if isinstance(model, NoCheck):
+        return NO_CHECK
+    order: ByteOrder = model.order or byte_order
+    match model:
+        case SumCheck():
+            compute = _sum_function(WIDTHS[model.type], model.complement, order)
+        case XorCheck():
+            initial = model.init
+            return Check(1, frozenset(model.covers), lambda covered: bytes((reduce(xor, covered, initial),)))
+        case CrcCheck():
+            compute = _crc_function(model, order)
+        case XxHashCheck():
+            seed = model.seed
+            compute = lambda covered: xxhash.xxh32_intdigest(covered, seed).to_bytes(4, order)  # noqa: E731
+        case CustomCheck():
+            found = (custom or {}).get(model.name)
+            if found is None:
+                raise IcdError(f"link.serial.check: the plugin has no check named {model.name!r}")
+            compute = found
+        case _:
+            assert_never(model)
+    return Check(len(compute(b"")), frozenset(model.covers), compute)
+
+
+def _sum_function(width: int, complement: str, order: ByteOrder) -> CheckFunction:
+    mask = (1 << 8 * width) - 1
+
+    def compute(covered: bytes) -> bytes:
+        total = sum(covered)
+        if complement != "none":
+            total = ~total + (complement == "twos")
+        return (total & mask).to_bytes(width, order)
+
+    return compute
+
+
+def _crc_function(model: CrcCheck, order: ByteOrder) -> CheckFunction:
+    width = WIDTHS[model.type]
+    mask = (1 << 8 * width) - 1
+    for name, value in (("poly", model.poly), ("init", model.init), ("xor", model.xor)):
+        if value > mask:
+            raise IcdError(f"link.serial.check: {name} {value:#x} does not fit {model.type}")
+
+    def compute(covered: bytes) -> bytes:
+        return crc(
+            covered, width=width, poly=model.poly, init=model.init, reflect=model.reflect, xor_out=model.xor
+        ).to_bytes(width, order)
+
+    return compute
+
+
+def crc(data: bytes, *, width: int, poly: int, init: int = 0, reflect: bool = False, xor_out: int = 0) -> int:
+    """Return a cyclic redundancy check of `width` bytes; `poly` and `init` in normal notation."""
+    table = _crc_table(width, poly, reflect)
+    bits = 8 * width
+    if reflect:
+        register = _reversed(init, bits)
+        for byte in data:
+            register = register >> 8 ^ table[(register ^ byte) & 0xFF]
+    else:
+        register = init
+        shift, mask = bits - 8, (1 << bits) - 1
+        for byte in data:
+            register = (register << 8 & mask) ^ table[register >> shift ^ byte]
+    return register ^ xor_out
+
+
+@lru_cache(maxsize=16)
+def _crc_table(width: int, poly: int, reflect: bool) -> tuple[int, ...]:
+    """Return the register after each byte value, from an empty register."""
+    bits = 8 * width
+    top, mask = 1 << (bits - 1), (1 << bits) - 1
+    table = []
+    for byte in range(256):
+        register = (_reversed(byte, 8) if reflect else byte) << (bits - 8)
+        for _ in range(8):
+            register = (register << 1 ^ poly if register & top else register << 1) & mask
+        table.append(_reversed(register, bits) if reflect else register)
+    return tuple(table)
+
+
+def _reversed(value: int, bits: int) -> int:
+    """Return the lowest bits of a value in reverse order."""
+    return int(f"{value:0{bits}b}"[::-1], 2)

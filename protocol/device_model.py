@@ -1,0 +1,119 @@
+"""The device model: the parameters, quantities and actions of the emulated star sensor, whatever its interface.
+
+`configs/units/model.toml` declares them; units bind the fields of their rows to them by name. The functions that compute
+quantities and perform actions are those of the emulator.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+from pydantic import ValidationError
+
+from starhil.protocol.icd_schema import (
+    ActionModel,
+    ArgumentModel,
+    DeviceModelFile,
+    DeviceParameterModel,
+    QuantityModel,
+)
+from starhil.protocol.unit_folders import UNITS_FOLDER
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.values import EnumDefinition, IcdError
+
+MODEL_FILE: Final = UNITS_FOLDER / "model.toml"
+
+_NUMBER: Final = re.compile(r"\[(\d+)\]")
+
+PARAMETER: Final = "parameter."
+"""Quantities of this name report a parameter of the device."""
+HEALTH: Final = "health."
+"""Quantities of this name report a number of the profile's table `[health]`."""
+
+
+@dataclass(frozen=True)
+class DeviceModel:
+    """Parameters, quantities, actions and enumerations by name."""
+
+    parameters: Mapping[str, DeviceParameterModel]
+    quantities: Mapping[str, QuantityModel]
+    actions: Mapping[str, ActionModel]
+    enums: Mapping[str, EnumDefinition]
+
+    def quantity(self, name: str) -> QuantityModel | None:
+        """Return the declaration of a quantity, such as `attitude.w`, `stars[3].x` or `parameter.exposure`, or None."""
+        if name.startswith(PARAMETER):
+            parameter = self.parameters.get(name.removeprefix(PARAMETER))
+            return None if parameter is None else _of_parameter(name, parameter)
+        if name.startswith(HEALTH):
+            return QuantityModel(
+                name=name, type="float", unit="*", doc="A number of the profile's table [health]."
+            )
+        found = self.quantities.get(generic(name))
+        numbers = [int(number) for number in _NUMBER.findall(name)]
+        if found is None or any(not 1 <= number <= (found.count or 0) for number in numbers):
+            return None
+        return found
+
+    def near_quantities(self, name: str) -> str:
+        """Return a hint at quantities whose names are similar."""
+        return did_you_mean(name, [*self.quantities, *(PARAMETER + known for known in self.parameters)])
+
+    def argument(self, action: ActionModel, name: str) -> ArgumentModel | None:
+        """Return the declaration of an action's argument, or None."""
+        numbers = [int(number) for number in _NUMBER.findall(name)]
+        found = next((item for item in action.arguments if item.name == generic(name)), None)
+        if found is None or any(not 1 <= number <= (found.count or 0) for number in numbers):
+            return None
+        return found
+
+
+def generic(name: str) -> str:
+    """Return a name with `[n]` in place of its number."""
+    return _NUMBER.sub("[n]", name)
+
+
+def number_in(name: str) -> int | None:
+    """Return the number in brackets of a name, or None."""
+    found = _NUMBER.search(name)
+    return None if found is None else int(found[1])
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean …?` with the names most similar to one that does not exist, or nothing."""
+    near = difflib.get_close_matches(name, list(known), n=3)
+    return f"; did you mean {', '.join(near)}?" if near else ""
+
+
+def _of_parameter(name: str, parameter: DeviceParameterModel) -> QuantityModel:
+    kinds = {"f32": "float", "f64": "float", "bool": "bool", "enum8": "text"}
+    return QuantityModel.model_validate(
+        {
+            "name": name,
+            "type": kinds.get(parameter.type, "int"),
+            "enum": parameter.enum,
+            "unit": parameter.unit,
+            "doc": parameter.doc,
+        }
+    )
+
+
+@cache
+def device_model() -> DeviceModel:
+    """Read `configs/units/model.toml`, once."""
+    try:
+        file = DeviceModelFile.model_validate(tomllib.loads(read_user_text(MODEL_FILE)))
+    except (OSError, ValueError, ValidationError) as error:
+        raise IcdError(f"{MODEL_FILE}: not a device model: {' '.join(str(error).split())}") from None
+    return DeviceModel(
+        parameters={item.name: item for item in file.parameter},
+        quantities={item.name: item for item in file.quantity},
+        actions={item.name: item for item in file.action},
+        enums={item.name: EnumDefinition(item.name, item.doc, dict(item.values)) for item in file.enum},
+    )

@@ -1,0 +1,246 @@
+"""Headers of serial messages: fields by role, packed to bytes and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel
+from starhil.protocol.values import IcdError
+
+ByteOrder = Literal["little", "big"]
+
+SIZES: Final = {
+    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "bits8": 1, "bits16": 2, "bits32": 4,
+}  # fmt: skip
+WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
+"""Roles whose values wrap around in their field."""
+NANOSECONDS: Final = 1_000_000_000
+
+
+class HeaderError(ProtocolError):
+    """A header that no message of the unit has."""
+
+
+@dataclass(frozen=True)
+class _Bit:
+    role: str | None
+    shift: int
+    mask: int
+    const: int | None
+    default: int
+
+
+@dataclass(frozen=True)
+class HeaderField:
+    """One field of a header."""
+
+    role: str | None
+    size: int
+    order: ByteOrder
+    signed: bool
+    const: int | None
+    default: int
+    scale: float
+    includes: frozenset[str]
+    classes: frozenset[str] | None
+    bits: tuple[_Bit, ...]
+
+    def in_class(self, klass: str) -> bool:
+        """Return whether messages of a class have this field."""
+        return self.classes is None or klass in self.classes
+
+    def to_bytes(self, value: int) -> bytes:
+        """Return a value as bytes."""
+        if self.role in WRAPPING:
+            value &= (1 << 8 * self.size) - 1
+        try:
+            return value.to_bytes(self.size, self.order, signed=self.signed and self.role not in WRAPPING)
+        except OverflowError:
+            raise ProtocolError(
+                f"header: {self.role or 'constant'} {value} does not fit {self.size} bytes"
+            ) from None
+
+    def from_bytes(self, data: bytes) -> int:
+        """Return the value of bytes."""
+        return int.from_bytes(data, self.order, signed=self.signed)
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """What a header says, by role, and how long the header is."""
+
+    values: Mapping[str, int]
+    size: int
+    klass: str
+    """Class by name, or an empty text."""
+
+
+class Header:
+    """The fields before the data of a message.
+
+    Parameters
+    ----------
+    models
+        Fields as in the definition.
+    byte_order
+        That of the unit.
+    class_of
+        Returns the name of the class with this code; raises HeaderError.
+    overhead
+        Bytes of `start`, `check` and `end`, for what a length may count.
+    where
+        Field path for error messages.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[HeaderFieldModel],
+        byte_order: ByteOrder,
+        class_of: Callable[[int], str],
+        overhead: Mapping[str, int],
+        where: str,
+    ) -> None:
+        self.fields: Final = tuple(
+            _field(model, byte_order, f"{where}: {number}") for number, model in enumerate(models, 1)
+        )
+        self._class_of = class_of
+        self._overhead = overhead
+        self.roles: Final = frozenset(
+            role for field in self.fields for role in (field.role, *(bit.role for bit in field.bits)) if role
+        )
+        """Roles that the header carries."""
+        self.defaults: Final = {
+            role: default
+            for field in self.fields
+            for role, default in (
+                (field.role, field.default),
+                *((bit.role, bit.default) for bit in field.bits),
+            )
+            if role
+        }
+        """Value of each role where a message has none."""
+
+    def size(self, klass: str) -> int:
+        """Return the bytes of the header in messages of a class."""
+        return sum(field.size for field in self.fields if field.in_class(klass))
+
+    def count_ns(self, role: str) -> int:
+        """Return the nanoseconds a count of `ticks` or `time`."""
+        return next(round(field.scale * NANOSECONDS) for field in self.fields if field.role == role)
+
+    def length(self, header_size: int, data_size: int) -> int:
+        """Return the value of the length field in a message of these sizes."""
+        return self._counted(self._length_field, header_size, data_size)
+
+    @property
+    def _length_field(self) -> HeaderField:
+        return next(field for field in self.fields if field.role == "length")
+
+    def pack(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
+        """Return the header of a message with this much data.
+
+        Raises ProtocolError if a value does not fit its field.
+        """
+        packed = []
+        for field in self.fields:
+            if not field.in_class(klass):
+                continue
+            if field.bits:
+                value = sum(_bit_value(bit, values) << bit.shift for bit in field.bits)
+            elif field.role == "length":
+                value = self._counted(field, self.size(klass), data_size)
+            elif field.role is None:
+                value = field.default
+            else:
+                value = values.get(field.role, field.default)
+            packed.append(field.to_bytes(value))
+        return b"".join(packed)
+
+    def unpack(self, body: bytes) -> Envelope | None:
+        """Return what the header of a body says, or None if the body is too short for one.
+
+        Raises HeaderError for a constant that differs or a class that the unit does not have.
+        """
+        values: dict[str, int] = {}
+        klass = ""
+        position = 0
+        for field in self.fields:
+            if not field.in_class(klass):
+                continue
+            if position + field.size > len(body):
+                return None
+            value = field.from_bytes(body[position : position + field.size])
+            if field.const is not None and value != field.const and field.role != "address":
+                raise HeaderError(f"header has {value:#x} in place of {field.const:#x}")
+            if field.role is not None:
+                values[field.role] = value
+            for bit in field.bits:
+                found = value >> bit.shift & bit.mask
+                if bit.const is not None and found != bit.const:
+                    raise HeaderError(f"header has bits {found:#x} in place of {bit.const:#x}")
+                if bit.role is not None:
+                    values[bit.role] = found
+            if "class" in values and not klass:
+                klass = self._class_of(values["class"])
+            position += field.size
+        return Envelope(values, position, klass)
+
+    def data_size(self, envelope: Envelope) -> int:
+        """Return the bytes of data that the length of a header promises.
+
+        Raises HeaderError if the length is shorter than what it counts.
+        """
+        data = envelope.values["length"] - self.length(envelope.size, 0)
+        if data < 0:
+            raise HeaderError(f"length {envelope.values['length']} is shorter than what it counts")
+        return data
+
+    def _counted(self, field: HeaderField, header_size: int, data_size: int) -> int:
+        sizes = {**self._overhead, "header": header_size, "data": data_size}
+        return sum(sizes[part] for part in field.includes)
+
+
+def _bit_value(bit: _Bit, values: Mapping[str, int]) -> int:
+    value = bit.default if bit.role is None else values.get(bit.role, bit.default)
+    if not 0 <= value <= bit.mask:
+        raise ProtocolError(
+            f"header: {bit.role or 'constant'} {value} does not fit {bit.mask.bit_length()} bits"
+        )
+    return value
+
+
+def _field(model: HeaderFieldModel, byte_order: ByteOrder, where: str) -> HeaderField:
+    size = SIZES[model.type]
+    if bool(model.bits) != model.type.startswith("bits"):
+        raise IcdError(f"{where}: types bits8, bits16 and bits32 have `bits`, the other types have none")
+    if model.role in ("ticks", "time") and round(model.scale * NANOSECONDS) < 1:
+        raise IcdError(f"{where}: scale {model.scale:g} s is below a nanosecond")
+    if model.role is None and model.const is None and model.default is None and not model.bits:
+        raise IcdError(f"{where}: needs a role, or `const` or `default`")
+    return HeaderField(
+        role=model.role,
+        size=size,
+        order=model.order or byte_order,
+        signed=model.type.startswith("i"),
+        const=model.const,
+        default=model.const if model.const is not None else model.default or 0,
+        scale=model.scale,
+        includes=frozenset(model.includes),
+        classes=None if model.classes is None else frozenset(model.classes),
+        bits=_bits(model.bits, 8 * size, where),
+    )
+
+
+def _bits(models: Sequence[HeaderBitModel], width: int, where: str) -> tuple[_Bit, ...]:
+    bits = []
+    shift = 0
+    for model in models:
+        default = model.const if model.const is not None else model.default or 0
+        bits.append(_Bit(model.role, shift, (1 << model.width) - 1, model.const, default))
+        shift += model.width
+    if models and shift != width:
+        raise IcdError(f"{where}: the bits make {shift}, must be {width}")
+    return tuple(bits)

@@ -1,0 +1,447 @@
+"""Framings of serial links, selected by data: where a message begins and ends in a stream of bytes.
+
+A framing turns a body (header, data and check) into bytes, and makes deframers, which do the reverse. A deframer is sans-I/O:
+it is fed bytes with their time of arrival and returns what its `interpret` makes of each body, and the faults.
+"""
+
+from __future__ import annotations
+
+import binascii
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Generic, TypeVar
+
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, SlipFraming
+from starhil.protocol.messages import FaultKind, LinkFault, check_receiver_limits
+from starhil.protocol.serial_framing import Deframer as EscapeDeframer
+from starhil.protocol.values import IcdError
+
+_Message = TypeVar("_Message")
+
+DEFAULT_SUBSTITUTES: Final = (0xDC, 0xDD)
+
+
+class BodySizeError(ProtocolError):
+    """The beginning of a body that no message has."""
+
+
+@dataclass(frozen=True)
+class Receiving(Generic[_Message]):
+    """What a deframer needs to know of the messages."""
+
+    interpret: Callable[[bytes], _Message | LinkFault | None]
+    """Returns the message of a body, the fault it has, or None if it is consumed."""
+    measure: Callable[[bytes], int | None]
+    """Returns the size of the body that begins with these bytes, None if they are too few.
+
+    Raises BodySizeError.
+    """
+    max_size: int
+    """Longest body, bytes."""
+    timeout_s: float
+    """Silence within a message after which it is abandoned."""
+
+
+class Deframer(ABC, Generic[_Message]):
+    """Finds bodies in a stream of bytes; each run of junk yields one fault."""
+
+    @property
+    @abstractmethod
+    def busy(self) -> bool:
+        """Whether a message has begun and not ended."""
+
+    @abstractmethod
+    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
+        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+
+    @abstractmethod
+    def flush(self, now: float) -> list[LinkFault]:
+        """Abandon a message that has been silent for the timeout."""
+
+
+class _Collector(Deframer[_Message]):
+    """Base of the deframers that collect bytes until a message is whole."""
+
+    def __init__(self, receiving: Receiving[_Message]) -> None:
+        check_receiver_limits(receiving.max_size, receiving.timeout_s)
+        self._interpret = receiving.interpret
+        self._measure = receiving.measure
+        self._max_size = receiving.max_size
+        self._timeout_s = receiving.timeout_s
+        self._last_time = float("-inf")
+        self._events: list[_Message | LinkFault] = []
+
+    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
+        self._events = list(self.flush(now))
+        if data:
+            self._last_time = now
+            self._consume(data)
+        return self._events
+
+    def flush(self, now: float) -> list[LinkFault]:
+        if now - self._last_time < self._timeout_s:
+            return []
+        size = self._abandon()
+        if not size:
+            return []
+        text = f"message of {size} bytes without end after {self._timeout_s:g} s of silence"
+        return [LinkFault(FaultKind.UART_INCOMPLETE, text)]
+
+    @abstractmethod
+    def _consume(self, data: bytes) -> None:
+        """Add to the events what these bytes complete."""
+
+    @abstractmethod
+    def _abandon(self) -> int:
+        """Forget everything received; return the bytes of a message that is incomplete and not yet reported."""
+
+    def _add(self, result: _Message | LinkFault | None) -> None:
+        if result is not None:
+            self._events.append(result)
+
+    def _fault(self, kind: FaultKind, text: str) -> None:
+        self._events.append(LinkFault(kind, text))
+
+    def _overlong(self) -> LinkFault:
+        return LinkFault(FaultKind.UART_OVERLONG, f"message longer than {self._max_size} bytes")
+
+
+class Framing(ABC):
+    """One way to mark messages in a stream of bytes."""
+
+    start: bytes = b""
+    """Bytes before a body that a check may cover."""
+    end: bytes = b""
+
+    @abstractmethod
+    def encode(self, body: bytes) -> bytes:
+        """Return a body as bytes on the line.
+
+        Raises ProtocolError if the framing cannot carry it.
+        """
+
+    @abstractmethod
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        """Return a deframer for one direction."""
+
+
+class Slip(Framing):
+    """Frames between end bytes, with substituted bytes within (RFC 1055)."""
+
+    def __init__(self, model: SlipFraming) -> None:
+        if model.xor is not None:
+            substitutes = (model.end ^ model.xor, model.escape ^ model.xor)
+        else:
+            substitutes = model.substitutes or DEFAULT_SUBSTITUTES
+        self.end = bytes((model.end,))
+        self.escape = bytes((model.escape,))
+        self._before = self.end if model.leading_end else b""
+        self._escaped_end = self.escape + bytes((substitutes[0],))
+        self._escaped_escape = self.escape + bytes((substitutes[1],))
+        self._originals = {substitutes[0]: self.end, substitutes[1]: self.escape}
+        if len(self._originals) < 2 or model.end == model.escape or self.end[0] in self._originals:
+            raise IcdError("link.serial.framing: end, escape and substitutes must differ")
+
+    def encode(self, body: bytes) -> bytes:
+        """Return `end`, the body with its end and escape bytes substituted, and `end`."""
+        escaped = body.replace(self.escape, self._escaped_escape).replace(self.end, self._escaped_end)
+        return self._before + escaped + self.end
+
+    def decode(self, frame: bytes) -> bytes | LinkFault:
+        """Return the body of what lies between two end bytes."""
+        first, *rest = frame.split(self.escape)
+        body = [first]
+        for piece in rest:
+            original = self._originals.get(piece[0]) if piece else None
+            if original is None:
+                found = f"byte {piece[0]:02X}" if piece else "the end of the message"
+                return LinkFault(FaultKind.UART_PROTOCOL, f"{found} after an escape byte within a message")
+            body += (original, piece[1:])
+        return b"".join(body)
+
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        """Return a deframer that takes what lies between end bytes."""
+        return _SlipDeframer(receiving, self)
+
+
+class _SlipDeframer(_Collector[_Message]):
+    def __init__(self, receiving: Receiving[_Message], framing: Slip) -> None:
+        super().__init__(receiving)
+        self._framing = framing
+        self._frame = bytearray()
+        self._skipping = False
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._frame) or self._skipping
+
+    def _consume(self, data: bytes) -> None:
+        *whole, rest = data.split(self._framing.end)
+        for piece in whole:
+            self._collect(piece)
+            self._finish()
+        self._collect(rest)
+
+    def _collect(self, piece: bytes) -> None:
+        if self._skipping:
+            return
+        self._frame += piece
+        if len(self._frame) > 2 * self._max_size:
+            self._add(self._overlong())
+            self._frame.clear()
+            self._skipping = True
+
+    def _finish(self) -> None:
+        frame = bytes(self._frame)
+        self._frame.clear()
+        self._skipping = False
+        if not frame:
+            return
+        body = self._framing.decode(frame)
+        if isinstance(body, bytes):
+            self._add(self._overlong() if len(body) > self._max_size else self._interpret(body))
+        else:
+            self._add(body)
+
+    def _abandon(self) -> int:
+        size = len(self._frame)
+        self._frame.clear()
+        self._skipping = False
+        return size
+
+
+class Escaped(Framing):
+    """`escape start … escape end`, with every escape byte within doubled."""
+
+    def __init__(self, model: EscapedFraming) -> None:
+        if len({model.escape, model.start, model.end}) < 3:
+            raise IcdError("link.serial.framing: escape, start and end must differ")
+        self._model = model
+        self._escape = bytes((model.escape,))
+        self.start = bytes((model.escape, model.start))
+        self.end = bytes((model.escape, model.end))
+
+    def encode(self, body: bytes) -> bytes:
+        """Return start, the body with its escape bytes doubled, and end."""
+        return self.start + body.replace(self._escape, self._escape * 2) + self.end
+
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        """Return a deframer that ignores what lies between messages."""
+        return _EscapedDeframer(receiving, self._model)
+
+
+class _EscapedDeframer(Deframer[_Message]):
+    def __init__(self, receiving: Receiving[_Message], model: EscapedFraming) -> None:
+        self._interpret = receiving.interpret
+        self._packets = EscapeDeframer(
+            frozenset((model.start,)),
+            first_is_id=False,
+            max_size=receiving.max_size,
+            timeout_s=receiving.timeout_s,
+            escape=model.escape,
+            end=model.end,
+        )
+
+    @property
+    def busy(self) -> bool:
+        return self._packets.busy
+
+    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
+        events = (
+            packet if isinstance(packet, LinkFault) else self._interpret(packet.body)
+            for packet in self._packets.feed(data, now)
+        )
+        return [event for event in events if event is not None]
+
+    def flush(self, now: float) -> list[LinkFault]:
+        return self._packets.flush(now)
+
+
+class Counted(Framing):
+    """`start`, a body whose size its header or its row gives, `end`."""
+
+    def __init__(self, start: list[int], end: list[int]) -> None:
+        self.start = bytes(start)
+        self.end = bytes(end)
+
+    def encode(self, body: bytes) -> bytes:
+        """Return start, body and end."""
+        return self.start + body + self.end
+
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        """Return a deframer that searches on from the byte after the start of a bad message."""
+        return _CountedDeframer(receiving, self)
+
+
+class _CountedDeframer(_Collector[_Message]):
+    def __init__(self, receiving: Receiving[_Message], framing: Counted) -> None:
+        super().__init__(receiving)
+        self._start, self._end = framing.start, framing.end
+        self._buffer = bytearray()
+        self._reported = 0
+        """Bytes at the beginning of the buffer that a fault has reported already."""
+        self._in_junk = False
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._buffer) or (self._in_junk and not self._start)
+
+    def _consume(self, data: bytes) -> None:
+        if self._in_junk and not self._start:
+            return
+        self._buffer += data
+        while self._buffer and self._at_start() and self._take_message():
+            pass
+
+    def _at_start(self) -> bool:
+        """Drop junk before the next start; return whether a whole start is there."""
+        head = len(self._start)
+        if not head:
+            return True
+        found = self._buffer.find(self._start)
+        self._drop_junk(self._partial_start() if found < 0 else found)
+        return found >= 0
+
+    def _partial_start(self) -> int:
+        """Return where a start may begin whose rest has not arrived."""
+        for size in range(min(len(self._start) - 1, len(self._buffer)), 0, -1):
+            if self._buffer.endswith(self._start[:size]):
+                return len(self._buffer) - size
+        return len(self._buffer)
+
+    def _take_message(self) -> bool:
+        """Take the message at the start of the buffer; return whether to search on."""
+        head = len(self._start)
+        try:
+            size = self._measure(bytes(self._buffer[head:]))
+        except BodySizeError as error:
+            return self._reject(LinkFault(FaultKind.UART_PROTOCOL, str(error)), head)
+        if size is None:
+            return len(self._buffer) - head > self._max_size and self._reject(self._overlong(), head)
+        if size > self._max_size:
+            return self._reject(self._overlong(), head)
+        whole = head + size + len(self._end)
+        if len(self._buffer) < whole:
+            return False
+        if self._buffer[head + size : whole] != self._end:
+            found = bytes(self._buffer[head + size : whole]).hex(" ").upper()
+            text = f"{found} in place of the end of a message"
+            return self._reject(LinkFault(FaultKind.UART_PROTOCOL, text), whole)
+        result = self._interpret(bytes(self._buffer[head : head + size]))
+        if isinstance(result, LinkFault):
+            return self._reject(result, whole)
+        self._drop(whole)
+        self._in_junk = False
+        self._add(result)
+        return True
+
+    def _reject(self, fault: LinkFault, extent: int) -> bool:
+        """Report the message at the start of the buffer unless it lies within one that is reported; search on in it."""
+        if self._reported <= 0:
+            self._add(fault)
+            self._reported = extent
+        self._in_junk = True
+        self._drop(1 if self._start else len(self._buffer))
+        return True
+
+    def _drop_junk(self, size: int) -> None:
+        if size > max(self._reported, 0) and not self._in_junk:
+            self._fault(FaultKind.UART_PROTOCOL, f"byte {self._buffer[0]:02X} outside a message")
+        self._in_junk = self._in_junk or size > 0
+        self._drop(size)
+
+    def _drop(self, size: int) -> None:
+        del self._buffer[:size]
+        self._reported -= size
+
+    def _abandon(self) -> int:
+        size, reported = len(self._buffer), self._reported
+        self._buffer.clear()
+        self._reported = 0
+        self._in_junk = False
+        return size if reported <= 0 else 0
+
+
+class Delimited(Framing):
+    """`start`, a body in bytes or hexadecimal digits, `end`."""
+
+    def __init__(self, model: DelimitedFraming) -> None:
+        self.start = bytes(model.start)
+        self.end = bytes(model.end)
+        self._hex = model.encoding == "hex"
+
+    def encode(self, body: bytes) -> bytes:
+        """Return start, the body and end."""
+        text = body.hex().upper().encode() if self._hex else body
+        for mark, within in ((self.end, text + self.end[:-1]), (self.start, text)):
+            if mark and mark in within:
+                raise ProtocolError(
+                    f"a message that contains {mark.hex(' ').upper()} does not fit this framing; "
+                    'set link.serial.framing.encoding = "hex"'
+                )
+        return self.start + text + self.end
+
+    def decode(self, text: bytes) -> bytes | LinkFault:
+        """Return the body of what lies between start and end."""
+        if not self._hex:
+            return text
+        try:
+            return binascii.unhexlify(text)
+        except binascii.Error:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"{text[:8]!r} is not hexadecimal")
+
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        """Return a deframer that takes what lies before each end."""
+        return _DelimitedDeframer(
+            receiving, self, 2 * receiving.max_size if self._hex else receiving.max_size
+        )
+
+
+class _DelimitedDeframer(_Collector[_Message]):
+    def __init__(self, receiving: Receiving[_Message], framing: Delimited, max_text: int) -> None:
+        super().__init__(receiving)
+        self._framing = framing
+        self._max_text = max_text + len(framing.start)
+        self._text = bytearray()
+        self._skipping = False
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._text) or self._skipping
+
+    def _consume(self, data: bytes) -> None:
+        self._text += data
+        *whole, rest = bytes(self._text).split(self._framing.end)
+        self._text = bytearray(rest)
+        for line in whole:
+            if not self._skipping:
+                self._take(line)
+            self._skipping = False
+        if len(rest) > self._max_text:
+            if not self._skipping:
+                self._add(self._overlong())
+            self._skipping = True
+            self._text = bytearray(rest[len(rest) - len(self._framing.end) + 1 :])
+
+    def _take(self, line: bytes) -> None:
+        if len(line) > self._max_text:
+            self._add(self._overlong())
+            return
+        before, start, text = (
+            line.rpartition(self._framing.start) if self._framing.start else (b"", b"", line)
+        )
+        if not start and self._framing.start:
+            self._fault(FaultKind.UART_PROTOCOL, "message without its start")
+            return
+        if before:
+            self._fault(FaultKind.UART_PROTOCOL, f"byte {before[0]:02X} outside a message")
+        body = self._framing.decode(text)
+        self._add(self._interpret(body) if isinstance(body, bytes) else body)
+
+    def _abandon(self) -> int:
+        size = 0 if self._skipping else len(self._text)
+        self._text.clear()
+        self._skipping = False
+        return size

@@ -1,0 +1,158 @@
+"""Checks what the fields of a unit are bound to: quantities, arguments of actions, parameters."""
+
+from __future__ import annotations
+
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.device_model import DeviceModel, did_you_mean, generic
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd_schema import ActionModel, ArgumentModel, QuantityModel
+from starhil.protocol.plugin import Plugin
+from starhil.protocol.units_of_measure import convertible, factor
+from starhil.protocol.values import IcdError
+
+ANY_UNIT = "*"
+
+
+def check_row(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
+    """Check the bindings of a row's fields.
+
+    Raises IcdError with the field, and with similar names where one is unknown.
+    """
+    action = _action(row, model, plugin, where)
+    for field in row.named_fields.values():
+        here = f"{where}: field {field.name}"
+        sources = [
+            name for name in ("value", "argument", "const", "parameter") if getattr(field, name) is not None
+        ]
+        if len(sources) > 1 and sources != ["argument", "parameter"]:
+            raise IcdError(f"{here}: has {' and '.join(sources)}; keep one of them")
+        if field.value is not None:
+            _check_value(field, row, model, plugin, here)
+        if field.argument is not None:
+            _check_argument(field, row, action, model, here)
+    if action is not None:
+        _check_required(row, action, where)
+
+
+def unbound(icd: InterfaceDefinition) -> list[str]:
+    """Return the rows and fields that the device cannot serve, as they are bound to nothing."""
+    missing = [
+        f"unit {icd.name}: telecommand {row.name}: no `action`; `nothing` accepts it and does nothing"
+        for row in icd.telecommands.values()
+        if row.action is None
+    ]
+    missing += [
+        f"unit {icd.name}: telemetry {row.name}: field {field.name}: no `value`, `const`, `parameter` or `default`; "
+        "a field without a name is sent as zeros"
+        for row in icd.telemetry.values()
+        for field in row.named_fields.values()
+        if (field.value, field.const, field.parameter, field.default, field.telecommand) == (None,) * 5
+    ]
+    return missing
+
+
+def quantity_of(name: str, model: DeviceModel, plugin: Plugin) -> QuantityModel | None:
+    """Return the declaration of a quantity of the device model or of the unit's plugin, or None."""
+    own = plugin.quantities.get(name)
+    if own is not None:
+        return QuantityModel(name=name, type="float", unit=own.unit or ANY_UNIT, doc=own.doc)
+    return model.quantity(name)
+
+
+def _action(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> ActionModel | None:
+    if row.action is None or row.action in plugin.actions:
+        return None
+    found = model.actions.get(row.action)
+    if found is None:
+        known = [*model.actions, *plugin.actions]
+        raise IcdError(f"{where}: no action named {row.action!r}{did_you_mean(row.action, known)}")
+    return found
+
+
+def _check_value(field: Field, row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
+    name = str(field.value)
+    if row.kind != "telemetry":
+        raise IcdError(f"{where}: `value` is for telemetry; a telecommand's field has an `argument`")
+    found = quantity_of(name, model, plugin)
+    if found is None:
+        raise IcdError(f"{where}: no quantity named {name!r}{model.near_quantities(name)}")
+    if name not in plugin.quantities:
+        _check_fit(field, found, f"quantity {name}", model, where)
+        _check_members(field, found, model, where)
+
+
+def _check_argument(
+    field: Field, row: Row, action: ActionModel | None, model: DeviceModel, where: str
+) -> None:
+    name = str(field.argument)
+    if row.kind != "telecommand":
+        raise IcdError(f"{where}: `argument` is for telecommands; a telemetry field has a `value`")
+    if row.action is None:
+        raise IcdError(f"{where}: argument {name}: the row has no `action`")
+    if action is None:
+        return  # the plugin's
+    found = model.argument(action, name)
+    if found is None:
+        known = [item.name for item in action.arguments]
+        raise IcdError(
+            f"{where}: action {action.name} has no argument {name!r}{did_you_mean(name, known)} "
+            f"(known: {', '.join(known) or 'none'})"
+        )
+    _check_fit(field, found, f"argument {name}", model, where)
+    if found.enum is not None and field.enum is not None:
+        names = [*field.enum.values, *field.aliases]
+        wrong = [item for item in names if item not in model.enums[found.enum].values]
+        if wrong:
+            hint = did_you_mean(wrong[0], model.enums[found.enum].values)
+            raise IcdError(f"{where}: {wrong[0]!r} is no value of argument {name}{hint}")
+
+
+def _check_fit(
+    field: Field, found: QuantityModel | ArgumentModel, what: str, model: DeviceModel, where: str
+) -> None:
+    """Check that a field can hold the values of a quantity or argument, and that its unit is convertible."""
+    if found.unit != ANY_UNIT and factor(found.unit, field.unit) is None:
+        raise IcdError(
+            f"{where}: unit {field.unit!r}, but {what} is in {found.unit!r}; use one of "
+            + ", ".join(repr(unit) for unit in convertible(found.unit))
+        )
+    names = found.enum is not None or found.type == "text"
+    fits = {
+        "bytes": field.kind == "bytes",
+        "text": field.kind in ("enum", "text"),
+        "bool": field.kind in ("flag", "integer", "bits", "enum"),
+    }.get(found.type, field.kind in ("integer", "float", "bits", "enum", "flag"))
+    if names and field.kind not in ("enum", "text"):
+        members = "" if found.enum is None else f": {', '.join(model.enums[found.enum].values)}"
+        raise IcdError(f"{where}: {what} has names{members}; give them numbers with `enum` or `map`")
+    if not fits:
+        raise IcdError(f"{where}: {what} is of type {found.type}, which a {field.kind} field does not hold")
+
+
+def _check_members(field: Field, found: QuantityModel, model: DeviceModel, where: str) -> None:
+    """Check that an enumeration has a number for every value that the quantity may have."""
+    if field.enum is None or field.default is not None:
+        return
+    wanted = ["true", "false"] if found.type == "bool" else []
+    if found.enum is not None:
+        wanted = list(model.enums[found.enum].values)
+    missing = [name for name in wanted if name not in field.enum.values and name not in field.aliases]
+    if missing:
+        raise IcdError(
+            f"{where}: quantity {field.value} may be {', '.join(missing)}, which has no number; add it, or a `default`"
+        )
+
+
+def _check_required(row: Row, action: ActionModel, where: str) -> None:
+    given = {generic(str(field.argument)) for field in row.named_fields.values()} | set(row.arguments)
+    missing = [item.name for item in action.arguments if item.required and item.name not in given]
+    if missing:
+        raise IcdError(
+            f"{where}: action {action.name} needs the argument {missing[0]}; bind a field to it with `argument`"
+        )
+    known = {item.name for item in action.arguments}
+    for name in row.arguments:
+        if name not in known:
+            raise IcdError(
+                f"{where}: action {action.name} has no argument {name!r}{did_you_mean(name, known)}"
+            )

@@ -1,0 +1,488 @@
+"""Reads the TOML files of a unit and builds its interface definition, or lists all their mistakes."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ValidationError
+
+from starhil.protocol import icd_schema as schema
+from starhil.protocol.codec import Row, RowKind
+from starhil.protocol.conventions import Conventions
+from starhil.protocol.device_model import DeviceModel, device_model, did_you_mean
+from starhil.protocol.icd import InterfaceDefinition, Names, RawTable
+from starhil.protocol.icd_bindings import check_row
+from starhil.protocol.icd_layout import Layout
+from starhil.protocol.link_schema import LinkModel
+from starhil.protocol.messages import ErrorCode, MessageClass, RequestKind
+from starhil.protocol.plugin import Plugin, load_plugin
+from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
+
+HIGHEST_ID: Final = 0xFF
+"""Highest id where the link does not say how an id is sent."""
+
+_MODELS: Final[dict[str, type[BaseModel]]] = {
+    "unit": schema.UnitModel,
+    "conventions": schema.ConventionsModel,
+    "class": schema.ClassModel,
+    "enum": schema.EnumModel,
+    "telecommand": schema.RowModel,
+    "telemetry": schema.RowModel,
+    "fields": schema.FieldModel,
+    "repeat": schema.RepeatModel,
+    "bits": schema.BitModel,
+    "parameter": schema.ParameterModel,
+    "section": schema.SectionModel,
+}
+"""Table → its schema, to suggest keys."""
+
+
+def read_definition(path: Path) -> tuple[InterfaceDefinition | None, list[str]]:
+    """Read a folder of TOML files, or one file; return the definition, or None and its mistakes."""
+    files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
+    if not files:
+        return None, [f"{path}: no .toml file of an interface definition in this folder"]
+    builder = _Builder(path)
+    for file in files:
+        builder.read(file)
+    definition = builder.build()
+    return (None, builder.mistakes) if builder.mistakes else (definition, [])
+
+
+def _key_path(document: object, location: tuple[int | str, ...]) -> str:
+    """Return a key's dotted path, with names of rows and fields instead of positions."""
+    steps: list[str] = []
+    here = document
+    for step in location:
+        try:
+            here = here[step]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            here = None
+        named = here.get("name") if isinstance(here, dict) else None
+        steps.append(str(named if named is not None and isinstance(step, int) else step))
+    return ".".join(steps)
+
+
+def _known_keys(location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys that the table of an unknown key may have."""
+    tables = [step for step in location[:-1] if isinstance(step, str)]
+    model = _MODELS.get(tables[-1], schema.FileModel) if tables else schema.FileModel
+    return [item.alias or name for name, item in model.model_fields.items()]
+
+
+class _Builder:
+    """Collects the files of a definition and validates them together."""
+
+    def __init__(self, path: Path) -> None:
+        self.mistakes: list[str] = []
+        self._path = path
+        self._model: DeviceModel = device_model()
+        self._enums: dict[str, EnumDefinition] = {}
+        self._used_enums: set[str] = set()
+        self._parameters: dict[str, Parameter] = {}
+        self._device_parameters: dict[str, Parameter] = {}
+        self._classes: dict[str, MessageClass] = {}
+        self._class_answers: dict[str, list[str]] = {}
+        self._files: list[tuple[Path, schema.FileModel]] = []
+        self._sections: list[Section] = []
+        self._tables: dict[str, tuple[Path, object]] = {}
+        self._plugin = Plugin()
+        self.byte_order: schema.Order = "little"
+
+    def read(self, file: Path) -> None:
+        """Read and validate one file."""
+        try:
+            document = tomllib.loads(read_user_text(file))
+        except OSError as error:
+            self.mistakes.append(f"{file}: cannot read the interface definition: {error.strerror}")
+            return
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            self.mistakes.append(f"{file}: not valid TOML: {error}")
+            return
+        try:
+            model = schema.FileModel.model_validate(document)
+        except ValidationError as error:
+            for item in error.errors():
+                where = f"{file}: {_key_path(document, item['loc'])}"
+                if item["type"] == "extra_forbidden":
+                    hint = did_you_mean(str(item["loc"][-1]), _known_keys(item["loc"]))
+                    self.mistakes.append(f"{where}: unknown key{hint}")
+                else:
+                    self.mistakes.append(f"{where}: {item['msg']}")
+            return
+        self._files.append((file, model))
+
+    def _attempt(self, step: Callable[..., None], *arguments: object) -> None:
+        """Do one step of building; note its mistake."""
+        try:
+            step(*arguments)
+        except IcdError as error:
+            self.mistakes.append(str(error))
+
+    def build(self) -> InterfaceDefinition | None:
+        """Build the definition; None if a mistake leaves nothing to build on."""
+        if self.mistakes:  # rows refer to each other across files: more would be found that is none
+            return None
+        for file, model in self._files:
+            for name, table in (
+                ("unit", model.unit),
+                ("conventions", model.conventions),
+                ("errors", model.errors),
+                ("link", model.link),
+                ("canopen", model.canopen),
+            ):
+                if table is not None:
+                    self._attempt(self._add_table, name, file, table)
+            for item in model.class_:
+                self._attempt(self._add_class, file, item)
+            for enum in model.enum:
+                self._attempt(self._add_enum, file, enum)
+            for section in model.section:
+                self._attempt(self._add_section, file, section)
+        if "unit" not in self._tables:
+            self.mistakes.append(f"{self._path}: no [unit] with name, version and doc")
+            return None
+        conventions = Conventions()
+        try:
+            self._load_plugin()
+            conventions = self._conventions()
+        except IcdError as error:
+            self.mistakes.append(str(error))
+        self.byte_order = conventions.byte_order
+        self._add_parameters()
+        rows: dict[str, Row] = {}
+        telecommands = self._build_rows("telecommand", rows)
+        telemetry = self._build_rows("telemetry", rows)
+        for row in telecommands:
+            self._attempt(self._check_answers, row, rows)
+        definition = self._definition(conventions, telecommands, telemetry)
+        self._attempt(self._check_link, definition)
+        return definition
+
+    def _check_link(self, definition: InterfaceDefinition) -> None:
+        """Check that the parts of the links fit one another and the rows."""
+        if definition.link.serial is None:
+            return
+        try:
+            build_serial_stack(definition)
+        except IcdError as error:
+            raise IcdError(f"{self._tables['link'][0]}: {error}") from None
+
+    def _definition(
+        self, conventions: Conventions, telecommands: list[Row], telemetry: list[Row]
+    ) -> InterfaceDefinition:
+        unit = self._unit
+        self._attempt(self._check_errors)
+        errors = self._tables.get("errors", (self._path, {}))[1]
+        link = self._tables.get("link", (self._path, None))[1]
+        enums = {
+            **{name: enum for name, enum in self._model.enums.items() if name in self._used_enums},
+            **self._enums,
+        }
+        return InterfaceDefinition(
+            name=unit.name,
+            version=unit.version,
+            doc=unit.doc,
+            telecommands=Names("telecommand", ((row.name, row) for row in telecommands)),
+            telemetry=Names("telemetry", ((row.name, row) for row in telemetry)),
+            enums=Names("enumeration", enums.items()),
+            parameters=Names("parameter", self._parameters.items()),
+            device_parameters=Names("parameter", {**self._device_parameters, **self._parameters}.items()),
+            sections=tuple(self._sections),
+            canopen=self._raw_table("canopen"),
+            link=link if isinstance(link, LinkModel) else LinkModel(),
+            conventions=conventions,
+            classes=tuple(self._classes.values()),
+            errors=errors if isinstance(errors, dict) else {},
+            first_telemetry_id=unit.first_telemetry_id,
+            plugin=self._plugin,
+        )
+
+    # --- tables that stand once ---
+
+    def _add_table(self, name: str, file: Path, table: object) -> None:
+        if name in self._tables:
+            raise IcdError(f"{file}: a second [{name}]; keep one of them")
+        self._tables[name] = (file, table)
+
+    def _raw_table(self, name: str) -> RawTable | None:
+        if name not in self._tables:
+            return None
+        file, table = self._tables[name]
+        return RawTable(file, table) if isinstance(table, dict) else None
+
+    @property
+    def _unit(self) -> schema.UnitModel:
+        unit = self._tables["unit"][1]
+        if not isinstance(unit, schema.UnitModel):
+            raise TypeError("unit: not a table of the schema")
+        return unit
+
+    def _load_plugin(self) -> None:
+        if self._unit.plugin is not None:
+            self._plugin = load_plugin(self._tables["unit"][0].parent / self._unit.plugin)
+
+    def _conventions(self) -> Conventions:
+        file, table = self._tables.get("conventions", (self._path, schema.ConventionsModel()))
+        if not isinstance(table, schema.ConventionsModel):
+            raise TypeError("conventions: not a table of the schema")
+        one, two, three = table.axes
+        try:
+            return Conventions(
+                table.quaternion, table.scalar_sign, (one, two, three), table.epoch, table.byte_order
+            )
+        except IcdError as error:
+            raise IcdError(f"{file}: {error}") from None
+
+    def _check_errors(self) -> None:
+        file, table = self._tables.get("errors", (self._path, {}))
+        known = [*(code.name.lower() for code in ErrorCode), "other"]
+        for name in table if isinstance(table, dict) else {}:
+            if name not in known:
+                raise IcdError(
+                    f"{file}: errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
+                )
+
+    # --- tables that stand many times ---
+
+    def _add_class(self, file: Path, model: schema.ClassModel) -> None:
+        where = f"{file}: class {model.name}"
+        if model.name in self._classes:
+            raise IcdError(f"{where}: defined twice")
+        same = next((item.name for item in self._classes.values() if item.code == model.code), None)
+        if model.code is not None and same is not None:
+            raise IcdError(f"{where}: code {model.code} is already used by {same}")
+        self._classes[model.name] = MessageClass(
+            model.name, RequestKind(model.kind), model.code, model.reply, model.unsolicited
+        )
+        if model.answer is not None:
+            self._class_answers[model.name] = model.answer
+
+    def _add_section(self, file: Path, model: schema.SectionModel) -> None:
+        where = f"{file}: section {model.heading}"
+        if any(other.heading == model.heading for other in self._sections):
+            raise IcdError(f"{where}: defined twice")
+        for number, row in enumerate(model.rows, 1):
+            if len(row) != len(model.columns):
+                raise IcdError(f"{where}: row {number} has {len(row)} cells, must have {len(model.columns)}")
+        rows = tuple(tuple(row) for row in model.rows)
+        self._sections.append(Section(model.heading, tuple(model.paragraphs), tuple(model.columns), rows))
+
+    def _add_enum(self, file: Path, model: schema.EnumModel) -> None:
+        if model.name in self._enums:
+            raise IcdError(f"{file}: enum {model.name}: defined twice")
+        if len(set(model.values.values())) != len(model.values):
+            raise IcdError(f"{file}: enum {model.name}: two names have one number")
+        self._enums[model.name] = EnumDefinition(model.name, model.doc, dict(model.values))
+
+    def enum_of(self, name: str | None, where: str) -> EnumDefinition:
+        """Return an enumeration of the unit, else of the device model."""
+        if name is None:
+            raise IcdError(f"{where}: type enum needs `enum`, the name of an enumeration")
+        if name in self._enums:
+            return self._enums[name]
+        if name in self._model.enums:
+            self._used_enums.add(name)
+            return self._model.enums[name]
+        known = sorted({*self._enums, *self._model.enums})
+        raise IcdError(
+            f"{where}: no enumeration named {name!r}{did_you_mean(name, known)} (known: {', '.join(known)})"
+        )
+
+    # --- parameters ---
+
+    def _add_parameters(self) -> None:
+        for name, item in self._model.parameters.items():
+            enum = None if item.enum is None else self._enums.get(item.enum, self._model.enums[item.enum])
+            low, high = self._limits(item, enum, f"device model: parameter {name}")
+            self._device_parameters[name] = Parameter(
+                0, name, item.type, item.unit, low, high, item.default, item.doc, enum
+            )
+        for file, model in self._files:
+            for parameter in model.parameter:
+                self._attempt(self._add_parameter, file, parameter)
+
+    def _add_parameter(self, file: Path, model: schema.ParameterModel) -> None:
+        where = f"{file}: parameter {model.name}"
+        if model.name in self._parameters:
+            raise IcdError(f"{where}: defined twice")
+        same_id = next((other.name for other in self._parameters.values() if other.id == model.id), None)
+        if same_id is not None:
+            raise IcdError(f"{where}: id {model.id} is already used by {same_id}")
+        base = self._model.parameters.get(model.name)
+        if base is None:
+            hint = did_you_mean(model.name, self._model.parameters)
+            raise IcdError(f"{where}: the device has no parameter of this name{hint}")
+        changes = model.model_dump(exclude_none=True, exclude={"id"})
+        whole = base.model_copy(update=changes)
+        if whole.unit != base.unit:
+            raise IcdError(f"{where}: unit {whole.unit!r}, but the device has it in {base.unit!r}")
+        enum = self.enum_of(whole.enum, where) if whole.type == "enum8" else None
+        low, high = self._limits(whole, enum, where)
+        parameter = Parameter(
+            model.id, whole.name, whole.type, whole.unit, low, high, whole.default, whole.doc, enum
+        )
+        try:
+            default = parameter.check(whole.default)
+        except FieldError as error:
+            raise IcdError(f"{where}: default: {error}") from None
+        self._parameters[whole.name] = Parameter(
+            model.id, whole.name, whole.type, whole.unit, low, high, default, whole.doc, enum
+        )
+
+    @staticmethod
+    def _limits(
+        model: schema.DeviceParameterModel, enum: EnumDefinition | None, where: str
+    ) -> tuple[float, float]:
+        if enum is not None:
+            return float(min(enum.values.values())), float(max(enum.values.values()))
+        if model.type == "bool":
+            return 0.0, 1.0
+        if model.min is None or model.max is None or not model.min <= model.max:
+            raise IcdError(f"{where}: needs min and max, min not above max")
+        low, high = INTEGER_RANGES.get(model.type, (float("-inf"), float("inf")))
+        if model.min < low or model.max > high:
+            raise IcdError(f"{where}: limits {model.min:g} to {model.max:g} do not fit type {model.type}")
+        return model.min, model.max
+
+    def check_parameter(self, name: str | None, unit: str, where: str) -> str | None:
+        """Check that a field's parameter exists and has the field's unit."""
+        if name is None:
+            return None
+        if name not in self._device_parameters:
+            raise IcdError(
+                f"{where}: no parameter named {name!r}{did_you_mean(name, self._device_parameters)}"
+            )
+        if self._device_parameters[name].unit != unit:
+            raise IcdError(
+                f"{where}: unit {unit!r}, but parameter {name} has {self._device_parameters[name].unit!r}; they must agree"
+            )
+        return name
+
+    # --- rows ---
+
+    def _build_rows(self, kind: RowKind, rows: dict[str, Row]) -> list[Row]:
+        models = [
+            (file, row)
+            for file, model in self._files
+            for row in (model.telecommand if kind == "telecommand" else model.telemetry)
+        ]
+        waiting = [(file, model) for file, model in models if model.include]
+        done: list[Row] = []
+        for file, model in chain(((file, model) for file, model in models if not model.include), waiting):
+            self._attempt(self._add_rows, kind, file, model, rows, done)
+        return done
+
+    def _add_rows(
+        self, kind: RowKind, file: Path, model: schema.RowModel, rows: dict[str, Row], done: list[Row]
+    ) -> None:
+        for row in self._expand_row(kind, file, model, rows):
+            self._check_unique(file, row, rows)
+            check_row(row, self._model, self._plugin, f"{file}: {kind} {row.name}")
+            rows[row.name] = row
+            done.append(row)
+
+    def _class_of(self, kind: RowKind, model: schema.RowModel, where: str) -> str:
+        if model.class_ is not None:
+            found = self._classes.get(model.class_)
+            if found is None:
+                raise IcdError(
+                    f"{where}: no class named {model.class_!r}{did_you_mean(model.class_, self._classes)}"
+                )
+            if found.kind.value != kind:
+                raise IcdError(f"{where}: class {model.class_} is one of {found.kind.value}s")
+            return model.class_
+        names = [item.name for item in self._classes.values() if item.kind.value == kind]
+        if len(names) > 1 or (self._classes and not names):
+            raise IcdError(f"{where}: needs `class`, one of {', '.join(names or self._classes)}")
+        return names[0] if names else ""
+
+    def _check_unique(self, file: Path, row: Row, rows: Mapping[str, Row]) -> None:
+        where = f"{file}: {row.kind} {row.name}"
+        first = self._unit.first_telemetry_id
+        if first is not None and (row.id >= first) != (row.kind == "telemetry"):
+            side = f"{first} and up" if row.kind == "telemetry" else f"below {first}"
+            raise IcdError(f"{where}: id {row.id} is not a {row.kind} id ({side})")
+        highest = self._highest_id
+        if row.id > highest:
+            raise IcdError(f"{where}: id {row.id} is above {highest}")
+        if row.name in rows:
+            raise IcdError(f"{where}: name used twice")
+        code = self._code(row)
+        same = next(
+            (other.name for other in rows.values() if (self._code(other), other.id) == (code, row.id)), None
+        )
+        if same is not None:
+            raise IcdError(f"{where}: id {row.id} is already used by {same}")
+
+    @property
+    def _highest_id(self) -> int:
+        """Highest id that the link can carry."""
+        link = self._tables.get("link", (self._path, None))[1]
+        if not isinstance(link, LinkModel) or link.serial is None:
+            return HIGHEST_ID
+        header = link.serial.request_header
+        widths = [bit.width for item in header for bit in item.bits if bit.role == "id"]
+        widths += [int(item.type[1:]) for item in header if item.role == "id"]
+        return (1 << widths[0]) - 1 if widths else HIGHEST_ID
+
+    def _code(self, row: Row) -> int | None:
+        return self._classes[row.klass].code if row.klass else None
+
+    def _expand_row(
+        self, kind: RowKind, file: Path, model: schema.RowModel, rows: Mapping[str, Row]
+    ) -> Iterator[Row]:
+        where = f"{file}: {kind} {model.name}"
+        if (model.fields is None) == (model.include is None):
+            raise IcdError(f"{where}: needs either `fields` or `include`")
+        last = model.id if model.last_id is None else model.last_id
+        if last < model.id:
+            raise IcdError(f"{where}: last_id {last} is below id {model.id}")
+        if kind == "telemetry" and (model.action is not None or model.arguments):
+            raise IcdError(f"{where}: only telecommands have an action")
+        klass = self._class_of(kind, model, where)
+        for number, row_id in enumerate(range(model.id, last + 1), 1):
+            single = model.last_id is None
+            layout = Layout(self, where, kind, model.provenance, None if single else number)
+            for name in model.include or ():
+                if name not in rows:
+                    raise IcdError(f"{where}: include: no row named {name!r}{did_you_mean(name, rows)}")
+                layout.include(rows[name])
+            for item in model.fields or ():
+                layout.add(item)
+            if model.size is not None and layout.size != model.size:
+                raise IcdError(f"{where}: size is {model.size} but the fields make {layout.size} bytes")
+            yield Row(
+                kind=kind,
+                id=row_id,
+                name=model.name if single else f"{model.name}_{number}",
+                size=layout.size,
+                fields=tuple(layout.fields),
+                slots=tuple(layout.slots),
+                doc=model.doc,
+                provenance=model.provenance,
+                source=model.source,
+                klass=klass,
+                action=model.action,
+                arguments={
+                    name: number if value == "[n]" else value for name, value in model.arguments.items()
+                },
+                answers=tuple(
+                    self._class_answers.get(klass, ["reply"]) if model.answer is None else model.answer
+                ),
+            )
+
+    def _check_answers(self, row: Row, rows: Mapping[str, Row]) -> None:
+        for answer in row.answers:
+            kind, _, name = answer.partition(":")
+            where = f"{self._path}: {row.kind} {row.name}: answer {answer!r}"
+            if kind not in ("echo", "reply", "row") or (kind == "row") != bool(name):
+                raise IcdError(f"{where}: must be echo, reply or row:NAME")
+            if kind == "row" and (name not in rows or rows[name].kind != "telemetry"):
+                raise IcdError(f"{where}: no telemetry of this name{did_you_mean(name, rows)}")

@@ -1,0 +1,113 @@
+"""The way out of the data: functions of a unit's own, in a Python file beside its definition.
+
+In `unit.py`, beside the TOML files of a unit whose `[unit]` says `plugin = "unit.py"`::
+
+    from starhil.protocol.plugin import action, check, framing, quantity
+
+    @quantity("battery.voltage", unit="V")
+    def battery_voltage(snapshot):
+        return 3.7
+
+    @action("blink")
+    def blink(device, arguments):
+        device.reset("command")
+
+An action's function returns nothing, messages that follow the answer, or `bytes`, the data of the answer; a list of them is
+as many answers. A quantity's function gets the `starhil.emulator.device.snapshot.Snapshot` of the device, an action's the
+device and its arguments by name. Framings and checks are those of `starhil.protocol.serial_stack`.
+"""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from starhil.protocol.values import IcdError
+
+Function = TypeVar("Function")
+
+
+@dataclass(frozen=True)
+class PluginQuantity:
+    """A quantity that a plugin computes."""
+
+    function: Callable[[Any], Any]
+    unit: str
+    doc: str
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """What the plugin of a unit defines, by name."""
+
+    quantities: dict[str, PluginQuantity] = field(default_factory=dict)
+    actions: dict[str, Callable[[Any, Mapping[str, Any]], Any]] = field(default_factory=dict)
+    framings: dict[str, Any] = field(default_factory=dict)
+    checks: dict[str, Any] = field(default_factory=dict)
+
+
+_loading: ContextVar[Plugin | None] = ContextVar("plugin that is being loaded", default=None)
+
+
+def _table(name: str) -> dict[str, Any]:
+    plugin = _loading.get()
+    if plugin is None:
+        raise IcdError("a plugin's functions are registered only while its unit is being loaded")
+    table: dict[str, Any] = getattr(plugin, name)
+    return table
+
+
+def quantity(name: str, *, unit: str = "", doc: str = "") -> Callable[[Function], Function]:
+    """Make a function of the device's snapshot a quantity that rows can bind with `value`."""
+
+    def register(function: Function) -> Function:
+        _table("quantities")[name] = PluginQuantity(function, unit, doc)  # type: ignore[arg-type]
+        return function
+
+    return register
+
+
+def _registering(table: str, name: str) -> Callable[[Function], Function]:
+    def register(function: Function) -> Function:
+        _table(table)[name] = function
+        return function
+
+    return register
+
+
+def action(name: str) -> Callable[[Function], Function]:
+    """Make a function of device and arguments an action of telecommands."""
+    return _registering("actions", name)
+
+
+def framing(name: str) -> Callable[[Function], Function]:
+    """Make a class a framing of serial links."""
+    return _registering("framings", name)
+
+
+def check(name: str) -> Callable[[Function], Function]:
+    """Make a function of bytes a check of serial links."""
+    return _registering("checks", name)
+
+
+def load_plugin(file: Path) -> Plugin:
+    """Run the plugin of a unit and return what it defines.
+
+    Raises IcdError with the plugin's own error in one line.
+    """
+    plugin = Plugin()
+    token = _loading.set(plugin)
+    try:
+        runpy.run_path(str(file))
+    except FileNotFoundError:
+        raise IcdError(f"{file}: no such plugin; unit.plugin names a file beside the definition") from None
+    except Exception as error:
+        text = " ".join(str(error).split())
+        raise IcdError(f"{file}: the plugin fails: {type(error).__name__}: {text}") from error
+    finally:
+        _loading.reset(token)
+    return plugin

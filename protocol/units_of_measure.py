@@ -1,0 +1,38 @@
+"""Units of measure of quantities and fields, and the factors between those of one kind."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+PER_SI_UNIT: Final[dict[str, dict[str, float]]] = {
+    "time": {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9},
+    "angle": {
+        "rad": 1.0,
+        "deg": 180.0 / math.pi,
+        "arcmin": 10_800.0 / math.pi,
+        "arcsec": 648_000.0 / math.pi,
+    },
+    "rate": {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "arcsec/s": 648_000.0 / math.pi},
+    "frequency": {"Hz": 1.0, "mHz": 1e3},
+    "fraction": {"1": 1.0, "%": 100.0},
+    "voltage": {"V": 1.0, "mV": 1e3},
+    "current": {"A": 1.0, "mA": 1e3},
+    "power": {"W": 1.0, "mW": 1e3},
+}
+"""Counts of each unit in one unit of the SI, by kind."""
+
+
+def convertible(unit: str) -> list[str]:
+    """Return the units that a value in this unit can be converted to, itself included."""
+    return next((list(units) for units in PER_SI_UNIT.values() if unit in units), [unit])
+
+
+def factor(unit: str, wanted: str) -> float | None:
+    """Return what a value is multiplied with to change its unit, or None if there is no such factor."""
+    if unit == wanted:
+        return 1.0
+    for units in PER_SI_UNIT.values():
+        if unit in units and wanted in units:
+            return units[wanted] / units[unit]
+    return None

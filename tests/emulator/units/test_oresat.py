@@ -1,0 +1,118 @@
+"""A client for OreSat's star tracker card, written from its object dictionary: SDO and PDO frames byte by byte."""
+
+from __future__ import annotations
+
+import struct
+
+from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
+
+NODE = 0x2C
+STANDBY, STAR_TRACK = 2, 4
+
+
+def upload(unit: Emulated, index: int, subindex: int = 0) -> bytes:
+    """Read an entry by an expedited upload."""
+    request = struct.pack("<BHB4x", 0x40, index, subindex)
+    (reply,) = [f for f in unit.ask_can(0x600 + NODE, request, extended=False) if f.id == 0x580 + NODE]
+    command, found_index, found_subindex = struct.unpack_from("<BHB", reply.data)
+    assert (found_index, found_subindex) == (index, subindex)
+    assert command & 0xE3 == 0x43, reply.data.hex()
+    return reply.data[4 : 8 - (command >> 2 & 3)]
+
+
+def download(unit: Emulated, index: int, value: int) -> int:
+    """Write a byte; return the abort code, 0 for none."""
+    request = struct.pack("<BHB", 0x2F, index, 0) + bytes([value, 0, 0, 0])
+    (reply,) = [f for f in unit.ask_can(0x600 + NODE, request, extended=False) if f.id == 0x580 + NODE]
+    return 0 if reply.data[0] == 0x60 else struct.unpack_from("<I", reply.data, 4)[0]
+
+
+def operational(unit: Emulated) -> None:
+    unit.ask_can(0, bytes([1, NODE]), extended=False)
+
+
+def rotation_matrix(i: float, j: float, k: float, real: float):
+    """Return the rotation of vectors by a quaternion, from its definition v' = q v q*."""
+    import numpy as np
+
+    def product(a, b):
+        return np.append(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3]), a[3] * b[3] - a[:3] @ b[:3])
+
+    q = np.array([i, j, k, real])
+    conjugate = q * [-1, -1, -1, 1]
+    columns = [product(product(q, np.append(axis, 0.0)), conjugate)[:3] for axis in np.eye(3)]
+    return np.array(columns).T
+
+
+def test_status_is_commanded_and_read():
+    def scenario(unit: Emulated) -> None:
+        assert upload(unit, 0x4000) == bytes([STANDBY])
+        assert download(unit, 0x4000, STAR_TRACK) == 0
+        assert upload(unit, 0x4000) == bytes([STAR_TRACK])
+        assert download(unit, 0x4000, 77) != 0
+        assert upload(unit, 0x4000) == bytes([STAR_TRACK])
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_orientation_is_the_truth_and_known():
+    def scenario(unit: Emulated) -> None:
+        download(unit, 0x4000, STAR_TRACK)
+        unit.step(3.0)
+        i, j, k, real = (struct.unpack("<f", upload(unit, 0x4002, n))[0] for n in (1, 2, 3, 5))
+        assert arcseconds_between(rotation_matrix(i, j, k, real), true_matrix()) < 0.1
+        assert upload(unit, 0x4002, 6) == b"\x01"
+        midnight_ms = struct.unpack("<I", upload(unit, 0x4002, 4))[0]
+        assert midnight_ms == unit.bench.device.fresh.mid_unix_ns // 1_000_000 % 86_400_000
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_attitude_is_unknown_when_the_lens_is_covered():
+    def scenario(unit: Emulated) -> None:
+        download(unit, 0x4000, STAR_TRACK)
+        unit.step(3.0)
+        unit.cover()
+        unit.step(3.0)
+        assert upload(unit, 0x4002, 6) == b"\x00"
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_pdos_of_each_frame_have_the_published_can_ids_and_the_attitude():
+    def scenario(unit: Emulated) -> None:
+        operational(unit)
+        download(unit, 0x4000, STAR_TRACK)
+        unit.step(3.0)
+        frames = {frame.id: frame.data for frame in unit.step(1.0)}
+        assert {0x3AC, 0x4AC, 0x1AD} <= set(frames)
+        status, known, midnight_ms = struct.unpack("<BBI", frames[0x3AC])
+        assert (status, known) == (STAR_TRACK, 1)
+        assert midnight_ms == unit.bench.device.fresh.mid_unix_ns // 1_000_000 % 86_400_000
+        real, i = struct.unpack("<2f", frames[0x4AC])
+        j, k = struct.unpack("<2f", frames[0x1AD])
+        assert arcseconds_between(rotation_matrix(i, j, k, real), true_matrix()) < 0.1
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_housekeeping_pdos_come_by_their_timers():
+    def scenario(unit: Emulated) -> None:
+        operational(unit)
+        frames = unit.step(60.5)
+        assert len([frame for frame in frames if frame.id == 0x1AC and len(frame.data) == 6]) == 2
+        assert len([frame for frame in frames if frame.id == 0x2AC and len(frame.data) == 2]) == 12
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_card_is_restarted_by_an_entry():
+    def scenario(unit: Emulated) -> None:
+        before = unit.bench.device.boot_count
+        request = struct.pack("<BHB", 0x2F, 0x3003, 1) + bytes([1, 0, 0, 0])
+        unit.ask_can(0x600 + NODE, request, extended=False)
+        unit.step(3.0)
+        assert unit.bench.device.boot_count == before + 1
+        assert struct.unpack("<H", upload(unit, 0x3003, 6))[0] == before + 1
+
+    with_unit("oresat", "canopen", scenario)
