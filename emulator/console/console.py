@@ -76,7 +76,6 @@ class Console:
         self._rows_wanted = asyncio.Event()
         self._status_due = asyncio.Event()
         self._stars: asyncio.Task[dict[str, Any]] | None = None
-        self._line_number = 0
         self._actions: dict[str, Callable[[Viewer, dict[str, Any]], Awaitable[dict[str, Any]]]] = {
             "subscribe": self._subscribe,
             "control": self._control,
@@ -194,10 +193,6 @@ class Console:
             self.trace.discard()
             return
         lines, left_out = self.trace.take()
-        self._line_number += left_out
-        for line in lines:
-            line["n"] = self._line_number
-            self._line_number += 1
         if lines:
             self._broadcast(
                 {"type": "wire", "lines": lines, "left_out": left_out}, lambda viewer: viewer.wire
@@ -252,7 +247,9 @@ class Console:
 
     async def _subscribe(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         viewer.frames = bool(request.get("frames"))
-        viewer.wire = bool(request.get("wire"))
+        begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
+        if begins and viewer.wire:
+            viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
         rows = request.get("rows") or ()
         known = self._emulation.device.icd.telemetry
         viewer.rows = frozenset(name for name in rows if name in known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -67,12 +68,15 @@ class WireItem:
         True if the device sent it.
     item
         Bytes, or a CAN frame.
+    number
+        Number of the item in the trace.
     """
 
     at_s: float
     bus: str
     outgoing: bool
     item: bytes | CanFrame
+    number: int = 0
 
 
 class WireTrace:
@@ -92,7 +96,10 @@ class WireTrace:
         self, icd: InterfaceDefinition, links: Sequence[Link], dialect: Callable[[], Dialect | None]
     ) -> None:
         self._links = links
+        self._icd = icd
+        self._dialect = dialect
         self._decoder = Decoder(icd, dialect)
+        self._count = 0
         self._kept: deque[WireItem] = deque(maxlen=KEPT_ITEMS)
         self._new: deque[WireItem] = deque(maxlen=KEPT_ITEMS)
         self.listening = False
@@ -112,7 +119,8 @@ class WireTrace:
             link.wire.listener = partial(self._add, link.bus, True) if wanted else None  # noqa: FBT003
 
     def _add(self, bus: str, outgoing: bool, item: bytes | CanFrame) -> None:
-        entry = WireItem(time.time(), bus, outgoing, item)
+        entry = WireItem(time.time(), bus, outgoing, item, self._count)
+        self._count += 1
         self._kept.append(entry)
         self._new.append(entry)
 
@@ -124,6 +132,12 @@ class WireTrace:
         lines = [self._decoder.line(item) for item in self._new]
         self._new.clear()
         return lines, left_out
+
+    def recent(self) -> list[dict[str, Any]]:
+        """Return the newest lines, for somebody who begins to look."""
+        decoder = Decoder(self._icd, self._dialect)
+        first = max(0, len(self._kept) - DECODED_PER_TURN)
+        return [decoder.line(item) for item in itertools.islice(self._kept, first, None)]
 
     def discard(self) -> None:
         """Forget what is new: nobody looks at the trace."""
@@ -168,6 +182,7 @@ class Decoder:
             kind, text = self._serial_text(entry.item, entry.at_s, outgoing=entry.outgoing)
             raw = entry.item.hex(" ").upper()
         return {
+            "n": entry.number,
             "t": entry.at_s,
             "bus": entry.bus,
             "out": entry.outgoing,

@@ -2,7 +2,7 @@
 
 import uPlot from "/static/vendor/uPlot.esm.js";
 import { fixed, make } from "./format.js";
-import { colour, onTheme } from "./theme.js";
+import { colour, onTheme, pen } from "./theme.js";
 
 const WINDOWS = [[60, "1 min"], [300, "5 min"], [900, "15 min"], [3600, "1 h"]];
 const MOST_POINTS = 900;
@@ -122,7 +122,7 @@ export class Charts {
     const axis = { stroke: colour("dim"), font: `${0.72 * rem}px system-ui`, grid: { stroke: colour("grid"), width: 1 }, ticks: { show: false } };
     const series = [{}];
     for (const item of plan.series) {
-      series.push({ stroke: item.hidden ? "transparent" : colour(item.ink), width: item.dash ? 1 : 1.5, dash: item.dash ? [4, 4] : undefined, points: { show: false }, spanGaps: false });
+      series.push({ stroke: item.hidden ? "transparent" : colour(item.ink), width: (item.dash ? 1 : 1.5) * pen(), dash: item.dash ? [4 * pen(), 4 * pen()] : undefined, points: { show: false }, spanGaps: false });
     }
     const bands = [];
     if (plan.band) {

@@ -100,9 +100,9 @@ store.on("shown", () => {
   setText($("mode"), mode.replaceAll("_", " "));
   $("mode").dataset.mode = mode;
   showValidity(item("valid") === 1, store.reasons[item("reason")] || "invalid");
-  setText($("ra"), `${fixed(item("ra"), 4, 9)}°`);
+  setText($("ra"), `${fixed(turn(item("ra")), 4, 9)}°`);
   setText($("dec"), `${fixed(item("dec"), 4, 9)}°`);
-  setText($("roll"), `${fixed(item("roll"), 4, 9)}°`);
+  setText($("roll"), `${fixed(turn(item("roll")), 4, 9)}°`);
   for (const name of ["qx", "qy", "qz", "qw"]) $("ra").dataset[name] = String(item(name));
   setText($("error"), `${fixed(item("error_cross"), 2, 6)} / ${fixed(item("error_roll"), 1, 6)}`);
   setText($("stars"), `${fixed(item("matched"), 0, 3)} of ${fixed(item("detected"), 0, 3)}`);
@@ -112,6 +112,11 @@ store.on("shown", () => {
   }
   showMoment(item);
 });
+
+// An angle of a full turn, which is shown with four digits, is none.
+function turn(degrees) {
+  return degrees >= 359.99995 ? 0 : degrees;
+}
 
 function showMoment(item) {
   const image = store.image;
@@ -182,6 +187,11 @@ document.addEventListener("keydown", (event) => {
   if (!found) return;
   event.preventDefault();
   found[3](event);
+});
+
+// A click leaves the keys to the page: space is to pause, not to press the button again.
+document.addEventListener("click", (event) => {
+  if (event.detail > 0 && event.target.closest("button, a")) document.activeElement.blur();
 });
 
 window.starhil = { store, sky, link };

@@ -1,6 +1,6 @@
 // The whole sky in Hammer's equal-area projection: bright stars, the trail of the boresight, Sun, Moon and Earth.
 
-import { colour, onTheme } from "./theme.js";
+import { colour, onTheme, pen } from "./theme.js";
 
 const RAD = Math.PI / 180;
 const TRAIL_POINTS = 600;
@@ -94,7 +94,8 @@ export class SkyMap {
     const trail = [];
     const step = Math.max(1, Math.floor((position - rows.start) / TRAIL_POINTS));
     for (let i = position; i >= rows.start && trail.length < TRAIL_POINTS; i -= step) trail.push([rows.at(i, "true_ra"), rows.at(i, "true_dec")]);
-    context.lineWidth = 1.5;
+    context.lineWidth = 2 * pen();
+    context.font = `${Math.max(10, this.radius / 11)}px system-ui, sans-serif`;
     context.strokeStyle = colour("b");
     this.line(context, trail);
     const head = store.image && store.image.head;
@@ -103,7 +104,7 @@ export class SkyMap {
     const here = this.place(rows.at(position, "true_ra"), rows.at(position, "true_dec"));
     context.fillStyle = colour("b");
     context.beginPath();
-    context.arc(...here, 3, 0, 2 * Math.PI);
+    context.arc(...here, 3 * pen(), 0, 2 * Math.PI);
     context.fill();
   }
 
@@ -113,10 +114,10 @@ export class SkyMap {
     context.fillStyle = context.strokeStyle = ink;
     if (body.radius_deg > 3) this.line(context, circle(body.ra_deg, body.dec_deg, body.radius_deg));
     context.beginPath();
-    context.arc(x, y, body.name === "sun" ? 5 : 3.5, 0, 2 * Math.PI);
+    context.arc(x, y, (body.name === "sun" ? 5 : 3.5) * pen(), 0, 2 * Math.PI);
     context.fill();
     context.textAlign = "left";
-    context.fillText(body.name, x + 7, y + 4);
+    context.fillText(body.name, x + 7 * pen(), y + 4 * pen());
   }
 
   // The outline of the field of view.
@@ -134,7 +135,7 @@ export class SkyMap {
     }
     points.push(points[0]);
     context.strokeStyle = colour("text");
-    context.lineWidth = 1;
+    context.lineWidth = 1.2 * pen();
     this.line(context, points);
   }
 }

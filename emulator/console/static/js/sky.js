@@ -1,7 +1,7 @@
 // The image of the sensor with what was found in it, and what should have been.
 
 import { fixed, setText } from "./format.js";
-import { colour, onTheme } from "./theme.js";
+import { colour, onTheme, pen } from "./theme.js";
 
 const HOVER_PX = 14;
 const MOST_ZOOM = 16;
@@ -160,7 +160,7 @@ export class Sky {
   }
 
   drawBodies(context, head) {
-    context.lineWidth = 1.5;
+    context.lineWidth = 1.5 * pen();
     for (const polygon of head.covered || []) {
       if (!polygon.length) continue;
       context.beginPath();
@@ -196,10 +196,11 @@ export class Sky {
     for (const [x, y] of head.false_stars || []) {
       const [px, py] = this.place(x, y);
       context.beginPath();
-      context.moveTo(px - 5, py - 5);
-      context.lineTo(px + 5, py + 5);
-      context.moveTo(px + 5, py - 5);
-      context.lineTo(px - 5, py + 5);
+      const arm = 5 * pen();
+      context.moveTo(px - arm, py - arm);
+      context.lineTo(px + arm, py + arm);
+      context.moveTo(px + arm, py - arm);
+      context.lineTo(px - arm, py + arm);
       context.stroke();
     }
   }
@@ -226,7 +227,7 @@ export class Sky {
     const size = Math.max(5, this.stage.clientWidth / 110);
     const found = new Set(head.hips);
     context.font = this.font();
-    context.lineWidth = 1.4;
+    context.lineWidth = 1.4 * pen();
     const labels = [];
     const unmatched = colour("on-sky-detected");
     const matched = colour("on-sky-identified");
@@ -279,12 +280,12 @@ export class Sky {
   }
 
   label(context, text, x, y, ink) {
-    context.lineWidth = 3;
+    context.lineWidth = 3 * pen();
     context.strokeStyle = "rgba(5, 8, 12, 0.8)";
     context.strokeText(text, x, y);
     context.fillStyle = ink;
     context.fillText(text, x, y);
-    context.lineWidth = 1.4;
+    context.lineWidth = 1.4 * pen();
   }
 
   // Where the boresight moves to: with the body rate ω it moves by ω × z = (ω_y, −ω_x).
@@ -295,12 +296,13 @@ export class Sky {
     const centre = this.place(head.width / 2, head.height / 2);
     const ink = colour("on-sky-rate");
     context.strokeStyle = context.fillStyle = ink;
-    context.lineWidth = 2;
+    const size = pen();
+    context.lineWidth = 2 * size;
     context.beginPath();
-    context.moveTo(centre[0] - 7, centre[1]);
-    context.lineTo(centre[0] + 7, centre[1]);
-    context.moveTo(centre[0], centre[1] - 7);
-    context.lineTo(centre[0], centre[1] + 7);
+    context.moveTo(centre[0] - 7 * size, centre[1]);
+    context.lineTo(centre[0] + 7 * size, centre[1]);
+    context.moveTo(centre[0], centre[1] - 7 * size);
+    context.lineTo(centre[0], centre[1] + 7 * size);
     context.stroke();
     if (speed > 1e-3) {
       const length = this.stage.clientWidth * 0.06 * (1 + Math.log10(1 + speed * 20));
@@ -309,13 +311,13 @@ export class Sky {
       context.beginPath();
       context.moveTo(...centre);
       context.lineTo(...tip);
-      context.lineTo(tip[0] - 8 * ux - 5 * uy, tip[1] - 8 * uy + 5 * ux);
+      context.lineTo(tip[0] - size * (8 * ux + 5 * uy), tip[1] - size * (8 * uy - 5 * ux));
       context.moveTo(...tip);
-      context.lineTo(tip[0] - 8 * ux + 5 * uy, tip[1] - 8 * uy - 5 * ux);
+      context.lineTo(tip[0] - size * (8 * ux - 5 * uy), tip[1] - size * (8 * uy + 5 * ux));
       context.stroke();
     }
     if (speed > 1e-3 || Math.abs(z) > 1e-3) {
-      this.label(context, `${fixed(Math.hypot(speed, z), 3)} °/s`, centre[0] + 12, centre[1] + 18, ink);
+      this.label(context, `${fixed(Math.hypot(speed, z), 3)} °/s`, centre[0] + 12 * size, centre[1] + 20 * size, ink);
     }
   }
 

@@ -23,3 +23,8 @@ export function onTheme(listener) {
 export function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
+
+// Line widths and marks follow the size of the type, so that they can be seen on a large screen too.
+export function pen() {
+  return Math.max(1, parseFloat(getComputedStyle(document.documentElement).fontSize) / 12.5);
+}

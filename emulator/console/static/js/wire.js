@@ -18,6 +18,7 @@ export class Wire {
     this.text = "";
     this.held = false;
     this.build();
+    store.on("hello", () => (this.lines = []));
     store.on("wire", (message) => this.add(message));
   }
 
@@ -49,7 +50,8 @@ export class Wire {
   }
 
   add(message) {
-    this.lines.push(...message.lines);
+    const last = this.lines.length ? this.lines[this.lines.length - 1].n : -1;
+    this.lines.push(...message.lines.filter((line) => line.n > last));
     if (this.lines.length > KEPT_LINES) this.lines.splice(0, this.lines.length - KEPT_LINES);
     if (message.left_out) this.left.textContent = `${message.left_out} left out`;
     else this.left.textContent = "";
