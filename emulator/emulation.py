@@ -65,6 +65,8 @@ class Emulation:
         The first head, if this is a further one: it shares that head's clock and truth.
     tape
         Records the run, or plays a recording.
+    previews
+        Somebody may look at the frames.
 
     Attributes
     ----------
@@ -84,8 +86,10 @@ class Emulation:
         worker: WorkerProcess | None = None,
         leader: Emulation | None = None,
         tape: Tape | None = None,
+        previews: bool = False,
     ) -> None:
         self.profile = profile
+        self._previews = previews
         self.icd = load_unit(profile.unit_source)
         missing = unbound(self.icd)
         if missing:
@@ -141,7 +145,9 @@ class Emulation:
         return self.requests.device
 
     def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
-        setup = pipeline_setup(self.profile, repeatable=self.tape is not None)
+        setup = replace(
+            pipeline_setup(self.profile, repeatable=self.tape is not None), previews=self._previews
+        )
         if self.profile.run.worker == "process":
             return ProcessImager(setup, worker or WorkerProcess())
         if worker is not None:

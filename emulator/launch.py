@@ -1,19 +1,24 @@
-"""The composition root: makes one or several heads with truth logs, faults, scenario and control channel."""
+"""The composition root: makes one or several heads with truth logs, faults, scenario, control channel and console."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from starhil.emulator.clock import make_clock
+from starhil.emulator.console.obc import MakeClient, ObcClient, ObcPort
 from starhil.emulator.control.channel import ControlServer, ControlTarget
 from starhil.emulator.control.faults import Faults
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
+from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.replay import prepare_recording
@@ -41,7 +46,13 @@ class RunOptions:
     scenario
         Name or path of a scenario; empty for none.
     record
-        Folder of a recording of the run.
+        Folder of a recording of the run, for a replay.
+    view
+        Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT.
+    mcap
+        MCAP file of images, truth, telemetry and events.
+    make_client
+        Makes the OBC of console and MCAP file; needed for these two.
     """
 
     truth_log: Path | None = None
@@ -50,6 +61,14 @@ class RunOptions:
     control_token: str = ""
     scenario: str = ""
     record: Path | None = None
+    view: str = "off"
+    mcap: Path | None = None
+    make_client: MakeClient | None = None
+
+    @property
+    def watched(self) -> bool:
+        """Whether a console or an MCAP file shows the images."""
+        return self.view != "off" or self.mcap is not None
 
 
 class Head:
@@ -154,12 +173,14 @@ class Run:
                 raise EmulatorError("--record: records one head; run the others apart, or leave it out")
             prepare_recording(self.options.record, profile, self.options.scenario)
             self._recorder = Recorder(self.options.record, make_clock(profile.run.clock))
-        self.emulation = Emulation(profile, worker, tape=self._recorder)
+        self.emulation = Emulation(profile, worker, tape=self._recorder, previews=self.options.watched)
         self.heads = [Head(1, self.emulation)]
         for number, other in enumerate(others, start=2):
             self.heads.append(Head(number, Emulation(other, leader=self.emulation)))
         self.ended = asyncio.Event()
         self.control: ControlServer | None = None
+        self._closers: list[Callable[[], object]] = []
+        """Closers of console and MCAP file, in the order of opening."""
 
     @property
     def faults(self) -> Faults:
@@ -191,6 +212,8 @@ class Run:
                 self.control = ControlServer(targets, self.ended.set, options.control_token)
                 where = await self.control.start(options.control)
                 self.emulation.ready_fields["control"] = where
+            if options.watched:
+                await self._open_console()
         except (EmulatorError, ProtocolError):
             for head in opened:
                 head.emulation.device.withdraw_start()
@@ -219,14 +242,78 @@ class Run:
         return line
 
     async def close(self) -> None:
-        """Close the control channel, the emulations and the truth logs, whatever fails to close."""
-        closers: list[Callable[[], object]] = [head.emulation.close for head in reversed(self.heads)]
+        """Close control channel, console, emulations and logs, whatever fails to close."""
+        closers: list[Callable[[], object]] = [*reversed(self._closers)]
+        self._closers.clear()
+        closers += [head.emulation.close for head in reversed(self.heads)]
         if self.control is not None:
             closers.insert(0, self.control.close)
         closers += [head.close_log for head in self.heads]
         if self._recorder is not None:
             closers.append(self._recorder.close)
         await close_all(closers)
+
+    async def _open_console(self) -> None:
+        """Open console and MCAP file, with an OBC on the bus of the first head."""
+        options, emulation = self.options, self.emulation
+        client = await self._open_obc()
+        if options.mcap is not None:
+            from starhil.emulator.console.recorder import McapRecorder
+
+            recorder = McapRecorder(emulation, client, options.mcap, overwrite=options.overwrite)
+            self._closers.append(recorder.close)
+            recorder.start()
+        if options.view != "off":
+            from starhil.emulator.console.console import Console
+            from starhil.emulator.console.server import ConsoleServer
+
+            targets = [ControlTarget(head.emulation, head.faults) for head in self.heads]
+            control = ControlServer(targets, self.ended.set)
+            console = Console(emulation, control.execute, client)
+            self._closers.append(console.close)
+            console.start()
+            server = ConsoleServer(console)
+            self._closers.append(server.close)
+            emulation.ready_fields["view"] = await server.start(options.view)
+
+    async def _open_obc(self) -> ObcClient:
+        """Open an OBC on the CAN bus of the run, or on a link of its own if the unit has no bus there.
+
+        Raises
+        ------
+        EmulatorError
+            The caller has given no `make_client`.
+        """
+        make_client, emulation = self.options.make_client, self.emulation
+        if make_client is None:
+            raise EmulatorError("run: console and recording need make_client")
+        device, has = emulation.device, emulation.icd.link
+        bus: Literal["can", "serial", ""] = "can" if has.can is not None else ""
+        where = emulation.ready_fields["can"] if emulation.can is not None else ""
+        own: SerialLink | CanLink | None = None
+        from starhil.protocol.transports.can import open_can
+        from starhil.protocol.transports.serial import open_serial
+
+        if bus and not where:
+            where = f"virtual:starhil-console-{os.getpid()}"
+            own = CanLink(emulation.requests, open_can(where))
+        elif not bus and has.serial is not None:
+            bus = "serial"
+            own = SerialLink(emulation.requests, open_serial("auto", paced=False))
+        if own is not None:
+            self._closers.append(own.close)
+            where = await own.start()
+        port = ObcPort(
+            bus,
+            where,
+            emulation.icd,
+            device_address=lambda: int(device.parameters["can_address"]),
+            dialect=lambda: own.dialect if isinstance(own, SerialLink) else None,
+        )
+        client = make_client(port)
+        self._closers.append(client.close)
+        await client.start()
+        return client
 
 
 def path_of_head(path: Path, number: int) -> Path:

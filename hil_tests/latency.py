@@ -34,6 +34,8 @@ PAUSE_S: Final = 0.004
 """Mean pause between two requests, seconds."""
 
 REPLY_WITHIN_S: Final = 1.0
+SETTLE_S: Final = 3.0
+"""Time for viewers to start and connect, seconds."""
 BAUD: Final = 921_600
 """High, so that the transmission time (1 ms for the longest reply) is short against the latency."""
 
@@ -50,6 +52,7 @@ class LatencyRow:
     link: str
     worker: str
     update_rate_hz: float
+    viewers: int
     requests: int
     p50_ms: float
     p99_ms: float
@@ -176,12 +179,31 @@ class EchoRequester:
         self._process.wait()
 
 
+PAIRS: Final = 4
+"""Turns in which the time of a rate is spent without and with viewers."""
+
+
+class Viewers:
+    """Processes that view the console of an emulator."""
+
+    def __init__(self, address: str, count: int) -> None:
+        command = [sys.executable, "-m", "starhil.hil_tests.console_viewer", address]
+        self._processes = [subprocess.Popen(command) for _ in range(count)]  # noqa: S603
+
+    def close(self) -> None:
+        """End them."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+
 def measure(
     icd: InterfaceDefinition,
     rates_hz: list[float],
     seconds: float,
     worker: str,
     report: Callable[[str], None] = lambda _text: None,
+    viewers: int = 0,
 ) -> tuple[list[LatencyRow], ProcessRow]:
     """Measure the latency of the links at rest and at each update rate.
 
@@ -197,6 +219,8 @@ def measure(
         `process` or `thread`.
     report
         Called with the progress.
+    viewers
+        Number of viewers of the console; each rate is then measured without and with them, in turns.
     """
     from starhil.hil_tests.client import ObcClient
 
@@ -211,6 +235,7 @@ def measure(
                     profile="demo",
                     can=hub_process.ready["can"],
                     settings=[f"run.worker={worker}", f"links.serial.baud={BAUD}"],
+                    extra=["--view", "auto"] if viewers else (),
                 )
             )
         )
@@ -233,20 +258,47 @@ def measure(
                     client.command("set_update_rate", rate=rate)
                 client.command("set_mode", mode="lost_in_space" if rate > 0.0 else "standby")
             serial.open()
-            rows += _measure_links(probes, worker, rate, seconds, rng)
+            rows += _measure_rate(probes, worker, rate, seconds, rng, ready.get("view", ""), viewers)
         memory_mb = emulator.memory_bytes() / 2**20
     return rows, ProcessRow(worker, ready_s, memory_mb)
 
 
-def _measure_links(
+def _measure_rate(
     probes: Mapping[str, Callable[[str], float | None]],
     worker: str,
     rate: float,
     seconds: float,
     rng: random.Random,
+    address: str,
+    viewers: int,
 ) -> list[LatencyRow]:
-    taken: dict[str, list[float]] = {link: [] for link in probes}
-    lost = dict.fromkeys(probes, 0)
+    """Measure the links at one update rate, without viewers and with them in turns."""
+    counts = (0, viewers) if viewers else (0,)
+    taken: dict[int, dict[str, list[float]]] = {count: {link: [] for link in probes} for count in counts}
+    lost = {count: dict.fromkeys(probes, 0) for count in counts}
+    turns = PAIRS if viewers else 1
+    for _ in range(turns):
+        for count in counts:
+            watching = Viewers(address, count)
+            if count:
+                time.sleep(SETTLE_S)
+            _measure_links(probes, seconds / turns, rng, taken[count], lost[count])
+            watching.close()
+    return [
+        _row(link, worker, rate, count, sorted(values), lost[count][link])
+        for count in counts
+        for link, values in taken[count].items()
+    ]
+
+
+def _measure_links(
+    probes: Mapping[str, Callable[[str], float | None]],
+    seconds: float,
+    rng: random.Random,
+    taken: Mapping[str, list[float]],
+    lost: dict[str, int],
+) -> None:
+    """Ask each link in turn for some time, and add latencies, ms, and losses."""
     end = time.monotonic() + seconds
     count = 0
     while time.monotonic() < end:
@@ -259,14 +311,13 @@ def _measure_links(
             else:
                 taken[link].append(latency * 1000.0)
             time.sleep(rng.expovariate(1.0 / PAUSE_S))
-    return [_row(link, worker, rate, sorted(values), lost[link]) for link, values in taken.items()]
 
 
-def _row(link: str, worker: str, rate: float, values: list[float], lost: int) -> LatencyRow:
+def _row(link: str, worker: str, rate: float, viewers: int, values: list[float], lost: int) -> LatencyRow:
     if not values:
-        return LatencyRow(link, worker, rate, 0, float("nan"), float("nan"), float("nan"), lost)
+        return LatencyRow(link, worker, rate, viewers, 0, float("nan"), float("nan"), float("nan"), lost)
     p50, p99 = (values[min(len(values) - 1, int(share * len(values)))] for share in (0.5, 0.99))
-    return LatencyRow(link, worker, rate, len(values), p50, p99, values[-1], lost)
+    return LatencyRow(link, worker, rate, viewers, len(values), p50, p99, values[-1], lost)
 
 
 def _socketcand(frame: CanFrame) -> bytes:

@@ -26,11 +26,12 @@ from starhil.hil_tests.results import (
     prepare_report,
     write_junit,
 )
+from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.protocol.icd import load_unit
+from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
@@ -53,6 +54,8 @@ class SessionRequest:
     truth: Path | None = None
     keep_going: bool = False
     quiet: bool = False
+    view: str | None = None
+    """Address of the console that shows the results; `auto` with `start`: that of the started emulator."""
 
 
 def find_script(path: Path) -> Path:
@@ -100,17 +103,9 @@ def run_session(request: SessionRequest) -> SessionResult:
     result: SessionResult | None = None
     try:
         with ExitStack() as stack:
-            emulator = None
-            if request.start:
-                if options.can == "auto":
-                    options = replace(options, can=stack.enter_context(PrivateCanBus()))
-                state = stack.enter_context(temporary_folder("starhil-session-"))
-                emulator = _emulator(request, script, options, folder, state)
-            bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
-            if emulator is not None:
-                emulator.check_unit(request.unit)
-            for link in bench.links:
-                bench.client(link)  # report a missing port before the first step
+            bench = _open_bench(request, script, options, icd, folder, stack)
+            if request.view is not None:
+                show = _shown_on_console(request.view, script, bench, stack, show)
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
     except EmulatorProcessError as error:
         if result is None:
@@ -129,6 +124,54 @@ def run_session(request: SessionRequest) -> SessionResult:
     if not request.quiet:
         _print_summary(result, folder)
     return result
+
+
+def _open_bench(
+    request: SessionRequest,
+    script: Script,
+    options: LinkOptions,
+    icd: InterfaceDefinition,
+    folder: Path,
+    stack: ExitStack,
+) -> Bench:
+    """Open the bench with its links, and start the emulator if that is asked for."""
+    emulator = None
+    if request.start:
+        if options.can == "auto":
+            options = replace(options, can=stack.enter_context(PrivateCanBus()))
+        state = stack.enter_context(temporary_folder("starhil-session-"))
+        emulator = _emulator(request, script, options, folder, state)
+    bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+    if emulator is not None:
+        emulator.check_unit(request.unit)
+    for link in bench.links:
+        bench.client(link)  # report a missing port before the first step
+    return bench
+
+
+def _shown_on_console(
+    view: str, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
+) -> Callable[[StepResult], None]:
+    """Return what shows a result on the console too."""
+    address = console_address(view, bench.emulator)
+    unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
+    planned = len(script.steps) * (len(bench.links) if script.link == "both" else 1)
+    feed = stack.enter_context(
+        RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
+    )
+
+    def show_on_both(result: StepResult) -> None:
+        show(result)
+        feed.result(
+            result.name,
+            result.status,
+            result.detail,
+            identity=str(result.number),
+            link=result.link,
+            seconds=result.seconds,
+        )
+
+    return show_on_both
 
 
 def _options(request: SessionRequest, script: Script) -> LinkOptions:
@@ -167,6 +210,7 @@ def _emulator(
             settings=wanted.settings,
             state_dir=state,
             truth_log=truth_log,
+            extra=["--view", "auto"] if request.view == "auto" else (),
         )
     )
 

@@ -58,8 +58,21 @@ def _print_version(value: bool) -> None:
         raise typer.Exit
 
 
+OPTIONAL_VALUES: Final = {"--view": "auto"}
+"""Options whose value may be left out → the value that they then have; typer has no such options."""
+
+
 class FiniteCommand(TyperCommand):
     """A command that rejects infinite and NaN options; typer's bounds let NaN pass."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, with the values of `OPTIONAL_VALUES` added where they are left out."""
+        whole = []
+        for argument, after in zip(args, [*args[1:], "--"], strict=True):
+            whole.append(argument)
+            if argument in OPTIONAL_VALUES and after.startswith("-"):
+                whole.append(OPTIONAL_VALUES[argument])
+        return super().parse_args(ctx, whole)
 
     def invoke(self, ctx: Any) -> Any:
         """Call the command with its options.

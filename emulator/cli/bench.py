@@ -59,6 +59,7 @@ def _entry(name: str, digits: int) -> Callable[[Any], str]:
 _LATENCY_COLUMNS: Final[tuple[Column, ...]] = (
     ("worker", lambda row: row.worker),
     ("rate Hz", lambda row: f"{row.update_rate_hz:g}"),
+    ("viewers", lambda row: str(row.viewers)),
     ("link", lambda row: row.link),
     ("requests", lambda row: str(row.requests)),
     ("p50 ms", _figure("p50_ms", 2)),
@@ -78,6 +79,12 @@ def latency(
     workers: Annotated[
         list[str] | None, typer.Option("--worker", help="process or thread. May be repeated.")
     ] = None,
+    viewers: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Viewers of the console: each rate is measured without and with them, in turns."
+        ),
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Measure reply latency on both links while frames are solved, and the start-up of the emulator."""
@@ -88,7 +95,7 @@ def latency(
     report = _progress()
     rows, processes = [], []
     for worker in chosen:
-        links, process = measure(load_unit(), rates or [0.0, 1.0, 10.0], seconds, worker, report)
+        links, process = measure(load_unit(), rates or [0.0, 1.0, 10.0], seconds, worker, report, viewers)
         rows += links
         processes.append(process)
     if as_json:

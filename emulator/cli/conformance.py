@@ -14,6 +14,7 @@ from starhil.emulator.cli.options import (
     AsJson,
     CanChannel,
     CanopenNode,
+    ConsoleAddress,
     DeviceAddress,
     HostAddress,
     JunitFile,
@@ -54,6 +55,7 @@ def command(
     ] = False,
     list_only: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
     junit: JunitFile = None,
+    view: ConsoleAddress = None,
     html: Annotated[
         Path | None,
         typer.Option(help=output_help("Write an HTML report of what was sent, expected and received.")),
@@ -113,6 +115,7 @@ def command(
         safe_only=safe_only,
         speed=speed,
         times=ProbeTimes(answer_s=time_out),
+        view=view,
     )
     console = Console(highlight=False, quiet=as_json)
     if list_only:

@@ -49,6 +49,16 @@ JunitFile: TypeAlias = Annotated[
     Path | None, typer.Option("--junit", help=output_help("Write a JUnit XML file."))
 ]
 
+ConsoleAddress: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--view",
+        metavar="[ADDRESS]",
+        help="Show the results on a console while they come: the address on the ready line of `starhil run --view`; "
+        "without one, and with --start, that of the emulator started here.",
+    ),
+]
+
 DIALECTS = ("a", "b", "c")
 
 

@@ -76,17 +76,28 @@ def command(
         Path | None,
         typer.Option(help=output_help("CSV file of true and measured attitudes, one row per frame.")),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing truth log.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Overwrite an existing truth log or recording.")
+    ] = False,
     scenario: Annotated[
         str,
         typer.Option(
             help="Scenario of timed faults and attitude changes: a TOML file, or a name in configs/scenarios."
         ),
     ] = "",
-    record: Annotated[
-        Path | None,
+    view: Annotated[
+        str,
         typer.Option(
-            help="Folder for a recording of the run, for starhil replay; missing folders are created."
+            metavar="[HOST:PORT]",
+            help="Serve the console, a web page, at this address; default 127.0.0.1 and a free port. The ready line "
+            "has the page's address with its token.",
+        ),
+    ] = "off",
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder for a recording of the run, for starhil replay, or MCAP file (*.mcap) of images, truth, "
+            "telemetry and events, for Foxglove. Missing folders are created. May be repeated."
         ),
     ] = None,
     settings: Annotated[
@@ -107,6 +118,7 @@ def command(
     import gc
     import logging
 
+    from starhil.emulator.cli.console_client import ConsoleClient
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.launch import Run, RunOptions, path_of_head, with_own_seeds
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
@@ -146,20 +158,31 @@ def command(
         profiles.append(load_profile(name, overrides))
     profiles = with_own_seeds(profiles)
     if (
-        control == "off"
+        (control, view) == ("off", "off")
         and not (truth_log or record)
         and not any(_is_reachable(each.links) for each in profiles)
     ):
         raise EmulatorError(
             "no link: the device cannot be reached and nothing is recorded; "
-            "give --serial auto, --can auto, --canopen NODE, --control auto or --truth-log FILE"
+            "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
 
     if control_token is not None and not control_token:
         raise EmulatorError("--control-token: empty; give a text, or leave the option out")
-    options = RunOptions(truth_log, overwrite, control, control_token or "", scenario, record)
-    if truth_log is not None:
-        prepare_output(truth_log, "--truth-log")
+    options = RunOptions(
+        truth_log,
+        overwrite,
+        control,
+        control_token or "",
+        scenario,
+        record=_one_path(record, mcap=False),
+        view=view,
+        mcap=_one_path(record, mcap=True),
+        make_client=ConsoleClient,
+    )
+    for path, option in ((truth_log, "--truth-log"), (options.mcap, "--record")):
+        if path is not None:
+            prepare_output(path, option)
 
     async def run() -> None:
         import signal
@@ -194,6 +217,17 @@ def _absolute_folder(unit: str) -> str:
     from starhil.protocol.unit_folders import find_unit, shipped_units
 
     return unit if unit in shipped_units() else str(find_unit(unit).absolute())
+
+
+def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
+    """Return the MCAP file of `--record`, or its folder; None without."""
+    from starhil.emulator.errors import EmulatorError
+
+    found = [path for path in paths or () if (path.suffix == ".mcap") == mcap]
+    if len(found) > 1:
+        kind = "MCAP file" if mcap else "folder"
+        raise EmulatorError(f"--record {found[1]}: one {kind} per run, and {found[0]} is one already")
+    return found[0] if found else None
 
 
 def _folder_of_head(folder: Path, number: int) -> Path:

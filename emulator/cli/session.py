@@ -12,6 +12,7 @@ import typer
 from starhil.emulator.cli.options import (
     AsJson,
     CanChannel,
+    ConsoleAddress,
     DeviceAddress,
     HostAddress,
     JunitFile,
@@ -36,6 +37,7 @@ def command(
         Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
     ] = None,
     junit: JunitFile = None,
+    view: ConsoleAddress = None,
     truth: Annotated[
         Path | None, typer.Option(help="Truth log that the emulator writes (run --truth-log).")
     ] = None,
@@ -75,6 +77,7 @@ def command(
         truth=truth,
         keep_going=keep_going,
         quiet=as_json,
+        view=view,
     )
     with interruptible():
         result = run_session(request)

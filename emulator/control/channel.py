@@ -21,6 +21,7 @@ each request must carry it as `token`. With several heads, `head` in a request n
 ``step``                  `seconds`: advance simulation time (stepped clock only); answered when it is done
 ``fault``                 `optical`, `device`, `serial` or `can`: a table of the keys below; keys not given are off
 ``clear_faults``          remove all faults
+``scenario``              `name`: run a scenario, a TOML file or a name in configs/scenarios, its times from now on
 ``quit``                  end the emulator as SIGTERM does
 ========================  =======================================================================================
 
@@ -48,6 +49,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.faults import FaultRequest, Faults
+from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.cycle import Measurement, as_quaternion
 from starhil.emulator.emulation import Emulation
@@ -119,6 +121,7 @@ class ControlServer:
             "step": self._step,
             "fault": self._fault,
             "clear_faults": self._clear_faults,
+            "scenario": self._run_scenario,
             "quit": self._quit_run,
         }
         for target in targets:
@@ -192,21 +195,25 @@ class ControlServer:
                 "ok": False,
                 "error": "token: missing or wrong; give the one of --control-token",
             }
+        return {**identity, **await self.execute(request)}
+
+    async def execute(self, request: dict[str, Any]) -> Answer:
+        """Execute one decoded request, without `id` and `token`, and return its answer."""
         wanted = str(request.pop("do", ""))
         action = self._actions.get(wanted)
         if action is None:
-            return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+            return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
         try:
             target = self._target(request)
             if target.emulation.tape is not None:
                 target.emulation.tape.latch()
-            return {**identity, "ok": True, **await action(target, request)}
+            return {"ok": True, **await action(target, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
-            return {**identity, "ok": False, "error": str(error)}
+            return {"ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
             log.exception("control channel: %s", wanted)
             name = type(error).__name__
-            return {**identity, "ok": False, "error": f"internal error: {name}; see the emulator's log"}
+            return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
     def _token_is_valid(self, token: object) -> bool:
         if not self._token:
@@ -312,6 +319,17 @@ class ControlServer:
         _note(target, "clear_faults")
         target.faults.clear()
         return {"faults": target.faults.describe()}
+
+    async def _run_scenario(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+        _check_keys(request, "name")
+        emulation = target.emulation
+        if emulation.tape is not None:
+            raise EmulatorError("scenario: a recording begins with its scenario; run with --scenario")
+        scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
+        scheduler, clock = emulation.device.scheduler, emulation.clock
+        set_truth, folder = emulation.leader.set_truth, emulation.profile.folder
+        scenario.enter(scheduler, target.faults, set_truth, folder, start_s=clock.now_ns() / NANOSECONDS)
+        return {"events": len(scenario.at)}
 
     async def _quit_run(self, _target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request)

@@ -62,12 +62,12 @@ class ScenarioEvent(Strict):
             raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
         return self
 
-    def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path) -> Action:
-        """Return the action of the event; what it needs is read and checked now."""
+    def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path, at_s: float) -> Action:
+        """Return the action of the event at a simulation time; what it needs is read and checked now."""
         if self.fault is not None:
             faults.check(self.fault)
         config = self.truth
-        truth = None if config is None else config.build(self.run_time_s, folder)
+        truth = None if config is None else config.build(at_s, folder)
 
         def act(_due_ns: int) -> None:
             if self.clear_faults:
@@ -76,7 +76,7 @@ class ScenarioEvent(Strict):
                 faults.inject(self.fault)
             if config is not None and truth is not None:
                 set_truth(truth, config)
-            log.info("scenario at %g s", self.run_time_s)
+            log.info("scenario at %g s", at_s)
 
         return act
 
@@ -95,6 +95,7 @@ class Scenario(Strict):
         faults: Faults,
         set_truth: SetTruth,
         folder: Path,
+        start_s: float = 0.0,
     ) -> None:
         """Schedule all events; files that they need are read and checked now.
 
@@ -108,6 +109,8 @@ class Scenario(Strict):
             Called with a new truth source and its configuration.
         folder
             Folder that relative paths of truth files start from.
+        start_s
+            Simulation time from which the times of the events count, seconds.
 
         Raises
         ------
@@ -115,11 +118,12 @@ class Scenario(Strict):
             An event names a link that this run does not have, or a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
+            at_s = start_s + event.run_time_s
             try:
-                action = event.prepare(faults, set_truth, folder)
+                action = event.prepare(faults, set_truth, folder, at_s)
             except (EmulatorError, StaridError) as error:
                 raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
-            scheduler.at(round(event.run_time_s * NANOSECONDS), action)
+            scheduler.at(round(at_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:

@@ -83,7 +83,9 @@ class WireFaults(Generic[Item]):
     ) -> None:
         self.settings = WireFaultSettings()
         self.dropped = self.corrupted = 0
-        self._send = send
+        self.listener: Callable[[Item], None] | None = None
+        """Called with each item as it goes out."""
+        self._transmit = send
         self._damage = damage
         self._clock = clock
         self._scheduler = scheduler
@@ -111,6 +113,12 @@ class WireFaults(Generic[Item]):
             self.corrupted += 1
             item = self._damage.corrupt(item, rng)
         self._send_or_hold(self._damage.split(item, settings.split) if settings.split else [item], settings)
+
+    def _send(self, item: Item) -> None:
+        """Hand an item to the transport."""
+        if self.listener is not None:
+            self.listener(item)
+        self._transmit(item)
 
     def _send_or_hold(self, pieces: Sequence[Item], settings: WireFaultSettings) -> None:
         """Send the pieces of one item, now or later, after all that was sent before."""

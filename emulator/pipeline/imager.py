@@ -14,6 +14,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol, TypeAlias
 
 from starhil.emulator.errors import EmulatorError
@@ -64,6 +65,8 @@ class _RequestQueue:
         self._started: asyncio.Future[PipelineReady] = asyncio.get_running_loop().create_future()
         self.on_failure: Callable[[str], None] | None = None
         """Called with the reason if the pipeline ends after it was ready; if the start fails, `start` raises."""
+        self.watchers: set[object] = set()
+        """Who looks at the frames: unless this is empty, they come with a preview."""
 
     @property
     def pending(self) -> int:
@@ -72,6 +75,12 @@ class _RequestQueue:
     async def settle(self) -> None:
         """Wait until nothing is pending."""
         await self._idle.wait()
+
+    def _with_preview(self, request: PipelineRequest) -> PipelineRequest:
+        """Return the request, with a preview if somebody looks at the frames."""
+        if self.watchers and isinstance(request, FrameRequest):
+            return replace(request, preview=True)
+        return request
 
     def _add_pending(self, done: ReplyCallback) -> None:
         self._waiting.append(done)
@@ -163,7 +172,7 @@ class ProcessImager(_RequestQueue):
         if not self._worker.running or self._writer is None:
             done(Failure("pipeline worker: not running"))
             return
-        data = _with_length(request)
+        data = _with_length(self._with_preview(request))
         self._add_pending(done)
         self._writer.write(data)
 
@@ -248,7 +257,7 @@ class ThreadImager(_RequestQueue):
             done(Failure("pipeline thread: not running"))
             return
         self._add_pending(done)
-        self._requests.put(request)
+        self._requests.put(self._with_preview(request))
 
     def _pipeline_ended(self, text: str) -> None:
         self._thread = None

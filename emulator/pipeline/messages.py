@@ -39,6 +39,8 @@ class PipelineSetup:
     build_in_background
         Solve with the current star index while another is built. If false, frames wait for the new index, so
         that a run on the stepped clock is reproducible byte for byte.
+    previews
+        Somebody may look at the frames: be ready to make previews.
     """
 
     camera: dict[str, Any]
@@ -50,6 +52,7 @@ class PipelineSetup:
     algorithm: str
     seed: int
     build_in_background: bool = False
+    previews: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ class FrameRequest:
     observer_velocity
         Velocity of the sensor relative to the barycentre as the device believes it, ICRS, m/s, to correct
         aberration; None: no correction.
+    preview
+        Return the image too, compressed for display.
     """
 
     index: int
@@ -119,6 +124,63 @@ class FrameRequest:
     position_m: Triple | None = None
     velocity_m_s: Triple | None = None
     observer_velocity: Triple | None = None
+    preview: bool = False
+
+
+@dataclass(frozen=True)
+class SkyBody:
+    """A body of the sky as a viewer sees it.
+
+    Attributes
+    ----------
+    name
+        `sun`, `moon`, `earth`, or the name of a planet.
+    ra_deg, dec_deg, radius_deg
+        Direction of its centre, ICRS, and its angular radius; 0 for a point.
+    outline_px
+        Outline of its disc as pairs of pixels; None where the lens maps no direction. One pair for a point.
+    """
+
+    name: str
+    ra_deg: float
+    dec_deg: float
+    radius_deg: float
+    outline_px: tuple[tuple[float, float] | None, ...]
+
+
+@dataclass(frozen=True)
+class Preview:
+    """An image for display, and what is in it.
+
+    Attributes
+    ----------
+    jpeg
+        The image, 8 bits, faint stars raised.
+    width, height
+        Size of the image, pixels.
+    detections
+        Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first.
+    hips
+        Hipparcos number of each detection; 0 if it was not identified.
+    catalogue
+        Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first.
+    false_stars
+        Positions of the false stars in the image.
+    bodies
+        Sun, Moon, Earth and planets.
+    covered
+        Polygons, pixels, of the areas that something near the lens covers.
+    """
+
+    jpeg: bytes
+    width: int
+    height: int
+    detections: tuple[tuple[float, float, float, float], ...] = ()
+    hips: tuple[int, ...] = ()
+    catalogue: tuple[tuple[int, float, float, float], ...] = ()
+    false_stars: tuple[tuple[float, float], ...] = ()
+    bodies: tuple[SkyBody, ...] = ()
+    covered: tuple[tuple[tuple[float, float], ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,6 +222,8 @@ class FrameResult:
         Level and noise of the background, counts.
     render_s, detect_s, identify_s
         Wall time of each step, for the log; never in telemetry.
+    preview
+        The image, if the request asked for it.
     """
 
     index: int
@@ -183,6 +247,7 @@ class FrameResult:
     render_s: float = 0.0
     detect_s: float = 0.0
     identify_s: float = 0.0
+    preview: Preview | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)

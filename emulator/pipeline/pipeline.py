@@ -29,6 +29,7 @@ from starhil.emulator.pipeline.messages import (
     Triple,
 )
 from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
+from starhil.emulator.pipeline.preview import make_preview
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame, Renderer
@@ -125,6 +126,7 @@ class Pipeline:
             exposure_s=0.1,
             gain=self._sensor.gain,
             settings=settings,
+            preview=self._setup.previews,
         )
         if helper is not None:
             for rate in _WARM_UP_RATES_RAD_S:
@@ -168,13 +170,18 @@ class Pipeline:
         self._last = frame
         rendered = time.perf_counter()
         if not request.solve:
-            return FrameResult(request.index, solved=False, render_s=rendered - begin)
+            preview = make_preview(frame, self.camera, sensor, sky.objects) if request.preview else None
+            return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
         found = detect(frame.image, detection_settings(sensor, request.settings))
         detected = time.perf_counter()
         identifier, current = self._identifiers.get(self._identifier_setup(request.settings))
         solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
         result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        if request.preview:
+            result = replace(
+                result, preview=make_preview(frame, self.camera, sensor, sky.objects, found, solution)
+            )
         return result if current else replace(result, index_pending=True)
 
     def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:

@@ -172,6 +172,11 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
 }
 
 
+def range_of(field: str) -> tuple[float, float] | None:
+    """Return the lowest and highest value of a field of any class here; None if it has no range."""
+    return _RANGES.get(field)
+
+
 @dataclass(frozen=True)
 class SkyObjects:
     """Everything that changes an image besides the catalogue stars.

@@ -20,6 +20,7 @@ from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.results import FAILED
+from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.unit_folders import DEFAULT_UNIT
@@ -46,6 +47,8 @@ class ConformanceRequest:
     safe_only: bool = False
     speed: float = 1.0
     times: ProbeTimes = field(default_factory=ProbeTimes)
+    view: str | None = None
+    """Address of the console that shows the outcomes; `auto` with `start`: that of the started emulator."""
 
 
 def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
@@ -102,9 +105,14 @@ def run_conformance(
     try:
         with ExitStack() as stack:
             serial, can = request.serial, request.can
-            if request.start:
-                serial, can = _start(request, stack)
-            _run_on_links(request, icd, cases, serial, can, record)
+            emulator = _start(request, stack) if request.start else None
+            if emulator is not None:
+                serial, can = emulator.ready.get("serial"), emulator.ready.get("can")
+            shown: Callable[[Outcome], None] = record
+            if request.view is not None:
+                address = console_address(request.view, emulator)
+                shown = _shown_on_console(address, f"{serial or ''} {can or ''}", len(cases), stack, record)
+            _run_on_links(request, icd, cases, serial, can, shown)
             complete = True
     except EmulatorProcessError as error:
         if not complete:
@@ -117,6 +125,31 @@ def run_conformance(
                 record(not_run(item, interruption.reason))
         return ConformanceResult(outcomes, interruption)
     return ConformanceResult(outcomes)
+
+
+def _shown_on_console(
+    address: str, unit: str, planned: int, stack: ExitStack, record: Callable[[Outcome], None]
+) -> Callable[[Outcome], None]:
+    """Return what shows an outcome on the console too."""
+    feed = stack.enter_context(
+        RunFeed(address, kind="conformance", title="Conformance", unit=unit.strip(), planned=planned)
+    )
+
+    def record_on_both(outcome: Outcome) -> None:
+        record(outcome)
+        detail = outcome.seen
+        if outcome.status == FAILED:
+            detail = f"expected {outcome.expected}; seen {outcome.seen}"
+        feed.result(
+            outcome.title,
+            outcome.status,
+            detail,
+            identity=outcome.id,
+            seconds=outcome.seconds,
+            traffic=outcome.log if outcome.status == FAILED else (),
+        )
+
+    return record_on_both
 
 
 def _run_on_links(
@@ -167,8 +200,8 @@ def _fallen(error: EmulatorProcessError) -> Outcome:
     )
 
 
-def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, str | None]:
-    """Start an emulator with the links that are asked for; return port and channel."""
+def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
+    """Start an emulator with the links that are asked for."""
     folder = stack.enter_context(temporary_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"
@@ -177,6 +210,8 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
     extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
     if request.speed != 1.0:
         extra += ["--clock", f"scaled:{request.speed:g}"]
+    if request.view == "auto":
+        extra += ["--view", "auto"]
     command = emulator_command(
         profile=request.profile,
         unit=request.unit,
@@ -189,7 +224,7 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
     )
     emulator = stack.enter_context(EmulatorProcess(command))
     emulator.check_unit(request.unit)
-    return emulator.ready.get("serial"), emulator.ready.get("can")
+    return emulator
 
 
 def _run_canopen(

@@ -50,6 +50,8 @@ class Transport(ABC, Generic[Item]):
         self.statistics: Final = statistics or Statistics()
         self._on_receive: Receive[Item] | None = None
         self._on_error: ReportError | None = None
+        self.listener: Receive[Item] | None = None
+        """Called with each received item before it is processed."""
 
     async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
         """Open the port and pass what arrives to `on_receive`.
@@ -78,6 +80,8 @@ class Transport(ABC, Generic[Item]):
         """Close the port; may be called twice."""
 
     def _receive(self, item: Item) -> None:
+        if self.listener is not None:
+            self.listener(item)
         if self._on_receive is not None:
             self._on_receive(item)
 

@@ -23,6 +23,7 @@ from starhil.emulator.pipeline.messages import (
     ImageRequest,
     ImageResult,
     MatchedStar,
+    Preview,
 )
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
@@ -40,6 +41,8 @@ STARS = (
     MatchedStar(27989, 361.0, 282.7, 0.45, 600.0),
     MatchedStar(21421, 793.0, 65.7, 0.87, 500.0),
 )
+
+PREVIEW = Preview(b"jpeg of a frame", 937, 937, ((86.0, 824.6, -1.4, 900.0),), (32349,))
 
 
 @dataclass
@@ -82,6 +85,7 @@ class FakePipeline:
             rms_px=0.1,
             background_dn=8.2,
             noise_dn=0.61,
+            preview=PREVIEW if request.preview else None,
         )
 
     @property

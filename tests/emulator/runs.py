@@ -3,9 +3,10 @@
 import asyncio
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
-from starhil.emulator.pipeline.messages import PipelineReady
+from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady
 from starhil.protocol.messages import ErrorCode, Request
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
@@ -28,9 +29,18 @@ class DirectImager:
 
 
 class FakeImager(DirectImager):
-    """A pipeline that is ready at once."""
+    """A pipeline that is ready at once, and makes previews while somebody looks."""
 
     on_failure = None
+
+    def __init__(self, handle: Callable[[PipelineRequest], PipelineReply]) -> None:
+        super().__init__(handle)
+        self.watchers: set[object] = set()
+
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
+        if self.watchers and isinstance(request, FrameRequest):
+            request = replace(request, preview=True)
+        super().submit(request, done)
 
     async def start(self) -> PipelineReady:
         return PipelineReady(CAMERA, 5, 0.0)

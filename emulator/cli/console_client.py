@@ -1,0 +1,73 @@
+"""The console's OBC: the client of the bench on a link of a run."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from starhil.emulator.console.obc import HOST_ADDRESS, Exchange, ObcPort
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
+from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
+from starhil.protocol.codec import Row
+from starhil.protocol.serial_framing import Dialect
+
+
+class ConsoleClient:
+    """An OBC for console and recording.
+
+    Parameters
+    ----------
+    port
+        Where the device is found.
+    """
+
+    def __init__(self, port: ObcPort) -> None:
+        self._port = port
+        self._client: AsyncObcClient | None = None
+        self._settings: tuple[object, ...] = ()
+        """Settings of the device for which the client was made."""
+
+    async def start(self) -> None:
+        """Open the link."""
+        port = self._port
+        self._settings = self._present_settings()
+        link: HostLink[Any]
+        if port.bus == "can":
+            link = CanHostLink(port.where, host_address=HOST_ADDRESS, device_address=port.device_address())
+        elif port.bus == "serial":
+            link = SerialHostLink(port.icd, port.where, dialect=port.dialect() or Dialect.B)
+        else:
+            return
+        self._client = AsyncObcClient(link, port.icd)
+        await self._client.start()
+
+    async def close(self) -> None:
+        """Close the link."""
+        if self._client is not None:
+            await self._client.close()
+            self._client = None
+
+    def _present_settings(self) -> tuple[object, ...]:
+        return self._port.device_address(), self._port.dialect()
+
+    async def exchange(self, row: Row, data: bytes) -> Exchange:
+        """Send a telecommand, or request telemetry, and wait for the reply."""
+        if self._settings != self._present_settings():  # a telecommand has changed them
+            await self.close()
+            await self.start()
+        if self._client is None:
+            return Exchange("no_link", f"{row.name}: the unit has CANopen only; use a CANopen master")
+        request = self._port.icd.request(row, data)
+        begin = time.perf_counter()
+        try:
+            reply, latency = await self._client.transact(
+                request, row.name, 0 if row.kind == "telecommand" else row.size
+            )
+        except NackError as error:
+            return Exchange(error.code_name, str(error), time.perf_counter() - begin, refused=True)
+        except NoReplyError as error:
+            return Exchange("no_reply", str(error))
+        except BenchError as error:
+            return Exchange("link_lost", str(error))
+        return Exchange("ok", "", latency, reply.data)

@@ -1,0 +1,324 @@
+"""The console of a run: listens to its frames and wires, speaks to the device as an OBC, and serves the page."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, Final
+
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.console.describe import describe, load_bright_stars
+from starhil.emulator.console.history import History, frame_content
+from starhil.emulator.console.obc import HOST_ADDRESS, ConsoleObc, Exchange, ObcClient
+from starhil.emulator.console.runs import Runs
+from starhil.emulator.console.slew import slew_request
+from starhil.emulator.console.stepping import StepRunner
+from starhil.emulator.console.trace import WireTrace, request_bytes
+from starhil.emulator.console.viewer import Viewer
+from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.modes import Transition
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import log_internal_error, one_line
+from starhil.protocol.errors import ProtocolError
+from starid.errors import StaridError
+
+log = logging.getLogger("starhil.console")
+
+Execute = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Executes a request of the control channel."""
+
+TURN_S: Final = 0.1
+"""Time between two deliveries of the wire's trace, seconds."""
+
+STATUS_S: Final = 0.5
+"""Time between two reports of the run's status, seconds."""
+
+POLL_S: Final = 1.0
+"""Time in which every telemetry row that a page shows is read once, seconds."""
+
+CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
+"""Requests of the control channel that a page may make."""
+
+
+class Console:
+    """Everything behind the page.
+
+    Parameters
+    ----------
+    emulation
+        The run, open.
+    execute
+        Executes requests of the control channel.
+    client
+        OBC on a link to the device, open.
+    """
+
+    def __init__(self, emulation: Emulation, execute: Execute, client: ObcClient) -> None:
+        self._emulation = emulation
+        self._execute = execute
+        device = emulation.device
+        self.obc = ConsoleObc(client, device.icd)
+        self.history = History()
+        self.runs = Runs(self._broadcast)
+        self.trace = WireTrace(
+            device.icd,
+            emulation.links,
+            lambda: None if emulation.serial is None else emulation.serial.dialect,
+        )
+        self.stepping = StepRunner(execute)
+        self.viewers: set[Viewer] = set()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._rows_wanted = asyncio.Event()
+        self._status_due = asyncio.Event()
+        self._stars: asyncio.Task[dict[str, Any]] | None = None
+        self._actions: dict[str, Callable[[Viewer, dict[str, Any]], Awaitable[dict[str, Any]]]] = {
+            "subscribe": self._subscribe,
+            "control": self._control,
+            "slew": self._slew,
+            "clock": self._set_clock,
+            "encode": self._encode,
+            "send": self._send,
+            "read": self._read,
+            "clear_session": self._clear_session,
+        }
+
+    def start(self) -> None:
+        """Begin to listen."""
+        device = self._emulation.device
+        device.on_frame.append(self._frame_published)
+        device.on_mode.append(self._mode_changed)
+        catalog = self._emulation.profile.catalog
+        path = str(self._emulation.profile.folder / catalog.path) if catalog.path else None
+        self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, catalog.epoch))
+        loops = (self._deliver_trace, self._report_status, self._poll_telemetry)
+        self._tasks = [asyncio.create_task(self._guarded(loop)) for loop in loops]
+
+    async def close(self) -> None:
+        """Cease to listen."""
+        self.trace.listen(wanted=False)
+        self.stepping.pause()
+        tasks = [*self._tasks, *([self._stars] if self._stars is not None else [])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    @staticmethod
+    async def _guarded(loop: Callable[[], Awaitable[None]]) -> None:
+        """Repeat a loop's turn for ever; a turn that fails is logged."""
+        while True:
+            try:
+                await loop()
+            except Exception as error:  # noqa: BLE001 (the run goes on without this turn)
+                log_internal_error("console", error)
+                await asyncio.sleep(STATUS_S)
+
+    # --- pages ---
+
+    def join(self, viewer: Viewer) -> None:
+        """Add a page."""
+        self.viewers.add(viewer)
+        self._viewers_changed()
+
+    def leave(self, viewer: Viewer) -> None:
+        """Remove a page."""
+        self.viewers.discard(viewer)
+        self._viewers_changed()
+
+    def _viewers_changed(self) -> None:
+        """Make no previews, and listen to no wire, unless somebody looks."""
+        watchers = self._emulation.imager.watchers
+        if any(viewer.frames for viewer in self.viewers):
+            watchers.add(self)
+        else:
+            watchers.discard(self)
+        self.trace.listen(wanted=bool(self.viewers))
+        if any(viewer.rows for viewer in self.viewers):
+            self._rows_wanted.set()
+        else:
+            self._rows_wanted.clear()
+        if self.viewers:
+            self._status_due.set()
+        else:
+            self._status_due.clear()
+
+    async def welcome(self, viewer: Viewer) -> bytes:
+        """Send the description of the run to a page; return its history as rows of 64-bit floats."""
+        stars = await self._stars if self._stars is not None else {}
+        content = describe(self._emulation) | stars | {"session_steps": self.obc.steps}
+        viewer.send(json.dumps({"type": "hello", **content}))
+        viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
+        for message in self.runs.messages():
+            viewer.send(message)
+        return self.history.rows().tobytes()
+
+    def _broadcast(
+        self, message: dict[str, Any], wants: Callable[[Viewer], bool] = lambda _viewer: True
+    ) -> None:
+        receivers = [viewer for viewer in self.viewers if wants(viewer)]
+        if receivers:
+            text = json.dumps(message)
+            for viewer in receivers:
+                viewer.send(text)
+
+    # --- what is listened to ---
+
+    def _frame_published(self, measurement: Measurement) -> None:
+        known = len(self.history.reasons)
+        row = self.history.add(measurement)
+        if len(self.history.reasons) != known:
+            self._broadcast({"type": "reasons", "reasons": self.history.reasons})
+        receivers = [viewer for viewer in self.viewers if viewer.frames]
+        if not receivers:
+            return
+        head = json.dumps(frame_content(measurement, row)).encode()
+        preview = measurement.result.preview
+        jpeg = b"" if preview is None else preview.jpeg
+        data = b"".join((b"F", len(head).to_bytes(4, "little"), head, jpeg))
+        for viewer in receivers:
+            viewer.send_frame(data)
+
+    def _mode_changed(self, transition: Transition) -> None:
+        now_s = self._emulation.clock.now_ns() / NANOSECONDS
+        text = f"{transition.before.value} → {transition.after.value} ({transition.cause.value})"
+        self._broadcast({"type": "event", "run_s": now_s, "what": "mode", "text": text})
+
+    async def _deliver_trace(self) -> None:
+        await asyncio.sleep(TURN_S)
+        if not any(viewer.wire for viewer in self.viewers):
+            self.trace.discard()
+            return
+        lines, left_out = self.trace.take()
+        if lines:
+            self._broadcast(
+                {"type": "wire", "lines": lines, "left_out": left_out}, lambda viewer: viewer.wire
+            )
+
+    async def _report_status(self) -> None:
+        await self._status_due.wait()
+        status = await self._execute({"do": "status"})
+        truth = await self._execute({"do": "truth"})
+        self._broadcast(
+            {
+                "type": "status",
+                "status": status,
+                "truth": truth,
+                "viewers": len(self.viewers),
+                "stepping": self.stepping.speed,
+                "session_steps": self.obc.steps,
+                "wall_s": time.time(),
+            }
+        )
+        await asyncio.sleep(STATUS_S)
+
+    async def _poll_telemetry(self) -> None:
+        """Read every row that a page shows, once."""
+        await self._rows_wanted.wait()
+        rows = sorted(frozenset[str]().union(*(viewer.rows for viewer in self.viewers)))
+        begin = time.monotonic()
+        for number, name in enumerate(rows):
+            exchange, values = await self.obc.poll(name)
+            self._broadcast(
+                {"type": "telemetry", "row": name, "values": values, **exchange_content(exchange)},
+                partial(_shows, name),
+            )
+            due = begin + (number + 1) * POLL_S / len(rows)
+            await asyncio.sleep(max(0.005, due - time.monotonic()))
+
+    # --- what a page asks for ---
+
+    async def answer(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        """Execute a request of a page and return the answer."""
+        identity = {"type": "answer", "id": request.get("id")}
+        action = self._actions.get(str(request.get("do")))
+        if action is None:
+            return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+        try:
+            return {**identity, "ok": True, **await action(viewer, request)}
+        except (EmulatorError, ProtocolError, StaridError) as error:
+            return {**identity, "ok": False, "error": str(error)}
+        except Exception as error:  # noqa: BLE001 (an internal error ends neither the run nor the page)
+            log_internal_error("console", error)
+            return {**identity, "ok": False, "error": f"internal error: {one_line(error)}"}
+
+    async def _subscribe(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        viewer.frames = bool(request.get("frames"))
+        begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
+        if begins and viewer.wire:
+            viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
+        rows = request.get("rows") or ()
+        known = self._emulation.device.icd.telemetry
+        viewer.rows = frozenset(name for name in rows if name in known)
+        self._viewers_changed()
+        return {}
+
+    async def _control(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        wanted = dict(_table(request, "request"))
+        if wanted.get("do") not in CONTROL:
+            raise EmulatorError(f"request: do must be one of {', '.join(sorted(CONTROL))}")
+        return await self._execute(wanted)
+
+    async def _slew(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        profile = self._emulation.profile
+        path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
+        truth = await self._execute({"do": "truth"})
+        wanted = await asyncio.to_thread(
+            slew_request,
+            _table(request, "to"),
+            truth,
+            request.get("max_rate_deg_s"),
+            path,
+            profile.catalog.epoch,
+        )
+        return await self._execute(wanted)
+
+    async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        if self._emulation.stepper is None:
+            raise EmulatorError(f"the clock is {self._emulation.clock.name}: it cannot be stopped")
+        speed = request.get("speed")
+        self.stepping.run(float(speed) if isinstance(speed, (int, float)) else 0.0)
+        return {"speed": self.stepping.speed}
+
+    async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
+        icd, address = self._emulation.icd, int(self._emulation.device.parameters["can_address"])
+        return {"problem": problem, **request_bytes(icd, row, data, HOST_ADDRESS, address)}
+
+    async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        exchange = await self.obc.send(str(request.get("row")), _table(request, "values"))
+        return exchange_content(exchange)
+
+    async def _read(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        exchange, values = await self.obc.read(str(request.get("row")))
+        return {"values": values, **exchange_content(exchange)}
+
+    async def _clear_session(self, _viewer: Viewer, _request: dict[str, Any]) -> dict[str, Any]:
+        self.obc.clear()
+        return {}
+
+
+def _shows(row: str, viewer: Viewer) -> bool:
+    return row in viewer.rows
+
+
+def _table(request: dict[str, Any], key: str) -> dict[str, Any]:
+    """Return a table of a request."""
+    value = request.get(key, {})
+    if not isinstance(value, dict):
+        raise EmulatorError(f"{key}: an object is needed")
+    return value
+
+
+def exchange_content(exchange: Exchange) -> dict[str, Any]:
+    """Return the outcome of a request as JSON data."""
+    latency = None if exchange.latency_s is None else round(exchange.latency_s * 1e3, 3)
+    return {
+        "outcome": exchange.outcome,
+        "detail": exchange.detail,
+        "refused": exchange.refused,
+        "latency_ms": latency,
+    }

@@ -1,0 +1,151 @@
+"""What a page has to know before anything happens: the interface, the faults, the sky and the run."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from typing import Any, Final
+
+import numpy as np
+
+from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.control.faults import NO_ERROR, DeviceFault, WireFault
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.profile import configs_folder
+from starhil.emulator.sky.objects import SkyObjects, range_of
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import InterfaceDefinition
+from starid.catalog import load_catalog
+from starid.star_names import STAR_NAMES
+
+MAP_V: Final = 4.2
+"""Faintest star on the map of the whole sky."""
+
+
+def load_bright_stars(path: str | None, epoch: float) -> dict[str, Any]:
+    """Return the stars for the map of the whole sky, and the names of stars, as JSON data."""
+    bright = load_catalog(path, epoch).brighter_than(MAP_V)
+    stars = np.column_stack([np.degrees(bright.ra_rad), np.degrees(bright.dec_rad), bright.v])
+    return {"map": stars.round(2).tolist(), "star_names": STAR_NAMES}
+
+
+def describe(emulation: Emulation) -> dict[str, Any]:
+    """Return the description of a run as JSON data."""
+    icd = emulation.device.icd
+    links = {
+        key: emulation.ready_fields[key]
+        for key in ("serial", "can", "canopen")
+        if key in emulation.ready_fields
+    }
+    return {
+        "columns": COLUMNS,
+        "modes": MODES,
+        "profile": emulation.profile.name,
+        "seed": emulation.profile.run.seed,
+        "clock": emulation.clock.name,
+        "links": links,
+        "camera": emulation.warm.camera if emulation.warm is not None else emulation.profile.camera.values(),
+        "unit": {"name": icd.name, "version": icd.version},
+        "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
+        "telemetry": [describe_row(row, icd) for row in icd.rows if row.kind == "telemetry"],
+        "parameters": [
+            {"id": item.id, "name": item.name, "unit": item.unit, "min": item.minimum, "max": item.maximum}
+            for item in icd.parameters.values()
+        ],
+        "faults": fault_controls(icd, [link.bus for link in emulation.links]),
+        "scenarios": sorted(path.stem for path in (configs_folder() / "scenarios").glob("*.toml")),
+    }
+
+
+def describe_row(row: Row, icd: InterfaceDefinition) -> dict[str, Any]:
+    """Return a telecommand or telemetry row as JSON data."""
+    return {
+        "id": row.id,
+        "name": row.name,
+        "class": row.klass,
+        "size": row.size,
+        "doc": row.doc,
+        "provenance": row.provenance,
+        "fields": [_describe_field(field, icd) for field in row.named_fields.values()],
+    }
+
+
+def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
+    values: dict[str, Any] = {
+        "name": field.name,
+        "kind": field.kind,
+        "type": field.type,
+        "unit": field.unit,
+        "doc": field.doc,
+        "default": field.default if field.const is None else field.const,
+    }
+    if field.kind in ("integer", "bits", "float"):
+        low, high = field.physical_limits
+        bounded = field.kind != "float" or field.minimum is not None or field.maximum is not None
+        if bounded and abs(low) < 1e38 and abs(high) < 1e38:
+            values |= {"min": low, "max": high}
+        if field.kind != "float":
+            values["step"] = field.scale
+    if field.enum is not None:
+        values["values"] = list(field.enum.values)
+    if field.name == "parameter" and icd.parameters:
+        values["parameters"] = True
+    if field.kind == "bytes":
+        values["bytes"] = field.size
+    return values
+
+
+def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
+    """Return the controls of the faults by level: name, kind and range of each value."""
+    causes = list(icd.enum("reset_cause").values)
+    errors = [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR]
+    device = [
+        {**control, "values": {"error": errors, "reset": causes}.get(control["name"])}
+        for control in _model_controls(DeviceFault)
+    ]
+    wire = _model_controls(WireFault)
+    share = {"name": "blocked_share", "kind": "number", "min": 0.0, "max": 1.0, "default": 0.0}
+    levels = [
+        {"level": "optical", "controls": [share, *_class_controls(SkyObjects)]},
+        {"level": "device", "controls": device},
+    ]
+    return levels + [{"level": bus, "controls": wire} for bus in dict.fromkeys(buses)]
+
+
+def _model_controls(model: type[DeviceFault | WireFault]) -> list[dict[str, Any]]:
+    controls = []
+    for name, schema in model.model_json_schema()["properties"].items():
+        kinds = {"boolean": "flag", "integer": "integer", "number": "number"}
+        controls.append(
+            {
+                "name": name,
+                "kind": kinds.get(schema.get("type", ""), "choice"),
+                "min": schema.get("minimum"),
+                "max": schema.get("maximum"),
+                "default": schema.get("default"),
+            }
+        )
+    return controls
+
+
+def _class_controls(kind: type[Any]) -> list[dict[str, Any]]:
+    """Return the controls of the fields of a class of sky objects; a body becomes a group."""
+    hints = typing.get_type_hints(kind)
+    controls = []
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
+        default = None if field.default is dataclasses.MISSING else field.default
+        inner = [each for each in typing.get_args(hint) if dataclasses.is_dataclass(each)]
+        control: dict[str, Any] = {"name": field.name, "default": default}
+        bounds = range_of(field.name)
+        if bounds is not None:
+            control |= {"min": bounds[0], "max": bounds[1]}
+        if typing.get_origin(hint) is types.UnionType and inner:
+            control |= {"kind": "group", "controls": _class_controls(typing.cast("type[Any]", inner[0]))}
+        elif typing.get_origin(hint) is tuple:
+            control |= {"kind": "list", "default": None}
+        else:
+            control["kind"] = {bool: "flag", int: "integer", float: "number"}.get(hint, "text")
+        controls.append(control)
+    return controls

@@ -1,0 +1,138 @@
+"""What a published frame says in numbers, and the numbers of the last hour."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.modes import Mode
+from starid.attitude import ARCSEC_PER_RAD, Attitude
+
+COLUMNS: Final = (
+    "run_s", "unix_s", "frame", "mode", "valid",
+    "error_x", "error_y", "error_roll", "error_cross", "sigma_cross", "sigma_roll",
+    "rate_x", "rate_y", "rate_z", "true_rate_x", "true_rate_y", "true_rate_z",
+    "detected", "matched", "render_ms", "detect_ms", "identify_ms", "latency_ms",
+    "qx", "qy", "qz", "qw", "ra", "dec", "roll", "true_ra", "true_dec", "true_roll", "reason",
+)  # fmt: skip
+"""Columns of a row: times in seconds, errors and sigmas in arcseconds, rates in degrees/s, angles in degrees.
+
+`mode` is an index of `MODES`, `reason` one of the history's `reasons`. NaN stands for what is not known.
+"""
+
+MODES: Final = tuple(mode.value for mode in Mode)
+
+KEPT_ROWS: Final = 36_000
+"""Rows of the history: an hour at 10 Hz."""
+
+Numbers = npt.NDArray[np.float64]
+
+
+class History:
+    """The newest rows, oldest first, in memory of fixed size.
+
+    Parameters
+    ----------
+    kept
+        Largest number of rows.
+    """
+
+    def __init__(self, kept: int = KEPT_ROWS) -> None:
+        self._rows: Numbers = np.zeros((kept, len(COLUMNS)))
+        self._count = 0
+        self.reasons: list[str] = []
+        """Reasons that have occurred; the column `reason` is an index of this list."""
+
+    def add(self, measurement: Measurement) -> list[float]:
+        """Add the row of a measurement, and return it."""
+        row = self._row(measurement)
+        self._rows[self._count % len(self._rows)] = row
+        self._count += 1
+        return row
+
+    def __len__(self) -> int:
+        return min(self._count, len(self._rows))
+
+    def rows(self) -> Numbers:
+        """Return a copy of the rows (n, columns), oldest first."""
+        if self._count <= len(self._rows):
+            return self._rows[: self._count].copy()
+        return np.roll(self._rows, -(self._count % len(self._rows)), axis=0)
+
+    def _row(self, measurement: Measurement) -> list[float]:
+        result, truth = measurement.result, measurement.truth
+        if measurement.reason not in self.reasons:
+            self.reasons.append(measurement.reason)
+        error = measured = [math.nan] * 3
+        cross = sigma_cross = sigma_roll = math.nan
+        quaternion = [math.nan] * 4
+        if measurement.valid:
+            attitude = Attitude(np.array(result.quaternion_xyzw))
+            difference = attitude.error_to(truth.attitude)
+            error = (difference.rotation_vector_rad * ARCSEC_PER_RAD).tolist()
+            cross = difference.cross_boresight_arcsec
+            sigma_cross, sigma_roll = result.sigma_cross_arcsec, result.sigma_roll_arcsec
+            quaternion = attitude.quaternion_xyzw.tolist()
+            measured = [attitude.ra_deg, attitude.dec_deg, attitude.roll_deg]
+        rate = np.degrees(measurement.rate_rad_s).tolist() if measurement.rate_valid else [math.nan] * 3
+        return [
+            measurement.mid_ns / NANOSECONDS,
+            measurement.mid_unix_ns / NANOSECONDS,
+            measurement.counter,
+            MODES.index(measurement.mode.value),
+            measurement.valid,
+            *error,
+            cross,
+            sigma_cross,
+            sigma_roll,
+            *rate,
+            *np.degrees(truth.rate_rad_s).tolist(),
+            result.detected,
+            result.matched,
+            result.render_s * 1e3,
+            result.detect_s * 1e3,
+            result.identify_s * 1e3,
+            measurement.latency_s * 1e3,
+            *quaternion,
+            *measured,
+            truth.attitude.ra_deg,
+            truth.attitude.dec_deg,
+            truth.attitude.roll_deg,
+            self.reasons.index(measurement.reason),
+        ]
+
+
+def json_row(row: list[float]) -> list[float | None]:
+    """Return a row for JSON, which has no NaN."""
+    return [value if math.isfinite(value) else None for value in map(float, row)]
+
+
+def frame_content(measurement: Measurement, row: list[float]) -> dict[str, Any]:
+    """Return what a page draws over the image of a frame, as JSON data."""
+    preview = measurement.result.preview
+    content: dict[str, Any] = {
+        "row": json_row(row),
+        "reason": measurement.reason,
+        "mode": measurement.mode.value,
+        "late": measurement.late,
+        "rejected": measurement.result.refused,
+        "truth_status": measurement.truth.status.value,
+        "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),
+    }
+    if preview is not None:
+        content |= {
+            "width": preview.width,
+            "height": preview.height,
+            "detections": preview.detections,
+            "hips": preview.hips,
+            "catalogue": preview.catalogue,
+            "false_stars": preview.false_stars,
+            "bodies": [vars(body) for body in preview.bodies],
+            "covered": preview.covered,
+        }
+    return content

@@ -1,0 +1,279 @@
+"""The console as an OBC: telecommands and readings over a link, and the session they make."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol
+
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.values import FieldError, Value
+
+HOST_ADDRESS: Final = 253
+"""CAN address of the console as an OBC."""
+
+KEPT_STEPS: Final = 1000
+"""Newest transactions that can be saved as a session."""
+
+SHORTEST_WAIT_S: Final = 0.05
+"""Pauses from this one on become steps of a session."""
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Outcome of one request.
+
+    Attributes
+    ----------
+    outcome
+        `ok`, the name of an error code, or `no_reply`.
+    detail
+        The outcome in one line; empty if it is `ok`.
+    latency_s
+        Time from request to reply, seconds; None without a reply.
+    data
+        Data of the reply.
+    refused
+        Whether the device refused the request.
+    """
+
+    outcome: str
+    detail: str = ""
+    latency_s: float | None = None
+    data: bytes = b""
+    refused: bool = False
+
+
+class ObcClient(Protocol):
+    """An OBC on a link to the device."""
+
+    async def start(self) -> None:
+        """Open the link."""
+
+    async def close(self) -> None:
+        """Close the link."""
+
+    async def exchange(self, row: Row, data: bytes) -> Exchange:
+        """Send a telecommand, or request telemetry, and wait for the reply."""
+
+
+@dataclass(frozen=True)
+class ObcPort:
+    """Where an OBC finds the device.
+
+    Attributes
+    ----------
+    bus
+        `can`, `serial`, or empty for a unit that an OBC cannot speak to without CANopen.
+    where
+        Channel or port.
+    icd
+        Interface definition of the device.
+    device_address
+        Returns the device's present CAN address, which a telecommand may change.
+    dialect
+        Returns the present dialect of serial replies; None for a unit that has no dialects.
+    """
+
+    bus: Literal["can", "serial", ""]
+    where: str
+    icd: InterfaceDefinition
+    device_address: Callable[[], int]
+    dialect: Callable[[], Dialect | None]
+
+
+MakeClient = Callable[[ObcPort], ObcClient]
+"""Makes the OBC at a port."""
+
+
+@dataclass(frozen=True)
+class SentStep:
+    """A transaction as a step of a session."""
+
+    at_s: float
+    row: Row
+    data: bytes
+    values: Mapping[str, Value]
+    exchange: Exchange
+
+
+class ConsoleObc:
+    """Sends what a page asks for, and notes it.
+
+    Parameters
+    ----------
+    client
+        OBC on a link.
+    icd
+        Interface definition of the device.
+    """
+
+    def __init__(self, client: ObcClient, icd: InterfaceDefinition) -> None:
+        self.client = client
+        self._icd = icd
+        self._steps: deque[SentStep] = deque(maxlen=KEPT_STEPS)
+
+    @property
+    def steps(self) -> int:
+        """Number of noted transactions."""
+        return len(self._steps)
+
+    def clear(self) -> None:
+        """Forget the noted transactions."""
+        self._steps.clear()
+
+    def encode(self, name: str, values: Mapping[str, Any]) -> tuple[Row, bytes, dict[str, Value], str]:
+        """Encode a telecommand; limits are not enforced, as the device is to judge.
+
+        Returns
+        -------
+        row, data, values, problem
+            The row, its bytes, the values by field, and what the definition has against them; empty if nothing.
+
+        Raises
+        ------
+        EmulatorError
+            A value is not one that the field's type can hold.
+        """
+        row = self._row("telecommand", name)
+        try:
+            physical = {
+                key: parse_value(field, values[key])
+                for key, field in row.named_fields.items()
+                if values.get(key) not in (None, "")
+            }
+            data = row.encode(physical, check=False)
+        except (FieldError, ValueError) as error:
+            raise EmulatorError(str(error)) from None
+        try:
+            row.encode(physical)
+        except FieldError as error:
+            return row, data, physical, str(error)
+        return row, data, physical, ""
+
+    async def send(self, name: str, values: Mapping[str, Any]) -> Exchange:
+        """Send a telecommand.
+
+        Raises
+        ------
+        EmulatorError
+            A value cannot be encoded; nothing was sent.
+        """
+        row, data, physical, _ = self.encode(name, values)
+        return await self._exchange(row, data, physical)
+
+    async def read(self, name: str) -> tuple[Exchange, dict[str, Any]]:
+        """Read a telemetry row, and note it; return the outcome and the values by field."""
+        row = self._row("telemetry", name)
+        exchange = await self._exchange(row, b"", {})
+        return exchange, decode(row, exchange)
+
+    async def poll(self, name: str) -> tuple[Exchange, dict[str, Any]]:
+        """Read a telemetry row without noting it."""
+        row = self._row("telemetry", name)
+        exchange = await self.client.exchange(row, b"")
+        return exchange, decode(row, exchange)
+
+    async def _exchange(self, row: Row, data: bytes, values: Mapping[str, Value]) -> Exchange:
+        begin = time.monotonic()
+        exchange = await self.client.exchange(row, data)
+        self._steps.append(SentStep(begin, row, data, values, exchange))
+        return exchange
+
+    def _row(self, kind: str, name: str) -> Row:
+        rows = self._icd.telecommands if kind == "telecommand" else self._icd.telemetry
+        if name not in rows:
+            raise EmulatorError(f"{name}: no such {kind}")
+        return rows[name]
+
+    def session(self, title: str) -> str:
+        """Return the noted transactions as a session script (TOML); pauses between them become waits.
+
+        Raises
+        ------
+        EmulatorError
+            Nothing was sent.
+        """
+        if not self._steps:
+            raise EmulatorError("nothing was sent yet: send a telecommand or read a row first")
+        lines = [f"title = {toml(title)}", "", "[defaults]", "timeout_s = 2.0"]
+        before: float | None = None
+        for step in self._steps:
+            if before is not None and step.at_s - before >= SHORTEST_WAIT_S:
+                lines += ["", "[[step]]", f"wait_s = {step.at_s - before:.2f}"]
+            lines += ["", *_step_lines(step)]
+            before = step.at_s
+        return "\n".join(lines) + "\n"
+
+
+def _step_lines(step: SentStep) -> list[str]:
+    """Return the lines of one step."""
+    telecommand = step.row.kind == "telecommand"
+    lines = ["[[step]]", f"{'command' if telecommand else 'read'} = {toml(step.row.name)}"]
+    if telecommand and step.data:
+        if step.exchange.refused or any(isinstance(value, bytes) for value in step.values.values()):
+            lines.append(f"with_hex = {toml(step.data.hex().upper())}")
+        else:
+            pairs = ", ".join(f"{key} = {toml(value)}" for key, value in step.values.items())
+            lines.append(f"with = {{ {pairs} }}")
+    if step.exchange.refused:
+        lines.append(f"refused = {toml(step.exchange.outcome)}")
+    return lines
+
+
+def toml(value: Value) -> str:
+    """Return a value as TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return repr(value)
+    text = value.hex() if isinstance(value, bytes) else value
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def parse_value(field: Field, value: object) -> Value:
+    """Return what a page has given for a field, in the field's type.
+
+    Raises
+    ------
+    ValueError
+        The text is not of that type; the message names the field.
+    """
+    if field.kind == "flag":
+        return bool(value) if isinstance(value, (bool, int)) else str(value) == "true"
+    text = str(value).strip()
+    try:
+        if field.kind == "bytes":
+            return bytes.fromhex(text)
+        if field.kind == "text":
+            return text
+        if field.kind == "enum" and field.enum is not None and text in field.enum.values:
+            return text
+        try:
+            return int(text, 0)
+        except ValueError:
+            return float(text)
+    except ValueError:
+        kind = "bytes in hexadecimal" if field.kind == "bytes" else "a number"
+        raise ValueError(f"{field.name}: {text!r} is not {kind}") from None
+
+
+def decode(row: Row, exchange: Exchange) -> dict[str, Any]:
+    """Return the values of a telemetry reply by field, for JSON; empty without a reply that fits."""
+    if exchange.outcome != "ok" or len(exchange.data) != row.size:
+        return {}
+    return {key: json_value(value) for key, value in row.decode(exchange.data).items()}
+
+
+def json_value(value: Value) -> Any:
+    """Return a value for JSON: bytes in hexadecimal, None for a number that is not finite."""
+    if isinstance(value, bytes):
+        return value.hex(" ").upper()
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value

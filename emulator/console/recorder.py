@@ -1,0 +1,240 @@
+"""A recording of a run as an MCAP file: images, truth, measurements, telemetry and events."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import functools
+import json
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import IO, Any, Final
+
+from mcap.writer import CompressionType, Writer
+
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.console.history import COLUMNS, MODES, History, json_row
+from starhil.emulator.console.obc import ObcClient, decode
+from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.modes import Transition
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import log_internal_error
+
+log = logging.getLogger("starhil.record")
+
+MOST_PENDING: Final = 64
+"""Messages that may wait for the disk; more are dropped."""
+
+POLL_S: Final = 1.0
+"""Time in which every telemetry row is read once, seconds."""
+
+_TIME: Final = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+_TEXT: Final = {"type": "string"}
+_NUMBER: Final = {"type": "number"}
+
+
+def _numbers(*names: str) -> dict[str, Any]:
+    return {"type": "object", "properties": dict.fromkeys(names, _NUMBER)}
+
+
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+    "foxglove.CompressedImage": {
+        "timestamp": _TIME,
+        "frame_id": _TEXT,
+        "data": {"type": "string", "contentEncoding": "base64"},
+        "format": _TEXT,
+    },
+    "foxglove.FrameTransform": {
+        "timestamp": _TIME,
+        "parent_frame_id": _TEXT,
+        "child_frame_id": _TEXT,
+        "translation": _numbers("x", "y", "z"),
+        "rotation": _numbers("x", "y", "z", "w"),
+    },
+    "foxglove.Log": {
+        "timestamp": _TIME,
+        "level": {"type": "integer"},
+        "message": _TEXT,
+        "name": _TEXT,
+    },
+    "starhil.Measurement": dict.fromkeys(COLUMNS, _NUMBER)
+    | {"mode": _TEXT, "reason": _TEXT, "valid": {"type": "boolean"}},
+    "starhil.Telemetry": {},
+}
+"""Name of a schema → its properties. Foxglove knows the first three and draws them."""
+
+INFO: Final = 2
+"""Level of foxglove.Log."""
+
+
+class McapRecorder:
+    """Records a run; on a full disk the recording ends and the run goes on.
+
+    Parameters
+    ----------
+    emulation
+        The run, open.
+    client
+        OBC that reads the telemetry.
+    path
+        File to write.
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    EmulatorError
+        The file cannot be created, or exists and is not empty.
+    """
+
+    def __init__(
+        self, emulation: Emulation, client: ObcClient, path: Path, *, overwrite: bool = False
+    ) -> None:
+        self._emulation = emulation
+        self._client = client
+        self._path = path
+        self._history = History(1)
+        self._room = threading.Semaphore(MOST_PENDING)
+        self._ended = False
+        """Whether nothing more can be written."""
+        self.dropped = 0
+        """Messages that were dropped because the disk was too slow."""
+        self._task: asyncio.Task[None] | None = None
+        try:
+            if not overwrite and path.exists() and path.stat().st_size:
+                raise EmulatorError(
+                    f"recording {path}: exists and is not empty; choose another file, or replace it with --overwrite"
+                )
+            self._file: IO[bytes] = path.open("wb")
+        except OSError as error:
+            raise EmulatorError(
+                f"recording {path}: cannot be written ({error.strerror}); choose another file"
+            ) from None
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library="starhil")
+        self._schemas = {
+            name: self._writer.register_schema(
+                name=name,
+                encoding="jsonschema",
+                data=json.dumps({"title": name, "type": "object", "properties": properties}).encode(),
+            )
+            for name, properties in SCHEMAS.items()
+        }
+        self._channels: dict[str, int] = {}
+        self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
+
+    def start(self) -> None:
+        """Begin to record."""
+        emulation = self._emulation
+        emulation.imager.watchers.add(self)
+        emulation.device.on_frame.append(self._record_frame)
+        emulation.device.on_mode.append(self._record_mode)
+        self._task = asyncio.create_task(self._record_telemetry())
+
+    async def close(self) -> None:
+        """Write what is left, and the index of the file."""
+        self._emulation.imager.watchers.discard(self)
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        await asyncio.to_thread(self._disk.shutdown, wait=True)
+        self._on_disk(self._writer.finish)
+        self._ended = True
+        self._file.close()
+        if self.dropped:
+            log.warning(
+                "recording %s: %d messages were dropped; the disk was too slow", self._path, self.dropped
+            )
+
+    # --- what is recorded ---
+
+    def _record_frame(self, measurement: Measurement) -> None:
+        at_ns = measurement.mid_unix_ns
+        stamp = _stamp(at_ns)
+        preview = measurement.result.preview
+        if preview is not None:
+            data = base64.b64encode(preview.jpeg).decode()
+            image = {"timestamp": stamp, "frame_id": "sensor", "data": data, "format": "jpeg"}
+            self._write("/image", "foxglove.CompressedImage", at_ns, image)
+        quaternion = measurement.truth.attitude.quaternion_xyzw.tolist()
+        truth = {
+            "timestamp": stamp,
+            "parent_frame_id": "icrs",
+            "child_frame_id": "sensor",
+            "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
+            "rotation": dict(
+                zip("xyzw", [-quaternion[0], -quaternion[1], -quaternion[2], quaternion[3]], strict=True)
+            ),
+        }
+        self._write("/truth", "foxglove.FrameTransform", at_ns, truth)
+        row = dict(zip(COLUMNS, json_row(self._history.add(measurement)), strict=True))
+        values: dict[str, Any] = {**row, "valid": measurement.valid, "reason": measurement.reason}
+        values["mode"] = MODES[int(row["mode"] or 0)]
+        self._write("/measurement", "starhil.Measurement", at_ns, values)
+
+    def _record_mode(self, transition: Transition) -> None:
+        at_ns = self._emulation.device.time.unix_ns()
+        text = f"mode {transition.before.value} → {transition.after.value} ({transition.cause.value})"
+        content = {"timestamp": _stamp(at_ns), "level": INFO, "message": text, "name": "device"}
+        self._write("/events", "foxglove.Log", at_ns, content)
+
+    async def _record_telemetry(self) -> None:
+        """Read one telemetry row after the other."""
+        rows = list(self._emulation.device.icd.telemetry.values())
+        while True:
+            for row in rows:
+                try:
+                    exchange = await self._client.exchange(row, b"")
+                except Exception as error:  # noqa: BLE001 (the recording goes on without this row)
+                    log_internal_error(f"recording: {row.name}", error)
+                else:
+                    if values := decode(row, exchange):
+                        at_ns = self._emulation.device.time.unix_ns()
+                        self._write(f"/telemetry/{row.name}", "starhil.Telemetry", at_ns, values)
+                await asyncio.sleep(POLL_S / len(rows))
+
+    # --- the file ---
+
+    def _write(self, topic: str, schema: str, at_ns: int, content: dict[str, Any]) -> None:
+        """Hand a message to the disk's thread, unless too many wait there."""
+        if self._ended:
+            return
+        if not self._room.acquire(blocking=False):
+            self.dropped += 1
+            return
+        write = functools.partial(self._add, topic, schema, at_ns, content)
+        self._disk.submit(self._on_disk, write).add_done_callback(self._written)
+
+    def _written(self, _future: object) -> None:
+        self._room.release()
+
+    def _add(self, topic: str, schema: str, at_ns: int, content: dict[str, Any]) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(
+                topic=topic, message_encoding="json", schema_id=self._schemas[schema]
+            )
+        self._writer.add_message(
+            channel_id=self._channels[topic],
+            log_time=at_ns,
+            publish_time=at_ns,
+            data=json.dumps(content).encode(),
+        )
+
+    def _on_disk(self, action: Callable[[], object]) -> None:
+        """Write; the recording ends if that fails."""
+        if self._ended:
+            return
+        try:
+            action()
+        except OSError as error:
+            log.warning("recording %s: ends here (%s); the run goes on", self._path, error.strerror)
+            self._ended = True
+
+
+def _stamp(at_ns: int) -> dict[str, int]:
+    """Return a time as Foxglove has it."""
+    return {"sec": at_ns // NANOSECONDS, "nsec": at_ns % NANOSECONDS}

@@ -1,0 +1,109 @@
+"""Session and conformance runs that report their results here while they go on."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from starhil.emulator.errors import EmulatorError
+
+KEPT_RUNS: Final = 20
+KEPT_RESULTS: Final = 2000
+STATUSES: Final = ("passed", "failed", "skipped", "not run")
+
+
+@dataclass
+class Run:
+    """One run: what it is, and its results so far."""
+
+    run: str
+    kind: str
+    title: str
+    unit: str
+    planned: int
+    begin_s: float
+    results: list[dict[str, Any]] = field(default_factory=list)
+    end_s: float | None = None
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(STATUSES, 0))
+
+    def head(self) -> dict[str, Any]:
+        """Return everything but the results."""
+        content = vars(self).copy()
+        del content["results"]
+        return content
+
+
+class Runs:
+    """The newest runs.
+
+    Parameters
+    ----------
+    broadcast
+        Sends a message to every page.
+    """
+
+    def __init__(self, broadcast: Callable[[dict[str, Any]], None]) -> None:
+        self._broadcast = broadcast
+        self._runs: OrderedDict[str, Run] = OrderedDict()
+
+    def report(self, event: object) -> None:
+        """Note what a run reports: its begin, a result or its end.
+
+        Raises
+        ------
+        EmulatorError
+            The report is not one of these.
+        """
+        if not isinstance(event, dict) or not isinstance(event.get("run"), str):
+            raise EmulatorError("report: an object with `run` and `event` is needed")
+        match event.get("event"):
+            case "begin":
+                self._begin(event)
+            case "result":
+                self._result(event)
+            case "end":
+                run = self._find(event)
+                run.end_s = time.time()
+                self._broadcast({"type": "run", **run.head()})
+            case _:
+                raise EmulatorError("report: event must be begin, result or end")
+
+    def _begin(self, event: dict[str, Any]) -> None:
+        planned = event.get("planned")
+        run = Run(
+            run=str(event["run"])[:80],
+            kind=str(event.get("kind", ""))[:40],
+            title=str(event.get("title", ""))[:200],
+            unit=str(event.get("unit", ""))[:200],
+            planned=planned if isinstance(planned, int) else 0,
+            begin_s=time.time(),
+        )
+        self._runs[run.run] = run
+        while len(self._runs) > KEPT_RUNS:
+            self._runs.popitem(last=False)
+        self._broadcast({"type": "run", **run.head()})
+
+    def _result(self, event: dict[str, Any]) -> None:
+        run = self._find(event)
+        result = event.get("result")
+        if not isinstance(result, dict) or result.get("status") not in STATUSES:
+            raise EmulatorError(f"report: result needs a status, one of {', '.join(STATUSES)}")
+        run.counts[str(result["status"])] += 1
+        if len(run.results) < KEPT_RESULTS:
+            run.results.append(result)
+        self._broadcast({"type": "result", "run": run.run, "counts": run.counts, "result": result})
+
+    def _find(self, event: dict[str, Any]) -> Run:
+        run = self._runs.get(str(event["run"]))
+        if run is None:
+            raise EmulatorError("report: no such run; report its begin first")
+        return run
+
+    def messages(self) -> Iterator[str]:
+        """Yield the messages that tell a new page of all runs."""
+        for run in self._runs.values():
+            yield json.dumps({"type": "run", **run.head(), "results": run.results})

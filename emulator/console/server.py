@@ -1,0 +1,232 @@
+"""The console's HTTP server: the pages, their WebSocket, exports, and the reports of other programs' runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import json
+import logging
+import secrets
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from aiohttp import WSMsgType, web
+
+from starhil.emulator.console.console import Console
+from starhil.emulator.console.viewer import Viewer
+from starhil.emulator.errors import EmulatorError
+from starhil.protocol.errors import reason
+
+log = logging.getLogger("starhil.console")
+
+STATIC: Final = Path(__file__).resolve().parent / "static"
+
+LARGEST_MESSAGE: Final = 1 << 16
+"""Longest message that a page may send, bytes."""
+
+LARGEST_REPORT: Final = 1 << 20
+"""Longest report of a run, bytes."""
+
+MOST_REQUESTS: Final = 16
+"""Requests of a page that may be under way at a time."""
+
+HEARTBEAT_S: Final = 20.0
+"""Time after which a page that does not answer is disconnected, seconds."""
+
+MOST_VIEWERS: Final = 32
+
+HEADERS: Final = {
+    "Cache-Control": "no-cache",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class ConsoleServer:
+    """Serves a console at an address that holds a token.
+
+    Parameters
+    ----------
+    console
+        Console, started.
+    token
+        Token that every page must know; by default a random one.
+    """
+
+    def __init__(self, console: Console, token: str | None = None) -> None:
+        self._console = console
+        self.token = secrets.token_urlsafe(18) if token is None else token
+        self._runner: web.AppRunner | None = None
+
+    async def start(self, where: str) -> str:
+        """Listen at `auto` (the loopback interface, a free port) or HOST:PORT; return the page's address.
+
+        Raises
+        ------
+        EmulatorError
+            The port is in use, or `where` is not an address.
+        """
+        host, port = parse_address(where)
+        app = web.Application(middlewares=[self._guard], client_max_size=LARGEST_REPORT)
+        app.router.add_get("/", _page("index.html"))
+        app.router.add_get("/runs", _page("runs.html"))
+        app.router.add_get("/ws", self._socket)
+        app.router.add_get("/session.toml", self._session)
+        app.router.add_get("/wire.log", self._wire_log)
+        app.router.add_post("/runs", self._report)
+        app.router.add_static("/static", STATIC)
+        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5)
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, host, port)
+        try:
+            await site.start()
+        except (OSError, UnicodeError) as error:
+            await self.close()
+            raise EmulatorError(
+                f"--view {where}: cannot listen ({reason(error)}); choose another port, or auto"
+            ) from None
+        bound = self._runner.addresses[0]
+        name = f"[{bound[0]}]" if ":" in bound[0] else bound[0]
+        return f"http://{name}:{bound[1]}/?token={self.token}"
+
+    async def close(self) -> None:
+        """Stop listening and close all connections."""
+        if self._runner is not None:
+            await self._runner.cleanup()
+            self._runner = None
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Reject other origins and, but for the files of the page itself, requests without the token."""
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != request.host:
+            return web.Response(
+                status=403, text="403: this page belongs to another origin\n", headers=HEADERS
+            )
+        if not request.path.startswith("/static/") and not self._token_is_valid(request):
+            text = (
+                "403: the token in the address is missing or wrong; the ready line of `starhil run` has it\n"
+            )
+            return web.Response(status=403, text=text, headers=HEADERS)
+        try:
+            response = await handler(request)
+        except EmulatorError as error:
+            return web.Response(status=400, text=f"{error}\n", headers=HEADERS)
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    def _token_is_valid(self, request: web.Request) -> bool:
+        return hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode())
+
+    async def _session(self, _request: web.Request) -> web.Response:
+        return _download(
+            self._console.obc.session("Recorded in the console"), "session.toml", "application/toml"
+        )
+
+    async def _wire_log(self, _request: web.Request) -> web.Response:
+        return _download(self._console.trace.candump(), "wire.log", "text/plain")
+
+    async def _report(self, request: web.Request) -> web.Response:
+        try:
+            event = json.loads(await request.text())
+        except (ValueError, RecursionError):
+            raise EmulatorError("report: not JSON") from None
+        self._console.runs.report(event)
+        return web.json_response({"ok": True})
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        """Connect a page: what it asks for is answered, and what it has subscribed to is sent."""
+        if len(self._console.viewers) >= MOST_VIEWERS:
+            return web.Response(status=503, text=f"503: {MOST_VIEWERS} pages are open already\n")
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
+        await socket.prepare(request)
+        viewer = Viewer(socket)
+        history = await self._console.welcome(viewer)
+        tasks: set[asyncio.Task[None]] = set()
+        try:
+            await viewer.flush()
+            await socket.send_bytes(b"H" + bytes(7) + history)
+            self._console.join(viewer)
+            tasks.add(asyncio.create_task(_pump(viewer, socket)))
+            await self._receive(socket, viewer, tasks)
+        except ConnectionError:
+            pass  # the page has gone
+        finally:
+            self._console.leave(viewer)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        return socket
+
+    async def _receive(
+        self, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
+    ) -> None:
+        """Execute the requests of a page until it closes."""
+        async for message in socket:
+            if message.type is not WSMsgType.TEXT:
+                continue
+            try:
+                request = json.loads(message.data)
+            except (ValueError, RecursionError):
+                request = None
+            if not isinstance(request, dict):
+                viewer.send(
+                    json.dumps({"type": "answer", "id": None, "ok": False, "error": "not a JSON object"})
+                )
+                continue
+            if len(tasks) > MOST_REQUESTS:
+                error = f"more than {MOST_REQUESTS} requests at a time"
+                viewer.send(
+                    json.dumps({"type": "answer", "id": request.get("id"), "ok": False, "error": error})
+                )
+                continue
+            task = asyncio.create_task(self._answer(viewer, request))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
+
+    async def _answer(self, viewer: Viewer, request: dict[str, object]) -> None:
+        viewer.send(json.dumps(await self._console.answer(viewer, request)))
+
+
+async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:
+    """Send what is queued for a page until it has gone."""
+    with contextlib.suppress(ConnectionError):
+        await viewer.pump()
+    await socket.close()
+
+
+def _page(name: str) -> Handler:
+    async def page(_request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(STATIC / name)
+
+    return page
+
+
+def _download(text: str, name: str, kind: str) -> web.Response:
+    return web.Response(
+        text=text, content_type=kind, headers={"Content-Disposition": f'attachment; filename="{name}"'}
+    )
+
+
+def parse_address(where: str) -> tuple[str, int]:
+    """Return host and port of `auto` or HOST:PORT.
+
+    Raises
+    ------
+    EmulatorError
+        It is neither.
+    """
+    if where == "auto":
+        return "127.0.0.1", 0
+    host, _, port = where.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise EmulatorError(f"--view {where}: must be auto or HOST:PORT")
+    return host.strip("[]"), int(port)

@@ -1,0 +1,69 @@
+// Numbers as text of fixed width, so that nothing jumps when they change.
+
+const MINUS = "−";
+
+export function fixed(value, digits, width = 0) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–".padStart(width);
+  const text = Math.abs(value).toFixed(digits);
+  const sign = value < 0 && Number(text) !== 0 ? MINUS : "";
+  return (sign + text).padStart(width);
+}
+
+export function duration(seconds) {
+  const whole = Math.floor(Math.abs(seconds));
+  const part = (n) => String(n).padStart(2, "0");
+  const tenth = Math.floor((Math.abs(seconds) - whole) * 10);
+  return `${part(Math.floor(whole / 3600))}:${part(Math.floor(whole / 60) % 60)}:${part(whole % 60)}.${tenth}`;
+}
+
+export function utc(seconds) {
+  if (!Number.isFinite(seconds)) return "–";
+  return new Date(seconds * 1000).toISOString().slice(0, 19).replace("T", " ");
+}
+
+export function wall(seconds) {
+  const date = new Date(seconds * 1000);
+  return date.toTimeString().slice(0, 8) + "." + String(date.getMilliseconds()).padStart(3, "0");
+}
+
+// A telemetry value in no more than 14 characters.
+export function value(item, field) {
+  if (item === null || item === undefined) return "–";
+  if (typeof item === "boolean") return item ? "yes" : "no";
+  if (typeof item !== "number") return String(item);
+  if (Number.isInteger(item) && (!field || field.kind !== "float")) return String(item).replace("-", MINUS);
+  const size = Math.abs(item);
+  if (size !== 0 && (size < 1e-4 || size >= 1e10)) return item.toExponential(5).replace(/-/g, MINUS);
+  const digits = size >= 1e6 ? 3 : size >= 100 ? 4 : 7;
+  return fixed(item, digits);
+}
+
+export function limits(field) {
+  if (field.values) return `${field.values.length} values`;
+  if (field.min === undefined) return "";
+  return `${short(field.min)} … ${short(field.max)}`;
+}
+
+export function short(number) {
+  if (number === null || number === undefined) return "";
+  const text = Number.isInteger(number) ? String(number) : String(Number(number.toPrecision(6)));
+  return text.replace("-", MINUS);
+}
+
+// An element with attributes, listeners (on…) and children.
+export function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, item] of Object.entries(attributes)) {
+    if (item === undefined || item === null || item === false) continue;
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), item);
+    else if (name === "class") element.className = item;
+    else if (name === "text") element.textContent = item;
+    else element.setAttribute(name, item === true ? "" : item);
+  }
+  element.append(...children);
+  return element;
+}
+
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}

@@ -1,0 +1,367 @@
+// The image of the sensor with what was found in it, and what should have been.
+
+import { fixed, setText } from "./format.js";
+import { colour, onTheme, pen } from "./theme.js";
+
+const HOVER_PX = 14;
+const MOST_ZOOM = 16;
+
+export class Sky {
+  constructor(store) {
+    this.store = store;
+    this.image = document.getElementById("image");
+    this.overlay = document.getElementById("overlay");
+    this.stage = this.image.parentElement;
+    this.hover = document.getElementById("hover");
+    this.layers = { detections: true, identified: true, missing: true, bodies: true };
+    this.zoom = 1;
+    this.offset = [0, 0]; // image pixels at the top left
+    this.bitmap = null;
+    this.shown = null;
+    this.pointer = null;
+    this.decoding = false;
+    this.painted = 0; // images drawn since the page was opened
+    store.on("shown", () => this.show());
+    onTheme(() => this.draw());
+    new ResizeObserver(() => this.resize()).observe(this.stage);
+    this.listen();
+  }
+
+  listen() {
+    for (const button of document.querySelectorAll("[data-layer]")) {
+      button.addEventListener("click", () => this.toggle(button.dataset.layer));
+    }
+    const stretch = document.getElementById("stretch");
+    const apply = () => (this.image.style.filter = `brightness(${stretch.value})`);
+    stretch.addEventListener("input", apply);
+    apply();
+    document.getElementById("zoom-reset").addEventListener("click", () => this.reset());
+    this.stage.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoomAt(event.offsetX, event.offsetY, Math.exp(-event.deltaY / 400));
+    }, { passive: false });
+    this.stage.addEventListener("pointerdown", (event) => {
+      this.drag = [event.clientX, event.clientY, ...this.offset];
+      this.stage.setPointerCapture(event.pointerId);
+    });
+    this.stage.addEventListener("pointerup", () => (this.drag = null));
+    this.stage.addEventListener("pointermove", (event) => {
+      if (this.drag) {
+        const scale = this.scale();
+        this.offset = [this.drag[2] - (event.clientX - this.drag[0]) / scale, this.drag[3] - (event.clientY - this.drag[1]) / scale];
+        this.draw();
+      }
+      const box = this.stage.getBoundingClientRect();
+      this.pointer = [event.clientX - box.left, event.clientY - box.top];
+      this.point();
+    });
+    this.stage.addEventListener("pointerleave", () => {
+      this.pointer = null;
+      this.hover.hidden = true;
+    });
+  }
+
+  toggle(layer) {
+    this.layers[layer] = !this.layers[layer];
+    document.querySelector(`[data-layer="${layer}"]`).classList.toggle("on", this.layers[layer]);
+    this.draw();
+  }
+
+  reset() {
+    this.zoom = 1;
+    this.offset = [0, 0];
+    this.draw();
+  }
+
+  zoomAt(x, y, factor) {
+    const before = this.scale();
+    this.zoom = Math.min(Math.max(this.zoom * factor, 1), MOST_ZOOM);
+    const after = this.scale();
+    this.offset[0] += x / before - x / after;
+    this.offset[1] += y / before - y / after;
+    this.draw();
+  }
+
+  zoomCentre(factor) {
+    this.zoomAt(this.stage.clientWidth / 2, this.stage.clientHeight / 2, factor);
+  }
+
+  resize() {
+    const ratio = window.devicePixelRatio || 1;
+    for (const canvas of [this.image, this.overlay]) {
+      canvas.width = Math.round(this.stage.clientWidth * ratio);
+      canvas.height = Math.round(this.stage.clientHeight * ratio);
+    }
+    this.draw();
+  }
+
+  // Screen pixels per image pixel.
+  scale() {
+    const head = this.shown && this.shown.head;
+    if (!head || !head.width) return 1;
+    return Math.min(this.stage.clientWidth / head.width, this.stage.clientHeight / head.height) * this.zoom;
+  }
+
+  // Decode the image to show; while one is decoded, later ones wait and only the newest is taken.
+  async show() {
+    if (this.decoding) return;
+    const image = this.store.image;
+    document.getElementById("no-frame").hidden = Boolean(image);
+    if (!image || image === this.shown) return;
+    this.decoding = true;
+    try {
+      const bitmap = await createImageBitmap(image.blob);
+      if (this.bitmap) this.bitmap.close();
+      this.bitmap = bitmap;
+      this.shown = image;
+      this.painted += 1;
+      this.draw();
+    } finally {
+      this.decoding = false;
+    }
+    if (this.store.image !== image) this.show();
+  }
+
+  limitOffset(head, scale) {
+    for (const [axis, size, room] of [[0, head.width, this.stage.clientWidth], [1, head.height, this.stage.clientHeight]]) {
+      const seen = room / scale;
+      this.offset[axis] = seen >= size ? (size - seen) / 2 : Math.min(Math.max(this.offset[axis], 0), size - seen);
+    }
+  }
+
+  // From image pixels, whose centres are integers, to the screen.
+  place(x, y) {
+    const scale = this.scale();
+    return [(x + 0.5 - this.offset[0]) * scale, (y + 0.5 - this.offset[1]) * scale];
+  }
+
+  draw() {
+    const ratio = window.devicePixelRatio || 1;
+    const base = this.image.getContext("2d");
+    base.setTransform(1, 0, 0, 1, 0, 0);
+    base.clearRect(0, 0, this.image.width, this.image.height);
+    const marks = this.overlay.getContext("2d");
+    marks.setTransform(1, 0, 0, 1, 0, 0);
+    marks.clearRect(0, 0, this.overlay.width, this.overlay.height);
+    if (!this.shown || !this.bitmap) return;
+    const { head } = this.shown;
+    const scale = this.scale();
+    this.limitOffset(head, scale);
+    base.imageSmoothingEnabled = scale < 3;
+    base.imageSmoothingQuality = "high";
+    base.setTransform(ratio, 0, 0, ratio, 0, 0);
+    base.drawImage(this.bitmap, -this.offset[0] * scale, -this.offset[1] * scale, head.width * scale, head.height * scale);
+    marks.setTransform(ratio, 0, 0, ratio, 0, 0);
+    setText(document.getElementById("zoom"), `${this.zoom.toFixed(1)}×`);
+    if (this.layers.bodies) this.drawBodies(marks, head);
+    this.drawStars(marks, head);
+    if (this.layers.bodies) this.drawRate(marks, head);
+    this.point();
+  }
+
+  drawBodies(context, head) {
+    context.lineWidth = 1.5 * pen();
+    for (const polygon of head.covered || []) {
+      if (!polygon.length) continue;
+      context.beginPath();
+      for (const corner of polygon) context.lineTo(...this.place(...corner));
+      context.closePath();
+      context.fillStyle = this.hatch(context, colour("on-sky-bad"));
+      context.fill();
+      context.strokeStyle = colour("on-sky-bad");
+      context.stroke();
+    }
+    context.strokeStyle = context.fillStyle = colour("on-sky-body");
+    context.font = this.font();
+    for (const body of head.bodies || []) {
+      let label = null;
+      context.beginPath();
+      let drawing = false;
+      for (const point of body.outline_px) {
+        if (!point) {
+          drawing = false;
+          continue;
+        }
+        const [x, y] = this.place(...point);
+        const inside = x > 0 && y > 0 && x < this.stage.clientWidth && y < this.stage.clientHeight;
+        if (inside && (!label || y < label[1])) label = [x, y];
+        if (drawing) context.lineTo(x, y);
+        else context.moveTo(x, y);
+        drawing = true;
+      }
+      context.stroke();
+      if (label) context.fillText(body.name, Math.min(label[0] + 6, this.stage.clientWidth - 50), Math.max(label[1] - 6, 14));
+    }
+    context.strokeStyle = colour("on-sky-bad");
+    for (const [x, y] of head.false_stars || []) {
+      const [px, py] = this.place(x, y);
+      context.beginPath();
+      const arm = 5 * pen();
+      context.moveTo(px - arm, py - arm);
+      context.lineTo(px + arm, py + arm);
+      context.moveTo(px + arm, py - arm);
+      context.lineTo(px - arm, py + arm);
+      context.stroke();
+    }
+  }
+
+  hatch(context, stroke) {
+    const tile = document.createElement("canvas");
+    tile.width = tile.height = 10;
+    const pen = tile.getContext("2d");
+    pen.strokeStyle = stroke;
+    pen.globalAlpha = 0.45;
+    pen.beginPath();
+    pen.moveTo(0, 10);
+    pen.lineTo(10, 0);
+    pen.stroke();
+    return context.createPattern(tile, "repeat");
+  }
+
+  font() {
+    return `${Math.max(11, this.stage.clientWidth / 48)}px system-ui, sans-serif`;
+  }
+
+  drawStars(context, head) {
+    const names = this.store.hello.star_names;
+    const size = Math.max(5, this.stage.clientWidth / 110);
+    const found = new Set(head.hips);
+    context.font = this.font();
+    context.lineWidth = 1.4 * pen();
+    const labels = [];
+    const unmatched = colour("on-sky-detected");
+    const matched = colour("on-sky-identified");
+    (head.detections || []).forEach(([x, y, magnitude], number) => {
+      const hip = head.hips[number];
+      const [px, py] = this.place(x, y);
+      if (hip && this.layers.identified) {
+        context.strokeStyle = matched;
+        context.beginPath();
+        context.arc(px, py, size, 0, 2 * Math.PI);
+        context.stroke();
+        if (names[hip] && (magnitude < 2.6 || this.zoom > 2)) labels.push([names[hip], px, py]);
+      } else if (this.layers.detections) {
+        context.strokeStyle = unmatched;
+        context.globalAlpha = hip ? 1 : 0.7;
+        const half = hip ? size * 0.62 : Math.max(2, size * 0.36);
+        context.strokeRect(px - half, py - half, 2 * half, 2 * half);
+        context.globalAlpha = 1;
+      }
+    });
+    this.drawLabels(context, labels, size, matched);
+    if (!this.layers.missing || !head.catalogue) return;
+    context.strokeStyle = colour("on-sky-missing");
+    context.setLineDash([2, 3]);
+    for (const star of missing(head, found)) {
+      const [px, py] = this.place(star[1], star[2]);
+      context.beginPath();
+      context.arc(px, py, size * 1.15, 0, 2 * Math.PI);
+      context.stroke();
+    }
+    context.setLineDash([]);
+  }
+
+  // Names beside their stars, brightest first; one that finds no room is left out.
+  drawLabels(context, labels, size, ink) {
+    const height = parseFloat(context.font);
+    const taken = [];
+    for (const [text, x, y] of labels) {
+      const width = context.measureText(text).width;
+      const places = [[x + size + 3, y + height / 3], [x - size - 3 - width, y + height / 3], [x - width / 2, y - size - 4], [x - width / 2, y + size + height]];
+      for (const [left, base] of places) {
+        const box = [left, base - height, left + width, base + 2];
+        const inside = box[0] >= 0 && box[2] <= this.stage.clientWidth && box[1] >= 0 && box[3] <= this.stage.clientHeight;
+        if (!inside || taken.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
+        taken.push(box);
+        this.label(context, text, left, base, ink);
+        break;
+      }
+    }
+  }
+
+  label(context, text, x, y, ink) {
+    context.lineWidth = 3 * pen();
+    context.strokeStyle = "rgba(5, 8, 12, 0.8)";
+    context.strokeText(text, x, y);
+    context.fillStyle = ink;
+    context.fillText(text, x, y);
+    context.lineWidth = 1.4 * pen();
+  }
+
+  // Where the boresight moves to: with the body rate ω it moves by ω × z = (ω_y, −ω_x).
+  drawRate(context, head) {
+    const { index } = this.store.rows;
+    const [x, y, z] = ["true_rate_x", "true_rate_y", "true_rate_z"].map((name) => head.row[index[name]]);
+    const speed = Math.hypot(x, y);
+    const centre = this.place(head.width / 2, head.height / 2);
+    const ink = colour("on-sky-rate");
+    context.strokeStyle = context.fillStyle = ink;
+    const size = pen();
+    context.lineWidth = 2 * size;
+    context.beginPath();
+    context.moveTo(centre[0] - 7 * size, centre[1]);
+    context.lineTo(centre[0] + 7 * size, centre[1]);
+    context.moveTo(centre[0], centre[1] - 7 * size);
+    context.lineTo(centre[0], centre[1] + 7 * size);
+    context.stroke();
+    if (speed > 1e-3) {
+      const length = this.stage.clientWidth * 0.06 * (1 + Math.log10(1 + speed * 20));
+      const [ux, uy] = [y / speed, -x / speed];
+      const tip = [centre[0] + ux * length, centre[1] + uy * length];
+      context.beginPath();
+      context.moveTo(...centre);
+      context.lineTo(...tip);
+      context.lineTo(tip[0] - size * (8 * ux + 5 * uy), tip[1] - size * (8 * uy - 5 * ux));
+      context.moveTo(...tip);
+      context.lineTo(tip[0] - size * (8 * ux - 5 * uy), tip[1] - size * (8 * uy + 5 * ux));
+      context.stroke();
+    }
+    if (speed > 1e-3 || Math.abs(z) > 1e-3) {
+      this.label(context, `${fixed(Math.hypot(speed, z), 3)} °/s`, centre[0] + 12 * size, centre[1] + 20 * size, ink);
+    }
+  }
+
+  // Say what is under the pointer.
+  point() {
+    if (!this.pointer || !this.shown) return;
+    const { head } = this.shown;
+    const names = this.store.hello.star_names;
+    let best = HOVER_PX;
+    let text = "";
+    const near = (x, y, say) => {
+      const [px, py] = this.place(x, y);
+      const distance = Math.hypot(px - this.pointer[0], py - this.pointer[1]);
+      if (distance < best) {
+        best = distance;
+        text = say();
+      }
+    };
+    const magnitudes = new Map((head.catalogue || []).map((star) => [star[0], star[3]]));
+    (head.detections || []).forEach(([x, y, magnitude, snr], number) => {
+      const hip = head.hips[number];
+      near(x, y, () => {
+        const measured = `measured ${fixed(magnitude, 2)} mag, SNR ${fixed(snr, 0)}\nx ${fixed(x, 2)}  y ${fixed(y, 2)}`;
+        if (!hip) return `not identified\n${measured}`;
+        return `${names[hip] ? names[hip] + "  " : ""}HIP ${hip}  V ${fixed(magnitudes.get(hip), 2)}\n${measured}`;
+      });
+    });
+    for (const star of missing(head, new Set(head.hips))) {
+      near(star[1], star[2], () => `missing: ${names[star[0]] || ""} HIP ${star[0]}  V ${fixed(star[3], 2)}`);
+    }
+    for (const [x, y] of head.false_stars || []) near(x, y, () => "false star");
+    this.hover.hidden = !text;
+    if (!text) return;
+    this.hover.textContent = text;
+    const left = Math.min(this.pointer[0] + 14, this.stage.clientWidth - this.hover.offsetWidth - 4);
+    const top = Math.min(this.pointer[1] + 14, this.stage.clientHeight - this.hover.offsetHeight - 4);
+    this.hover.style.transform = `translate(${left}px, ${top}px)`;
+  }
+}
+
+// Catalogue stars that were not identified though no fainter than most that were, or than V 4 if none was.
+function missing(head, found) {
+  const matched = (head.catalogue || []).filter((star) => found.has(star[0])).map((star) => star[3]);
+  matched.sort((a, b) => a - b);
+  const limit = matched.length >= 4 ? matched[Math.floor(0.5 * matched.length)] : 4;
+  return (head.catalogue || []).filter((star) => star[3] <= limit && !found.has(star[0]));
+}

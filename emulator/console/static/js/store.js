@@ -1,0 +1,167 @@
+// What the page knows: the description of the run, the numbers of the last hour, and images of it.
+
+const KEPT_ROWS = 36000;
+const RECENT_S = 60; // every image of the last minute is kept …
+const SPARSE_S = 5; // … and one in five seconds of the last hour
+const KEPT_S = 3600;
+
+// Rows of numbers by column, in arrays that hold the newest rows at their end.
+class Rows {
+  constructor(columns) {
+    this.index = Object.fromEntries(columns.map((name, number) => [name, number]));
+    this.width = columns.length;
+    this.data = columns.map(() => new Float64Array(2 * KEPT_ROWS));
+    this.start = 0;
+    this.end = 0;
+  }
+
+  push(row) {
+    if (this.end === 2 * KEPT_ROWS) {
+      for (const column of this.data) column.copyWithin(0, KEPT_ROWS, 2 * KEPT_ROWS);
+      this.end = KEPT_ROWS;
+      this.start = 0;
+    }
+    for (let number = 0; number < this.width; number++) {
+      const item = row[number];
+      this.data[number][this.end] = item === null ? NaN : item;
+    }
+    this.end += 1;
+    if (this.end - this.start > KEPT_ROWS) this.start += 1;
+  }
+
+  get length() {
+    return this.end - this.start;
+  }
+
+  column(name) {
+    return this.data[this.index[name]];
+  }
+
+  at(position, name) {
+    return this.data[this.index[name]][position];
+  }
+
+  // Position of the last row at or before a time.
+  find(time) {
+    const times = this.column("run_s");
+    let low = this.start;
+    let high = this.end;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (times[middle] <= time) low = middle + 1;
+      else high = middle;
+    }
+    return Math.max(low - 1, this.start);
+  }
+}
+
+export class Store {
+  constructor() {
+    this.hello = null;
+    this.rows = null;
+    this.reasons = [];
+    this.images = []; // {time, head, blob}, oldest first
+    this.status = null;
+    this.truth = null;
+    this.events = [];
+    this.cursor = null; // run time shown; null: live
+    this.listeners = new Map();
+  }
+
+  on(what, listener) {
+    if (!this.listeners.has(what)) this.listeners.set(what, []);
+    this.listeners.get(what).push(listener);
+  }
+
+  emit(what, item) {
+    for (const listener of this.listeners.get(what) || []) listener(item);
+  }
+
+  message(message) {
+    switch (message.type) {
+      case "hello":
+        this.hello = message;
+        this.rows = new Rows(message.columns);
+        this.images = [];
+        break;
+      case "reasons":
+        this.reasons = message.reasons;
+        break;
+      case "status":
+        this.status = message.status;
+        this.truth = message.truth;
+        break;
+      case "event":
+        this.events.push(message);
+        if (this.events.length > 500) this.events.shift();
+        break;
+    }
+    this.emit(message.type, message);
+  }
+
+  history(numbers) {
+    const width = this.hello.columns.length;
+    for (let start = 0; start + width <= numbers.length; start += width) {
+      this.rows.push(numbers.subarray(start, start + width));
+    }
+    this.emit("rows");
+  }
+
+  frame(head, blob) {
+    if (!this.rows) return;
+    this.rows.push(head.row);
+    const time = head.row[this.rows.index.run_s];
+    if (blob) {
+      this.images.push({ time, head, blob });
+      this.thin(time);
+    }
+    this.emit("rows");
+    if (this.cursor === null) this.emit("shown");
+  }
+
+  thin(now) {
+    const kept = [];
+    let last = -Infinity;
+    for (const image of this.images) {
+      const age = now - image.time;
+      if (age > KEPT_S || age < 0) continue;
+      if (age > RECENT_S && image.time - last < SPARSE_S) continue;
+      last = image.time;
+      kept.push(image);
+    }
+    this.images = kept;
+  }
+
+  get now() {
+    return this.rows && this.rows.length ? this.rows.at(this.rows.end - 1, "run_s") : 0;
+  }
+
+  // Position of the row that is shown.
+  get position() {
+    if (!this.rows || !this.rows.length) return -1;
+    return this.cursor === null ? this.rows.end - 1 : this.rows.find(this.cursor);
+  }
+
+  // The image nearest to what is shown.
+  get image() {
+    const { images } = this;
+    if (!images.length) return null;
+    if (this.cursor === null) return images[images.length - 1];
+    let best = images[0];
+    for (const image of images) if (Math.abs(image.time - this.cursor) < Math.abs(best.time - this.cursor)) best = image;
+    return best;
+  }
+
+  scrub(time) {
+    this.cursor = time === null || !this.rows || !this.rows.length ? null : Math.min(Math.max(time, this.rows.at(this.rows.start, "run_s")), this.now);
+    this.emit("cursor");
+    this.emit("shown");
+  }
+
+  // Move by frames.
+  step(count) {
+    if (!this.rows || !this.rows.length) return;
+    const position = Math.min(Math.max(this.position + count, this.rows.start), this.rows.end - 1);
+    this.scrub(this.rows.at(position, "run_s"));
+  }
+}

@@ -1,0 +1,30 @@
+// Dark or light, as the system has it unless the user has chosen.
+
+const listeners = [];
+
+export function initTheme(button) {
+  const saved = localStorage.getItem("starhil-theme");
+  const system = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
+  document.documentElement.dataset.theme = saved || system;
+  button.addEventListener("click", toggleTheme);
+}
+
+export function toggleTheme() {
+  const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+  document.documentElement.dataset.theme = next;
+  localStorage.setItem("starhil-theme", next);
+  for (const listener of listeners) listener();
+}
+
+export function onTheme(listener) {
+  listeners.push(listener);
+}
+
+export function colour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+}
+
+// Line widths and marks follow the size of the type, so that they can be seen on a large screen too.
+export function pen() {
+  return Math.max(1, parseFloat(getComputedStyle(document.documentElement).fontSize) / 12.5);
+}

@@ -1,0 +1,114 @@
+// The true attitude: fixed, rate, slew to a direction or a star, a file or a feed; and the stepped clock.
+
+import { duration, fixed, make, setText } from "./format.js";
+
+export class Truth {
+  constructor(store, link) {
+    this.store = store;
+    this.link = link;
+    this.host = document.getElementById("truth");
+    store.on("hello", (hello) => this.build(hello));
+    store.on("status", (message) => this.update(message));
+  }
+
+  build(hello) {
+    this.now = make("table", { class: "facts" });
+    this.outcome = make("p", { class: "problem" });
+    const stars = make("datalist", { id: "star-names" }, ...Object.values(hello.star_names).sort().map((name) => make("option", { value: name })));
+    const slew = this.form("slew", "slew", [["star", "", "or a direction:", "star-names"], ["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "° (as now if empty)"], ["max_rate_deg_s", "0.5", "°/s"]], (values) => {
+      const { max_rate_deg_s: rate, ...to } = values;
+      return this.link.request({ do: "slew", to, max_rate_deg_s: rate });
+    });
+    const rate = this.form("rate", "turn", [["x", "0", "°/s"], ["y", "0", "°/s"], ["z", "0", "°/s"]], async (values) => {
+      const truth = await this.link.control({ do: "truth" });
+      if (!truth.ok) return truth;
+      return this.set({ kind: "rate", attitude: { quaternion_xyzw: truth.quaternion_xyzw }, rate_deg_s: [values.x || 0, values.y || 0, values.z || 0] });
+    });
+    const still = this.form("fixed", "stand still", [["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "°"]], async (values) => {
+      if (values.ra_deg === undefined) {
+        const truth = await this.link.control({ do: "truth" });
+        return truth.ok ? this.set({ kind: "fixed", attitude: { quaternion_xyzw: truth.quaternion_xyzw } }) : truth;
+      }
+      return this.set({ kind: "fixed", attitude: values });
+    });
+    const json = make("textarea", { rows: "3", spellcheck: "false", "aria-label": "truth as JSON" });
+    json.value = '{"kind": "live", "protocol": "udp", "port": 0}';
+    const other = make("fieldset", {}, make("legend", { text: "file, feed or sequence: the keys of [truth], as JSON" }), json, make("button", {
+      type: "button", text: "use", onclick: () => {
+        try {
+          this.answer(this.set(JSON.parse(json.value)));
+        } catch (error) {
+          setText(this.outcome, `not JSON: ${error.message}`);
+        }
+      },
+    }));
+    this.host.replaceChildren(stars, this.now, this.outcome, make("div", { class: "scroll" }, ...this.clock(hello), slew, rate, still, other));
+  }
+
+  // Controls of the stepped clock.
+  clock(hello) {
+    this.speed = null;
+    if (hello.clock !== "stepped") return [];
+    const seconds = make("input", { value: "0.2", inputmode: "decimal", name: "step" });
+    this.speed = make("input", { value: "1", inputmode: "decimal", name: "speed" });
+    this.running = make("button", { type: "button", id: "run-clock", text: "run", onclick: () => this.toggleClock() });
+    return [
+      make("fieldset", {}, make("legend", { text: "stepped clock" }), make("div", { class: "bar" },
+        make("button", { type: "button", id: "step", text: "step", title: "s", onclick: () => this.step(Number(seconds.value)) }), seconds, make("span", { class: "dim", text: "s" }),
+        make("span", { class: "spacer" }), this.running, this.speed, make("span", { class: "dim", text: "× real time" }))),
+    ];
+  }
+
+  step(seconds = 0.2) {
+    return this.answer(this.link.control({ do: "step", seconds }));
+  }
+
+  toggleClock() {
+    if (!this.speed) return null;
+    return this.answer(this.link.request({ do: "clock", speed: this.stepping ? 0 : Number(this.speed.value) }));
+  }
+
+  set(truth) {
+    return this.link.control({ do: "set_truth", truth });
+  }
+
+  async answer(answer) {
+    const outcome = await answer;
+    setText(this.outcome, outcome.ok ? "" : outcome.error);
+  }
+
+  form(kind, verb, fields, send) {
+    const form = make("form", {
+      "data-truth": kind,
+      onsubmit: (event) => {
+        event.preventDefault();
+        const values = {};
+        for (const [name, text] of new FormData(form)) if (text.trim() !== "") values[name] = name === "star" ? text.trim() : Number(text);
+        this.answer(send(values));
+      },
+    });
+    for (const [name, initial, unit, list] of fields) {
+      form.append(make("label", { class: "field" }, make("span", { text: name.replace("_deg_s", "").replace("_deg", "").replaceAll("_", " ") }), make("input", { name, value: initial, list, autocomplete: "off", inputmode: list ? "text" : "decimal" }), make("span", { class: "dim", text: unit })));
+    }
+    form.append(make("button", { type: "submit", class: "primary", text: verb }));
+    return make("fieldset", {}, make("legend", { text: { slew: "slew to", rate: "turn at a rate", fixed: "stand still (here if empty)" }[kind] }), form);
+  }
+
+  update({ status, truth, stepping }) {
+    if (!this.now || !truth.ok) return;
+    this.stepping = stepping > 0;
+    if (this.speed) setText(this.running, this.stepping ? "pause" : "run");
+    const feed = status.feed;
+    const facts = [
+      ["source", `${status.truth_kind}, ${truth.status}`],
+      ["right ascension", `${fixed(truth.ra_deg, 5, 10)}°`],
+      ["declination", `${fixed(truth.dec_deg, 5, 10)}°`],
+      ["roll", `${fixed(truth.roll_deg, 5, 10)}°`],
+      ["rate x, y, z", truth.rate_deg_s.map((item) => fixed(item, 4, 8)).join(" ") + " °/s"],
+      ["simulation time", duration(truth.run_time_s)],
+      ["feed", feed ? `${feed.address}: ${feed.accepted} accepted, ${feed.refused} refused ${feed.last_fault || ""}` : "none"],
+    ];
+    if (this.now.rows.length !== facts.length) this.now.replaceChildren(...facts.map(([name]) => make("tr", {}, make("th", { text: name }), make("td", { class: "num" }))));
+    facts.forEach(([, text], number) => setText(this.now.rows[number].cells[1], text));
+  }
+}

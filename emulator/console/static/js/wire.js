@@ -1,0 +1,83 @@
+// The trace of serial line and CAN bus, decoded, with filters.
+
+import { address } from "./link.js";
+import { make, wall } from "./format.js";
+
+const KEPT_LINES = 1000;
+const SHOWN_LINES = 400;
+const KINDS = [["requests", ["telecommand", "telemetry"]], ["replies", ["ack", "reply"]], ["refusals, faults", ["nack", "fault"]], ["parts", ["part"]], ["CANopen", ["canopen"]]];
+
+export class Wire {
+  constructor(store, link) {
+    this.store = store;
+    this.link = link;
+    this.host = document.getElementById("wire");
+    this.lines = [];
+    this.hidden = new Set(["part"]);
+    this.buses = new Set(["serial", "can"]);
+    this.text = "";
+    this.held = false;
+    this.build();
+    store.on("hello", () => (this.lines = []));
+    store.on("wire", (message) => this.add(message));
+  }
+
+  build() {
+    const check = (label, on, change) => {
+      const box = make("input", { type: "checkbox", onchange: () => { change(box.checked); this.render(); } });
+      box.checked = on;
+      return make("label", { class: "check" }, box, label);
+    };
+    const filter = make("input", { type: "search", placeholder: "filter: name, hex, address", "aria-label": "filter", oninput: () => { this.text = filter.value.trim().toLowerCase(); this.render(); } });
+    this.hold = make("button", { type: "button", text: "hold", onclick: () => this.setHeld(!this.held) });
+    const buses = ["serial", "can"].map((bus) => check(bus === "can" ? "CAN" : bus, true, (on) => (on ? this.buses.add(bus) : this.buses.delete(bus))));
+    const kinds = KINDS.map(([label, names]) => check(label, !this.hidden.has(names[0]), (on) => { for (const name of names) on ? this.hidden.delete(name) : this.hidden.add(name); }));
+    this.left = make("output", { class: "num dim" });
+    const save = make("a", { class: "button", href: address("/wire.log"), download: "wire.log", text: "candump log" });
+    this.list = make("ol", { class: "trace scroll" });
+    this.host.append(make("div", { class: "bar wrap" }, filter, this.hold, save, this.left), make("div", { class: "bar wrap" }, ...buses, ...kinds), this.list);
+  }
+
+  show(active) {
+    this.link.subscribe({ wire: active });
+    if (active) this.render();
+  }
+
+  setHeld(held) {
+    this.held = held;
+    this.hold.classList.toggle("on", held);
+    if (!held) this.render();
+  }
+
+  add(message) {
+    const last = this.lines.length ? this.lines[this.lines.length - 1].n : -1;
+    this.lines.push(...message.lines.filter((line) => line.n > last));
+    if (this.lines.length > KEPT_LINES) this.lines.splice(0, this.lines.length - KEPT_LINES);
+    if (message.left_out) this.left.textContent = `${message.left_out} left out`;
+    else this.left.textContent = "";
+    if (!this.held) this.render();
+  }
+
+  wanted(line) {
+    if (this.hidden.has(line.kind) || !this.buses.has(line.bus)) return false;
+    return !this.text || `${line.raw} ${line.text}`.toLowerCase().includes(this.text);
+  }
+
+  // Newest first; lines that are on the screen already are kept.
+  render() {
+    const shown = this.lines.filter((line) => this.wanted(line)).slice(-SHOWN_LINES).reverse();
+    const there = new Map([...this.list.children].map((item) => [item.dataset.n, item]));
+    this.list.replaceChildren(...shown.map((line) => there.get(String(line.n)) || this.item(line)));
+  }
+
+  item(line) {
+    return make(
+      "li",
+      { class: line.kind, "data-n": String(line.n) },
+      make("time", { class: "num dim", text: wall(line.t) }),
+      make("span", { class: "way", text: `${line.bus === "can" ? "CAN" : "ser"} ${line.out ? "◀" : "▶"}`, title: line.out ? "from the device" : "to the device, or between others" }),
+      make("span", { class: "text", text: line.text }),
+      make("code", { text: line.raw }),
+    );
+  }
+}

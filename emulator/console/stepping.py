@@ -1,0 +1,59 @@
+"""The stepped clock run from the page: small steps, as fast as wanted, until it is paused."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+from starhil.emulator.errors import EmulatorError
+
+STEP_WALL_S: Final = 0.1
+"""Wall time of one step, seconds."""
+
+FASTEST: Final = 100.0
+"""Most simulation seconds per second."""
+
+
+class StepRunner:
+    """Steps the clock until it is paused.
+
+    Parameters
+    ----------
+    execute
+        Executes requests of the control channel.
+    """
+
+    def __init__(self, execute: Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]) -> None:
+        self._execute = execute
+        self._task: asyncio.Task[None] | None = None
+        self.speed = 0.0
+        """Simulation seconds per second; 0 while paused."""
+
+    def run(self, speed: float) -> None:
+        """Run at a speed; 0 pauses.
+
+        Raises
+        ------
+        EmulatorError
+            The speed is out of range.
+        """
+        if not 0.0 <= speed <= FASTEST:
+            raise EmulatorError(f"speed: {speed:g} is outside 0 … {FASTEST:g}")
+        self.pause()
+        if speed > 0.0:
+            self.speed = speed
+            self._task = asyncio.create_task(self._step())
+
+    def pause(self) -> None:
+        """Pause after the present step."""
+        self.speed = 0.0
+        self._task = None
+
+    async def _step(self) -> None:
+        own = asyncio.current_task()
+        loop = asyncio.get_running_loop()
+        while self._task is own:
+            begin = loop.time()
+            await self._execute({"do": "step", "seconds": self.speed * STEP_WALL_S})
+            await asyncio.sleep(max(0.0, begin + STEP_WALL_S - loop.time()))

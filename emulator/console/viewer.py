@@ -1,0 +1,95 @@
+"""One open page: what it wants, and what waits to be sent to it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import Final, Protocol
+
+QUEUE_LIMIT: Final = 256
+"""Most messages that wait for a page; the oldest are dropped."""
+
+
+class Socket(Protocol):
+    """What a viewer needs of a WebSocket."""
+
+    async def send_str(self, data: str, /) -> None:
+        """Send a text message."""
+
+    async def send_bytes(self, data: bytes, /) -> None:
+        """Send a binary message."""
+
+
+class Viewer:
+    """The server's end of a page; a page that does not read loses messages and delays nothing.
+
+    Parameters
+    ----------
+    socket
+        Connection to the page.
+
+    Attributes
+    ----------
+    frames, wire
+        Whether the page shows images, and the trace of the wire.
+    rows
+        Telemetry rows that the page shows.
+    dropped
+        Messages and images that were dropped because the page did not read.
+    """
+
+    def __init__(self, socket: Socket) -> None:
+        self._socket = socket
+        self._texts: deque[str] = deque()
+        self._frame: bytes | None = None
+        self._wake = asyncio.Event()
+        self.frames = False
+        self.wire = False
+        self.rows: frozenset[str] = frozenset()
+        self.dropped = 0
+
+    @property
+    def waiting(self) -> int:
+        """Number of messages that wait, the image included."""
+        return len(self._texts) + (self._frame is not None)
+
+    def send(self, text: str) -> None:
+        """Queue a message."""
+        if len(self._texts) >= QUEUE_LIMIT:
+            self._texts.popleft()
+            self.dropped += 1
+        self._texts.append(text)
+        self._wake.set()
+
+    def send_frame(self, data: bytes) -> None:
+        """Queue an image in place of one that still waits."""
+        self.dropped += self._frame is not None
+        self._frame = data
+        self._wake.set()
+
+    async def pump(self) -> None:
+        """Send what is queued, for ever.
+
+        Raises
+        ------
+        ConnectionError
+            The page has gone.
+        """
+        while True:
+            await self._wake.wait()
+            await self.flush()
+
+    async def flush(self) -> None:
+        """Send what is queued now.
+
+        Raises
+        ------
+        ConnectionError
+            The page has gone.
+        """
+        self._wake.clear()
+        while self._texts:
+            await self._socket.send_str(self._texts.popleft())
+        frame, self._frame = self._frame, None
+        if frame is not None:
+            await self._socket.send_bytes(frame)

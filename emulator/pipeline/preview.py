@@ -1,0 +1,175 @@
+"""Previews: a frame compressed for display, with the stars, bodies and covers in it."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.messages import Preview, SkyBody
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.renderer import Frame
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.objects import Obstruction, SkyObjects
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.imaging.detection import Detections
+from starid.solution import Solution
+
+JPEG_QUALITY: Final = 72
+FAINTEST_V: Final = 6.5
+"""Faintest catalogue star that a preview names."""
+BLACK_SIGMA: Final = 1.5
+"""Level of black above the background, in sigma of its noise: the noise costs bytes and shows nothing."""
+KNEE_SIGMA: Final = 4.0
+"""Level above black up to which brightness is nearly linear, in sigma of the noise."""
+OUTLINE_POINTS: Final = 96
+
+
+def make_preview(
+    frame: Frame,
+    camera: Camera,
+    sensor: SensorModel,
+    sky: SkyObjects,
+    found: Detections | None = None,
+    solution: Solution | None = None,
+) -> Preview:
+    """Make the preview of a frame; detections are left out of one that was not solved.
+
+    Raises
+    ------
+    EmulatorError
+        The image cannot be compressed.
+    """
+    height, width = frame.image.shape
+    background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
+    noise = max(1.0, 0.0 if found is None else found.noise)
+    stars, objects = frame.stars, frame.objects
+    bright = stars.magnitude <= FAINTEST_V
+    bright &= np.all((stars.xy_px > -0.5) & (stars.xy_px < (width - 0.5, height - 0.5)), axis=1)
+    detections, hips = ((), ()) if found is None else _detections(found, solution, sensor)
+    return Preview(
+        jpeg=compress(frame.image, background, noise, sensor.bits),
+        width=width,
+        height=height,
+        detections=detections,
+        hips=hips,
+        catalogue=tuple(
+            zip(
+                stars.hip[bright].tolist(),
+                *stars.xy_px[bright].round(1).T.tolist(),
+                stars.magnitude[bright].round(2).tolist(),
+                strict=True,
+            )
+        ),
+        false_stars=()
+        if objects is None
+        else tuple((x, y) for x, y in objects.false_xy_px.round(1).tolist()),
+        bodies=tuple(_bodies(sky, camera, frame.attitude)),
+        covered=tuple(_covered(obstruction, width, height) for obstruction in sky.obstructions),
+    )
+
+
+def compress(
+    image: NDArray[np.uint8] | NDArray[np.uint16], background: float, noise: float, bits: int
+) -> bytes:
+    """Compress an image (h, w) as JPEG, on a scale that is linear for faint and logarithmic for bright pixels.
+
+    Raises
+    ------
+    EmulatorError
+        The image cannot be compressed.
+    """
+    import cv2
+
+    levels = np.arange(1 << bits, dtype=np.float64)
+    above = np.clip(levels - background - BLACK_SIGMA * noise, 0.0, None) / (KNEE_SIGMA * noise)
+    scale = 255.0 / max(math.asinh(float(above[-1])), 1e-9)
+    table = np.rint(np.arcsinh(above) * scale).astype(np.uint8)
+    done, data = cv2.imencode(".jpg", table[image], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise EmulatorError("preview: the image cannot be compressed")
+    return data.tobytes()
+
+
+def _detections(
+    found: Detections, solution: Solution | None, sensor: SensorModel
+) -> tuple[tuple[tuple[float, float, float, float], ...], tuple[int, ...]]:
+    """Return the detections, and the Hipparcos number of each."""
+    zero = sensor.zero_magnitude_e_s * sensor.exposure_s
+    magnitude = -2.5 * np.log10(np.maximum(found.flux, 1.0) / zero)
+    snr = found.flux / found.flux_sigma
+    hips = np.zeros(len(found.flux), dtype=np.int64)
+    if solution is not None and solution.valid:
+        hips[solution.detection_index] = solution.hip
+    rows = zip(
+        *found.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
+    )
+    return tuple(rows), tuple(hips.tolist())
+
+
+def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[SkyBody]:
+    """Return the bodies of a sky, in the image or not."""
+    found = []
+    if sky.sun is not None:
+        found.append(_body("sun", sky.sun.ra_deg, sky.sun.dec_deg, 0.2666, camera, attitude))
+    if sky.moon is not None:
+        radius_deg = sky.moon.diameter_deg / 2.0
+        found.append(_body("moon", sky.moon.ra_deg, sky.moon.dec_deg, radius_deg, camera, attitude))
+    if sky.earth is not None:
+        earth = sky.earth
+        found.append(_body("earth", earth.ra_deg, earth.dec_deg, earth.radius_deg, camera, attitude))
+    for number, planet in enumerate(sky.planets, 1):
+        name = planet.name or f"planet {number}"
+        found.append(_body(name, planet.ra_deg, planet.dec_deg, 0.0, camera, attitude))
+    return found
+
+
+def _body(
+    name: str, ra_deg: float, dec_deg: float, radius_deg: float, camera: Camera, attitude: Attitude
+) -> SkyBody:
+    """Return a body with the outline of its disc in the image."""
+    centre = icrs_vector(ra_deg, dec_deg)
+    across = np.cross(centre, (0.0, 0.0, 1.0) if abs(centre[2]) < 0.9 else (1.0, 0.0, 0.0))
+    across /= np.linalg.norm(across)
+    radius = math.radians(radius_deg)
+    angle = np.linspace(0.0, 2.0 * math.pi, OUTLINE_POINTS + 1 if radius > 0.0 else 1)[:, None]
+    ring = np.cos(angle) * across + np.sin(angle) * np.cross(centre, across)
+    seen = attitude.to_sensor(math.cos(radius) * centre + math.sin(radius) * ring)
+    xy, _ = camera.project(seen)
+    limit = 20.0 * max(camera.width, camera.height)
+    mapped = np.all(np.abs(np.nan_to_num(xy, nan=np.inf)) < limit, axis=1)
+    outline = tuple(
+        (x, y) if there else None for (x, y), there in zip(xy.round(1).tolist(), mapped.tolist(), strict=True)
+    )
+    return SkyBody(name, ra_deg, dec_deg, radius_deg, outline)
+
+
+def _covered(obstruction: Obstruction, width: int, height: int) -> tuple[tuple[float, float], ...]:
+    """Return the polygon, pixels, that an obstruction covers."""
+    if obstruction.polygon_px:
+        return obstruction.polygon_px
+    if obstruction.share <= 0.0:
+        return ()
+    right, down = width - 0.5, height - 0.5
+    corners = ((-0.5, -0.5), (right, -0.5), (right, down), (-0.5, down))
+    angle = math.radians(obstruction.angle_deg)
+    x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
+    along = (math.cos(angle) * x[::4])[None, :] + (math.sin(angle) * y[::4])[:, None]
+    edge = float(np.quantile(along, 1.0 - obstruction.share))
+    heights = [
+        math.cos(angle) * (cx - 0.5 * (width - 1)) + math.sin(angle) * (cy - 0.5 * (height - 1)) - edge
+        for cx, cy in corners
+    ]
+    polygon: list[tuple[float, float]] = []
+    for number, ((ax, ay), above) in enumerate(zip(corners, heights, strict=True)):
+        (bx, by), other = corners[(number + 1) % 4], heights[(number + 1) % 4]
+        if above >= 0.0:
+            polygon.append((ax, ay))
+        if (above >= 0.0) != (other >= 0.0):
+            share = above / (above - other)
+            polygon.append((ax + share * (bx - ax), ay + share * (by - ay)))
+    return tuple((round(px, 1), round(py, 1)) for px, py in polygon)

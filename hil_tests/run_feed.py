@@ -1,0 +1,148 @@
+"""Reports the results of a run to the console of a running emulator, while the run goes on."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import logging
+import queue
+import sys
+import threading
+import uuid
+from types import TracebackType
+from typing import Any, Final, Self
+from urllib.parse import urlsplit
+
+from starhil.hil_tests.emulator_process import EmulatorProcess
+from starhil.hil_tests.errors import BenchError
+
+log = logging.getLogger("starhil.bench")
+
+TIMEOUT_S: Final = 5.0
+MOST_WAITING: Final = 5000
+"""Results that may wait for a slow console; more are not shown there."""
+
+ENDED_WITHIN_S: Final = 10.0
+"""Longest time that the end of a run waits for the console, seconds."""
+
+
+class RunFeed:
+    """Sends results in a thread of its own; a console that fails or ends does not hold up the run.
+
+    Parameters
+    ----------
+    address
+        Address of the console's page, as on the ready line of `starhil run --view`.
+    kind
+        `session` or `conformance`.
+    title, unit
+        What is run, and on which unit.
+    planned
+        Number of results to expect; 0 if it is not known.
+
+    Raises
+    ------
+    BenchError
+        No console answers at the address.
+    """
+
+    def __init__(self, address: str, *, kind: str, title: str, unit: str, planned: int) -> None:
+        parts = urlsplit(address)
+        if parts.scheme != "http" or not parts.hostname:
+            raise BenchError(
+                f"--view {address}: must be the address of a console, from the ready line of `starhil run --view`"
+            )
+        self._address = f"{parts.scheme}://{parts.netloc}"
+        self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=TIMEOUT_S)
+        self._path = f"/runs?{parts.query}"
+        self._run = uuid.uuid4().hex
+        self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue(MOST_WAITING)
+        begin = {"event": "begin", "kind": kind, "title": title, "unit": unit, "planned": planned}
+        try:
+            self._post(begin)
+        except (OSError, http.client.HTTPException, BenchError) as error:
+            raise BenchError(f"--view {self._address}: the console does not take reports ({error})") from None
+        self._thread = threading.Thread(target=self._send, name="run-feed", daemon=True)
+        self._thread.start()
+
+    def result(
+        self,
+        name: str,
+        status: str,
+        detail: str,
+        *,
+        identity: str = "",
+        link: str = "",
+        seconds: float = 0.0,
+        traffic: tuple[str, ...] = (),
+    ) -> None:
+        """Report a result; `status` is `passed`, `failed`, `skipped` or `not run`."""
+        content = {
+            "id": identity,
+            "name": name,
+            "status": status,
+            "detail": detail,
+            "link": link,
+            "seconds": round(seconds, 3),
+            "log": list(traffic),
+        }
+        try:
+            self._waiting.put_nowait({"event": "result", "result": content})
+        except queue.Full:
+            log.debug("console: a result was left out")
+
+    def close(self) -> None:
+        """Report the end, once everything before it was sent."""
+        try:
+            self._waiting.put({"event": "end"}, timeout=ENDED_WITHIN_S)
+            self._waiting.put(None, timeout=ENDED_WITHIN_S)
+        except queue.Full:
+            log.debug("console: the end of the run was left out")
+        self._thread.join(ENDED_WITHIN_S)
+        self._connection.close()
+
+    def _send(self) -> None:
+        while (event := self._waiting.get()) is not None:
+            try:
+                self._post(event)
+            except (OSError, http.client.HTTPException, BenchError) as error:
+                log.warning(
+                    "%s: the console takes no more reports (%s); the run goes on", self._address, error
+                )
+                while self._waiting.get() is not None:
+                    pass
+                return
+
+    def _post(self, event: dict[str, Any]) -> None:
+        body = json.dumps({"run": self._run, **event})
+        self._connection.request("POST", self._path, body, {"Content-Type": "application/json"})
+        response = self._connection.getresponse()
+        text = response.read().decode(errors="replace").strip()
+        if response.status != http.client.OK:
+            raise BenchError(text or f"status {response.status}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def console_address(view: str, emulator: EmulatorProcess | None) -> str:
+    """Return the address of the console; for `auto` print and return that of the started emulator.
+
+    Raises
+    ------
+    BenchError
+        `auto`, and no emulator was started.
+    """
+    if view != "auto":
+        return view
+    if emulator is None or "view" not in emulator.ready:
+        raise BenchError(
+            "--view auto needs --start; otherwise give the address of the ready line of `starhil run --view`"
+        )
+    print(f"console: {emulator.ready['view'].replace('/?', '/runs?')}", file=sys.stderr, flush=True)
+    return emulator.ready["view"]

@@ -1,0 +1,263 @@
+"""The page in a real browser: Chromium of the system, driven by playwright, on a running emulator."""
+
+import json
+import math
+import re
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+
+import pytest
+
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
+from starhil.hil_tests.private_can_bus import PrivateCanBus
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+WITHIN_MS = 30_000
+UPDATE_RATE_HZ = 5
+NO_STARS = ("too few stars", "detection failed")
+"""Reasons for no attitude behind a covered lens: noise gives a star or two, or none."""
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.process,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: as root, apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    settings = [f"parameters.update_rate={UPDATE_RATE_HZ}"]
+    with PrivateCanBus() as bus:
+        command = emulator_command(
+            profile="cubestar", serial="off", can=bus, seed=1, settings=settings, extra=["--view", "auto"]
+        )
+        with EmulatorProcess(command) as process:
+            yield process
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser, emulator):
+    """The console's page; whatever the browser's console says is a failure."""
+    opened = browser.new_page(viewport={"width": 1280, "height": 800})
+    opened.set_default_timeout(WITHIN_MS)
+    said = []
+    opened.on("console", lambda message: said.append(message.text))
+    opened.on("pageerror", lambda error: said.append(str(error)))
+    opened.goto(emulator.ready["view"])
+    opened.wait_for_selector("#link[data-state=connected]")
+    yield opened
+    opened.close()
+    assert said == []
+
+
+def send(page, name, **values):
+    """Send a telecommand through its form; return the outcome that the page shows."""
+    page.click("[data-tab=telecommands]")
+    page.select_option("#telecommand", name)
+    for key, value in values.items():
+        field = page.locator(f"#telecommand-form [name={key}]")
+        if field.evaluate("element => element.tagName") == "SELECT":
+            field.select_option(str(value))
+        else:
+            field.fill(str(value))
+    count = page.locator("#sent li").count()
+    page.click("#send")
+    page.wait_for_function("count => document.querySelectorAll('#sent li').length > count", arg=count)
+    return page.locator("#sent li .outcome").first.text_content()
+
+
+def wait_for_text(page, selector, text):
+    page.wait_for_function(
+        "([selector, text]) => document.querySelector(selector).textContent === text", arg=[selector, text]
+    )
+
+
+VALUES = "row => Object.fromEntries([...document.querySelectorAll(`[data-row=${row}] tr`)].map(tr => [tr.cells[0].textContent, tr.cells[1].textContent]))"
+"""Reads the values of a row as the page shows them."""
+
+
+def telemetry(page, row, **expected):
+    """Return the values of a row as the page shows them, once some of them are as expected."""
+    page.click("[data-tab=telemetry]")
+    page.fill("#telemetry input[type=search]", row)
+    page.wait_for_function(
+        f"([row, expected]) => Object.entries(expected).every(([name, text]) => ({VALUES})(row)[name] === text)",
+        arg=[row, expected],
+    )
+    return page.evaluate(VALUES, row)
+
+
+def track(page):
+    if page.locator("#mode").text_content() != "tracking":
+        assert send(page, "set_mode", mode="lost_in_space").startswith("accepted in ")
+    wait_for_text(page, "#mode", "tracking")
+    wait_for_text(page, "#validity", "valid")
+
+
+def test_lost_in_space_is_commanded_in_the_form_and_the_attitude_shown_is_that_of_telemetry(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    values = telemetry(page, "precise_attitude", valid="yes", mode="tracking")
+    shown = page.evaluate("Object.fromEntries(Object.entries(document.getElementById('ra').dataset))")
+    read = [float(values[f"q_{name}"].replace("−", "-")) for name in "xyzw"]
+    seen = [float(shown[f"q{name}"]) for name in "xyzw"]
+    turn = 2.0 * math.dist(read, seen)  # rad, for attitudes this near to each other
+    assert math.degrees(turn) * 3600.0 < 15.0  # some frames apart at most, each with its noise
+    assert abs(float(page.locator("#ra").text_content().strip("° ").replace("−", "-")) - 83.8) < 0.01
+
+
+def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_comes_back(page):
+    track(page)
+    page.evaluate(
+        """() => {
+            window.seen = [];
+            starhil.store.on("shown", () => window.seen.push([
+                starhil.store.rows.at(starhil.store.position, "frame"), document.getElementById("validity").textContent]));
+        }"""
+    )
+    page.click("[data-tab=faults]")
+    page.click("#cover")
+    wait_for_text(page, "#cover", "uncover the lens")
+    at = page.evaluate("starhil.store.rows.at(starhil.store.position, 'frame')")
+    page.wait_for_function(
+        "texts => texts.includes(document.querySelector('#validity').textContent)", arg=list(NO_STARS)
+    )
+    frames = [number for number, text in page.evaluate("window.seen") if text in NO_STARS]
+    assert frames[0] <= at + 3
+    assert page.locator("#active").text_content() == "1 active"
+    page.click("#clear-faults")
+    wait_for_text(page, "#validity", "valid")
+    wait_for_text(page, "#active", "none")
+
+
+def test_a_wrong_parameter_shows_the_refusal(page):
+    assert send(page, "set_update_rate", rate=500) == "refused: invalid_parameter"
+    problem = page.locator("#telecommand-form .problem").text_content()
+    assert "500.0 is outside 0.01 to 100 Hz" in problem
+    assert page.locator("#bytes").text_content().splitlines() == [
+        "serial   1F 7F 61 00 00 FA 43 1F FF",
+        "cansend vcan0 0161FD04#0000FA43",
+    ]
+
+
+def test_what_was_sent_is_saved_and_run_as_a_session(page, emulator, tmp_path):
+    page.click("[data-tab=telecommands]")
+    page.click("#clear-session")
+    send(page, "set_mode", mode="standby")
+    send(page, "set_mode", mode="lost_in_space")
+    send(page, "set_update_rate", rate=500)
+    with page.expect_download() as download:
+        page.click("#save-session")
+    path = tmp_path / "session.toml"
+    download.value.save_as(path)
+    command = [
+        installed_command(), "session", str(path), "--can", emulator.ready["can"], "--json", "--log", str(tmp_path / "log"),
+        "--view", emulator.ready["view"],
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    steps = [
+        item["name"] for item in json.loads(done.stdout)["results"] if not item["name"].startswith("wait")
+    ]
+    assert len(steps) == 3
+    page.goto(emulator.ready["view"].replace("/?", "/runs?"))
+    page.wait_for_function("() => document.querySelectorAll('#results tr.passed').length >= 3")
+    assert page.locator("#title").text_content() == "Recorded in the console"
+    assert page.locator("#list li").first.get_attribute("data-state") == "good"
+
+
+def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
+    track(page)
+    page.wait_for_function("() => starhil.store.images.length >= 4")
+    page.keyboard.press("Space")
+    page.wait_for_selector("body.paused")
+    frame = "starhil.store.rows.at(starhil.store.position, 'frame')"
+    before = page.evaluate(frame)
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate(frame) == before - 2
+    page.wait_for_function(f"() => starhil.sky.shown.head.row[2] === {frame}")  # the image of that moment
+    page.keyboard.press("Space")
+    page.wait_for_function(f"() => {frame} > {before}")
+    assert not page.locator("body.paused").count()
+
+
+def test_the_first_paint_comes_at_once_and_every_tab_opens_in_both_themes(page):
+    paint = page.evaluate("performance.getEntriesByType('paint')[0].startTime")
+    assert paint > 0
+    for _ in range(2):
+        for tab in ("telemetry", "telecommands", "wire", "faults", "truth"):
+            page.click(f"[data-tab={tab}]")
+            assert page.locator(f"#{tab}").is_visible()
+        page.keyboard.press("t")
+
+
+def test_nothing_leaves_the_window_at_any_size(page):
+    track(page)
+    for width, height in ((1280, 800), (1920, 1080), (3840, 2160)):
+        page.set_viewport_size({"width": width, "height": height})
+        boxes = page.evaluate(
+            """() => ["top", "sky", "map", "charts", "side", "help", "theme"].map((id) => {
+                const box = document.getElementById(id).getBoundingClientRect();
+                return [id, box.left, box.top, box.right, box.bottom];
+            })"""
+        )
+        for name, left, top, right, bottom in boxes:
+            assert left >= 0, (name, width)
+            assert top >= 0, (name, width)
+            assert right <= width + 0.5, (name, width, right)
+            assert bottom <= height + 0.5, (name, height, bottom)
+
+
+def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
+    """Frames as of eight hours at 5 Hz pass through the page's store."""
+    kept = page.evaluate(
+        """() => {
+            const { store } = starhil;
+            const blob = new Blob([new Uint8Array(16)]);
+            const width = store.hello.columns.length;
+            const begin = store.now + 1;
+            let most = 0;
+            for (let number = 0; number < 8 * 3600 * 5; number++) {
+                const row = new Array(width).fill(0);
+                row[0] = begin + number / 5;
+                store.rows.push(row);
+                if (number % 5 === 0) {
+                    store.images.push({ time: row[0], head: { row }, blob });
+                    store.thin(row[0]);
+                    most = Math.max(most, store.images.length);
+                }
+            }
+            return { rows: store.rows.length, numbers: store.rows.data[0].length, most };
+        }"""
+    )
+    assert kept["rows"] == 36_000
+    assert kept["numbers"] == 72_000
+    assert kept["most"] <= 62 + 721
+    page.reload()
+    page.wait_for_selector("#link[data-state=connected]")
+
+
+def test_a_wrong_token_and_another_origin_get_403(emulator):
+    address = emulator.ready["view"]
+    for url, headers in (
+        (address[:-1] + "_", {}),
+        (re.sub(r"\?.*", "", address), {}),
+        (address, {"Origin": "http://elsewhere.example"}),
+    ):
+        request = urllib.request.Request(url, headers=headers)
+        with pytest.raises(urllib.error.HTTPError) as error:
+            urllib.request.urlopen(request, timeout=10)
+        assert error.value.code == 403

@@ -1,0 +1,118 @@
+"""The recording: read back with mcap's own reader."""
+
+import asyncio
+import base64
+import json
+
+import pytest
+from mcap.reader import make_reader
+
+from starhil.emulator.cli.console_client import ConsoleClient
+from starhil.emulator.console import recorder as recorder_module
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.launch import RunOptions
+from tests.emulator.conftest import ORION, PREVIEW
+from tests.emulator.runs import command
+
+WITHIN_S = 20.0
+
+
+def options(path, **more):
+    return RunOptions(mcap=path, make_client=ConsoleClient, **more)
+
+
+def messages(path):
+    with path.open("rb") as stream:
+        found = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            found.setdefault(channel.topic, []).append(
+                (schema.name, message.log_time, json.loads(message.data))
+            )
+        return found
+
+
+async def record(emulation):
+    """Track for two seconds of simulation time, and wait until a row of telemetry was read."""
+    await emulation.stepper.step(1.0)
+    command(emulation, "set_mode", mode="lost_in_space")
+    await emulation.stepper.step(2.0)
+    counters = emulation.device.counters
+    async with asyncio.timeout(WITHIN_S):
+        while counters.telemetry < len(emulation.device.icd.telemetry):
+            await asyncio.sleep(0.01)
+
+
+def test_images_truth_measurements_telemetry_and_events_are_read_back(run, tmp_path):
+    path = tmp_path / "run.mcap"
+    published = []
+
+    async def scenario(emulation, _line):
+        emulation.device.on_frame.append(published.append)
+        await record(emulation)
+
+    run(scenario, options=options(path))
+    found = messages(path)
+    assert len(published) >= 2
+    for topic, schema in (
+        ("/image", "foxglove.CompressedImage"),
+        ("/truth", "foxglove.FrameTransform"),
+        ("/measurement", "starhil.Measurement"),
+    ):
+        assert [name for name, _, _ in found[topic]] == [schema] * len(published)
+        assert [at for _, at, _ in found[topic]] == [each.mid_unix_ns for each in published]
+    assert base64.b64decode(found["/image"][0][2]["data"]) == PREVIEW.jpeg
+    rotation = found["/truth"][0][2]["rotation"]
+    x, y, z, w = ORION.quaternion_xyzw
+    assert [rotation[name] for name in "xyzw"] == pytest.approx(
+        [-x, -y, -z, w]
+    )  # of the frame, not of its vectors
+    measured = found["/measurement"][-1][2]
+    assert (measured["valid"], measured["mode"], measured["matched"]) == (True, "tracking", 35)
+    assert "mode standby → lost_in_space (command)" in [event["message"] for _, _, event in found["/events"]]
+    assert found["/telemetry/device_status"][0][2]["mode"] in ("boot", "standby", "lost_in_space", "tracking")
+
+
+def test_nothing_is_replaced_unless_asked_for(run, tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"kept")
+
+    async def nothing(_emulation, _line):
+        return
+
+    with pytest.raises(
+        EmulatorError, match=r"exists and is not empty; choose another file, or replace it with"
+    ):
+        run(nothing, options=options(path))
+    assert path.read_bytes() == b"kept"
+    run(nothing, options=options(path, overwrite=True))
+    assert path.read_bytes()[:5] == b"\x89MCAP"
+    with pytest.raises(EmulatorError, match="cannot be written"):
+        run(nothing, options=options(tmp_path / "no_folder" / "run.mcap"))
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
+    async def scenario(emulation, _line):
+        await record(emulation)
+        assert emulation.device.frames_valid > 0
+
+    class FullDisk:
+        """A disk with room for nothing."""
+
+        def __init__(self, *_args, **_options):
+            self.register_schema = self.register_channel = lambda **_options: 1
+            self.start = lambda **_options: None
+
+        def add_message(self, **_options):
+            raise OSError(28, "No space left on device")
+
+        finish = add_message
+
+    original = recorder_module.Writer
+    recorder_module.Writer = FullDisk
+    try:
+        run(scenario, options=options(tmp_path / "run.mcap"))
+    finally:
+        recorder_module.Writer = original
+    said = [record.getMessage() for record in caplog.records if record.name == "starhil.record"]
+    assert len(said) == 1
+    assert said[0].endswith("ends here (No space left on device); the run goes on")

@@ -1,0 +1,457 @@
+"""The console's server: who may look, what a page receives and sends, and pages that do not read."""
+
+import asyncio
+import json
+from contextlib import AsyncExitStack
+
+import aiohttp
+import numpy as np
+import pytest
+
+from starhil.emulator.cli.console_client import ConsoleClient
+from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
+from starhil.emulator.launch import RunOptions
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.run_feed import RunFeed
+from starhil.hil_tests.script import load_script
+from starhil.protocol.candump import parse_candump
+from starhil.protocol.icd import load_unit
+from tests.emulator.conftest import PREVIEW
+from tests.emulator.runs import command, read
+
+OPTIONS = RunOptions(control="auto", view="auto", make_client=ConsoleClient)
+WITHIN_S = 20.0
+
+
+class Page:
+    """A page of a console."""
+
+    def __init__(self, emulation):
+        self.address = emulation.ready_fields["view"]
+        self.messages = []
+        self.frames = []
+        self.history = None
+        self._number = 0
+
+    def url(self, path):
+        return self.address.replace("/?", f"{path}?")
+
+    async def __aenter__(self):
+        self.session = aiohttp.ClientSession()
+        self.socket = await self.session.ws_connect(self.url("/ws"), max_msg_size=0)
+        hello = await self.until(lambda: self.history is not None)
+        assert hello
+        return self
+
+    async def __aexit__(self, *_):
+        await self.socket.close()
+        await self.session.close()
+
+    async def receive(self):
+        message = await asyncio.wait_for(self.socket.receive(), WITHIN_S)
+        if message.type is aiohttp.WSMsgType.TEXT:
+            self.messages.append(json.loads(message.data))
+        elif message.data[:1] == b"F":
+            length = int.from_bytes(message.data[1:5], "little")
+            self.frames.append((json.loads(message.data[5 : 5 + length]), message.data[5 + length :]))
+        else:
+            self.history = np.frombuffer(message.data[8:]).reshape(-1, len(COLUMNS))
+
+    async def until(self, condition):
+        """Receive until a condition holds."""
+        for _ in range(1000):
+            if found := condition():
+                return found
+            await self.receive()
+        raise AssertionError("never came")
+
+    async def ask(self, **request):
+        """Make a request and return its answer."""
+        self._number += 1
+        number = self._number
+        await self.socket.send_str(json.dumps({"id": number, **request}))
+        return await self.until(
+            lambda: next(
+                (item for item in self.messages if item["type"] == "answer" and item["id"] == number), None
+            )
+        )
+
+    async def message(self, kind, condition=lambda _message: True):
+        """Wait for a message of a kind."""
+        return await self.until(
+            lambda: next((item for item in self.messages if item["type"] == kind and condition(item)), None)
+        )
+
+    async def until_frame(self, number):
+        """Wait for the frame of a number."""
+        await self.until(lambda: self.frames and column(self.frames[-1][0]["row"], "frame") == number)
+
+    async def get(self, path):
+        async with self.session.get(self.url(path)) as response:
+            return await response.text()
+
+
+def column(row, name):
+    return row[COLUMNS.index(name)]
+
+
+@pytest.mark.parametrize("path", ["/", "/runs", "/ws", "/session.toml", "/wire.log"])
+def test_a_wrong_token_and_another_origin_are_answered_403(run, path):
+    async def scenario(emulation, _line):
+        right = emulation.ready_fields["view"].replace("/?", f"{path}?")
+        other = {"Origin": "http://elsewhere.example"}
+        async with aiohttp.ClientSession() as session:
+            for url, headers in (
+                (right.partition("?")[0], {}),
+                (right[:-1], {}),
+                (right + "x", {}),
+                (right, other),
+                (right.partition("?")[0] + "?token=%C3%A4", {}),
+            ):
+                async with session.get(url, headers=headers) as response:
+                    assert response.status == 403, (url, headers)
+            own = {"Origin": right.partition("//")[0] + "//" + right.split("/")[2]}
+            async with session.get(right, headers=own) as response:
+                assert response.status != 403
+
+    run(scenario, options=OPTIONS)
+
+
+def test_reports_of_runs_need_the_token_and_the_files_of_the_page_do_not(run):
+    async def scenario(emulation, _line):
+        base = emulation.ready_fields["view"].partition("/?")[0]
+        async with aiohttp.ClientSession() as session:
+            async with session.post(f"{base}/runs", json={"run": "1", "event": "end"}) as response:
+                assert response.status == 403
+            async with session.get(f"{base}/static/js/main.js") as response:
+                assert response.status == 200
+            origin = {"Origin": "https://elsewhere.example"}
+            async with session.get(f"{base}/static/js/main.js", headers=origin) as response:
+                assert response.status == 403
+
+    run(scenario, options=OPTIONS)
+
+
+def test_previews_are_made_only_while_somebody_looks_at_the_images(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        await emulation.stepper.step(2.0)
+        assert not any(request.preview for request in run.pipeline.frames)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", frames=False)
+            await emulation.stepper.step(1.0)
+            assert not any(request.preview for request in run.pipeline.frames)
+            before = len(run.pipeline.frames)
+            await page.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(2.0)
+            assert all(request.preview for request in run.pipeline.frames[before + 1 :])
+            await page.until(lambda: page.frames)
+        async with asyncio.timeout(WITHIN_S):
+            while emulation.imager.watchers:
+                await asyncio.sleep(0.01)
+        seen = len(run.pipeline.frames)
+        await emulation.stepper.step(2.0)
+        assert len(run.pipeline.frames) > seen
+        assert not run.pipeline.frames[-1].preview
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_page_receives_description_history_and_each_frame_with_its_numbers(run):
+    run.pipeline.turn_rad = 1e-5
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        await emulation.stepper.step(4.0)
+        known = emulation.device.cycle.published
+        async with Page(emulation) as page:
+            hello = page.messages[0]
+            assert hello["columns"] == list(COLUMNS)
+            assert {row["name"] for row in hello["telemetry"]} == set(emulation.device.icd.telemetry)
+            assert {row["name"] for row in hello["telecommands"]} == set(emulation.device.icd.telecommands)
+            assert hello["star_names"]["27989"] == "Betelgeuse"
+            assert len(page.history) == known
+            assert column(page.history.T, "error_x") == pytest.approx(1e-5 * 206264.806, rel=1e-3)
+            await page.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(1.0)
+            head, jpeg = await page.until(lambda: page.frames and page.frames[-1])
+            assert jpeg == PREVIEW.jpeg
+            assert head["hips"] == [32349]
+            assert column(head["row"], "frame") > known
+            assert MODES[int(column(head["row"], "mode"))] == "tracking"
+            attitude = read(emulation, "precise_attitude")
+            for name in ("x", "y", "z", "w"):
+                assert column(head["row"], f"q{name}") == pytest.approx(attitude[f"q_{name}"], abs=1e-6)
+
+    run(scenario, options=OPTIONS)
+
+
+def test_an_invalid_frame_has_its_reason_and_no_numbers(run):
+    run.pipeline.fail = "too_few_stars"
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(2.0)
+            head, _ = await page.until(lambda: page.frames and page.frames[-1])
+            assert head["reason"] == "too_few_stars"
+            assert column(head["row"], "valid") == 0
+            assert column(head["row"], "error_cross") is None
+            reasons = (await page.message("reasons", lambda item: item["reasons"]))["reasons"]
+            assert reasons[int(column(head["row"], "reason"))] == "too_few_stars"
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_telecommand_goes_over_a_link_and_its_outcome_comes_back(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            shown = await page.ask(do="encode", row="set_mode", values={"mode": "lost_in_space"})
+            assert shown["serial"] == "1F 7F 60 02 1F FF"
+            assert shown["cansend"] == ["0160FD04#02"]
+            sent = await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
+            assert sent["outcome"] == "ok"
+            assert sent["latency_ms"] > 0
+            assert emulation.device.counters.telecommands == 1
+            assert emulation.device.modes.mode == "lost_in_space"
+            refused = await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
+            assert (refused["outcome"], refused["refused"]) == ("invalid_parameter", True)
+            problem = await page.ask(do="encode", row="set_update_rate", values={"rate": "500"})
+            assert "set_update_rate.rate: 500.0 is outside 0.01 to 100 Hz" in problem["problem"]
+            wrong = await page.ask(do="send", row="set_update_rate", values={"rate": "fast"})
+            assert wrong["error"] == "rate: 'fast' is not a number"
+            assert (await page.ask(do="send", row="no_such", values={}))[
+                "error"
+            ] == "no_such: no such telecommand"
+            assert emulation.device.counters.telecommands == 2
+
+    run(scenario, options=OPTIONS)
+
+
+def test_only_the_rows_that_a_page_shows_are_read(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            assert emulation.device.counters.telemetry == 0
+            await page.ask(do="subscribe", rows=["device_status", "quaternion", "no_such_row"])
+            status = await page.message("telemetry", lambda item: item["row"] == "device_status")
+            assert status["values"]["mode"] == "standby"
+            await page.message("telemetry", lambda item: item["row"] == "quaternion")
+            assert {item["row"] for item in page.messages if item["type"] == "telemetry"} == {
+                "device_status",
+                "quaternion",
+            }
+
+    run(scenario, options=OPTIONS)
+
+
+def test_what_the_console_sent_is_a_session_script(run, tmp_path):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            assert "nothing was sent yet" in await page.get("/session.toml")
+            await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
+            await asyncio.sleep(0.06)
+            await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
+            await page.ask(do="send", row="clear_counters", values={})
+            await page.ask(do="read", row="device_status")
+            path = tmp_path / "session.toml"
+            path.write_text(await page.get("/session.toml"))
+            script = load_script(path, load_unit())
+            names = [step.name for step in script.steps]
+            assert len(names) == 5  # the pause is a step too
+            assert script.steps[2].action.refused == "invalid_parameter"
+            assert script.steps[0].action.values == {"mode": "lost_in_space"}
+            await page.ask(do="clear_session")
+            assert "nothing was sent yet" in await page.get("/session.toml")
+
+    run(scenario, options=OPTIONS)
+
+
+def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(5.0)
+        async with Page(emulation) as page:
+            answer = await page.ask(do="control", request={"do": "fault", "optical": {"blank": True}})
+            assert answer["faults"] == {"optical": {"blank": True}}
+            status = await page.message("status", lambda item: item["status"]["faults"])
+            assert status["status"]["faults"] == {"optical": {"blank": True}}
+            wrong = await page.ask(do="control", request={"do": "fault", "optical": {"moon": 3}})
+            assert wrong["error"].startswith("optical")
+            assert (
+                "request: do must be one of"
+                in (await page.ask(do="control", request={"do": "quit"}))["error"]
+            )
+            assert (await page.ask(do="control", request=3))["error"] == "request: an object is needed"
+            assert "do: must be one of" in (await page.ask(do="fly"))["error"]
+            assert (await page.ask(do="control", request={"do": "clear_faults"}))["faults"] == {}
+            slew = await page.ask(do="slew", to={"star": "rigel"}, max_rate_deg_s=2.0)
+            assert slew["kind"] == "slew"
+            await emulation.stepper.step(60.0)
+            truth = await page.ask(do="control", request={"do": "truth"})
+            assert (truth["ra_deg"], truth["dec_deg"]) == pytest.approx((78.634, -8.202), abs=0.01)
+            unknown = await page.ask(do="slew", to={"star": "Nibiru"})
+            assert unknown["error"].startswith("star 'Nibiru': unknown")
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_scenario_from_the_page_begins_now(run, tmp_path):
+    path = tmp_path / "later.toml"
+    path.write_text('name = "later"\n[[at]]\nrun_time_s = 2.0\nfault = { optical = { blank = true } }\n')
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(10.0)
+        async with Page(emulation) as page:
+            assert (await page.ask(do="control", request={"do": "scenario", "name": str(path)}))[
+                "events"
+            ] == 1
+            await emulation.stepper.step(1.9)
+            assert run.launched.faults.describe() == {}
+            await emulation.stepper.step(0.2)
+            assert run.launched.faults.describe() == {"optical": {"blank": True}}
+            missing = await page.ask(do="control", request={"do": "scenario", "name": "no_such"})
+            assert "no such file" in missing["error"]
+
+    run(scenario, options=OPTIONS)
+
+
+def test_the_stepped_clock_runs_until_it_is_paused(run):
+    async def scenario(emulation, _line):
+        async with Page(emulation) as page:
+            assert (await page.ask(do="clock", speed=10))["speed"] == 10
+            await page.message("status", lambda item: item["status"]["run_time_s"] > 2.0)
+            assert (await page.ask(do="clock", speed=0))["speed"] == 0
+            assert (await page.ask(do="clock", speed=1000))["error"] == "speed: 1000 is outside 0 … 100"
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_clock_that_passes_by_itself_cannot_be_stopped(run):
+    async def scenario(emulation, _line):
+        async with Page(emulation) as page:
+            assert (await page.ask(do="clock", speed=1))["error"] == "the clock is real: it cannot be stopped"
+
+    run(scenario, clock="real", options=OPTIONS)
+
+
+def test_the_wire_is_decoded_for_those_who_look_and_saved_as_a_candump_log(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", wire=True)
+            peer = open(emulation.ready_fields["serial"], "r+b", buffering=0)  # noqa: PTH123, SIM115
+            peer.write(bytes.fromhex("1F7FE61FFF"))
+            request = await page.message(
+                "wire", lambda item: any("quaternion?" in line["text"] for line in item["lines"])
+            )
+            line = next(line for line in request["lines"] if "quaternion?" in line["text"])
+            assert (line["bus"], line["out"], line["raw"]) == ("serial", False, "1F 7F E6 1F FF")
+            await page.message(
+                "wire", lambda item: any(line["text"].startswith("quaternion q_x") for line in item["lines"])
+            )
+            peer.close()
+
+    run(scenario, options=OPTIONS)
+
+
+def test_five_pages_receive_every_frame(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        async with AsyncExitStack() as stack:
+            pages = [await stack.enter_async_context(Page(emulation)) for _ in range(5)]
+            for page in pages:
+                await page.ask(do="subscribe", frames=True)
+            for _ in range(3):
+                await emulation.stepper.step(1.0)
+                for page in pages:
+                    await page.until_frame(emulation.device.cycle.published)
+
+    run(scenario, options=OPTIONS)
+
+
+class StalledSocket:
+    """A page that never reads."""
+
+    async def send_str(self, _data):
+        await asyncio.Event().wait()
+
+    async def send_bytes(self, _data):
+        await asyncio.Event().wait()
+
+
+def test_a_page_that_does_not_read_keeps_a_bounded_queue_and_the_newest_image():
+    async def scenario():
+        viewer = Viewer(StalledSocket())
+        pump = asyncio.create_task(viewer.pump())
+        messages = 8 * 3600 * 5  # eight hours at 5 Hz
+        for number in range(messages):
+            viewer.send(str(number))
+            viewer.send_frame(b"%d" % number)
+            if number % 1000 == 0:
+                await asyncio.sleep(0)
+        assert viewer.waiting <= QUEUE_LIMIT + 1
+        assert viewer.dropped >= 2 * messages - QUEUE_LIMIT - 10
+        pump.cancel()
+
+    asyncio.run(scenario())
+
+
+def test_a_session_reports_its_results_to_the_console_while_it_goes_on(run):
+    async def scenario(emulation, _line):
+        address = emulation.ready_fields["view"]
+        async with Page(emulation) as page:
+            feed = await asyncio.to_thread(
+                RunFeed, address, kind="session", title="First light", unit="can vcan0", planned=2
+            )
+            begun = await page.message("run")
+            assert (begun["title"], begun["planned"], begun["end_s"]) == ("First light", 2, None)
+            feed.result("the device answers", "passed", "ok", identity="1", link="can", seconds=0.1)
+            feed.result("it tracks", "failed", "mode=standby", identity="2", traffic=("-> 1F 7F",))
+            failed = await page.message("result", lambda item: item["result"]["status"] == "failed")
+            assert failed["counts"] == {"passed": 1, "failed": 1, "skipped": 0, "not run": 0}
+            await asyncio.to_thread(feed.close)
+            await page.message("run", lambda item: item["end_s"] is not None)
+        async with Page(emulation) as later:  # the report after the run
+            report = await later.message("run")
+            assert [result["name"] for result in report["results"]] == ["the device answers", "it tracks"]
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_report_to_no_console_is_an_error_in_one_line(run):
+    with pytest.raises(BenchError, match="must be the address of a console"):
+        RunFeed("vcan0", kind="session", title="", unit="", planned=0)
+    with pytest.raises(BenchError, match="does not take reports"):
+        RunFeed("http://127.0.0.1:9/?token=x", kind="session", title="", unit="", planned=0)
+
+    async def scenario(emulation, _line):
+        address = emulation.ready_fields["view"] + "x"
+        with pytest.raises(BenchError, match="the token in the address is missing or wrong"):
+            await asyncio.to_thread(RunFeed, address, kind="session", title="", unit="", planned=0)
+
+    run(scenario, options=OPTIONS)
+
+
+def test_the_candump_log_has_the_frames_of_the_bus(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", wire=True)
+            await page.ask(do="send", row="clear_counters", values={})
+            text = await page.get("/wire.log")
+            ids = [parse_candump(line)[1].id for line in text.splitlines()]
+            assert ids == [0x0167FD04, 0x026704FD]
+
+    run(
+        scenario,
+        options=OPTIONS,
+        links={"serial": {"port": "off"}, "can": {"channel": "virtual:console-test"}},
+    )

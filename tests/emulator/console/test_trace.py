@@ -1,0 +1,82 @@
+"""The trace of the wires: what each piece means."""
+
+import pytest
+
+from starhil.emulator.console.trace import Decoder, WireItem, canopen_text
+from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
+
+ICD = load_unit()
+MODE = ICD.telecommands["set_mode"]
+STATUS = ICD.telemetry["device_status"]
+
+
+def lines(items, dialect=Dialect.B):
+    decoder = Decoder(ICD, lambda: dialect)
+    return [
+        (line["kind"], line["text"])
+        for line in (
+            decoder.line(
+                WireItem(0.01 * number, "can" if isinstance(item, CanFrame) else "serial", outgoing, item)
+            )
+            for number, (outgoing, item) in enumerate(items)
+        )
+    ]
+
+
+@pytest.mark.parametrize("dialect", list(Dialect))
+def test_serial_requests_and_replies_are_named_in_every_dialect(dialect):
+    data = STATUS.encode(STATUS.example(), saturate=True)
+    request, command = Request.of(STATUS.id), Request.of(MODE.id, MODE.encode({"mode": "standby"}))
+    found = lines(
+        [
+            (False, encode_request(request)),
+            (True, encode_reply(Reply(ReplyKind.TELEMETRY, STATUS.id, data), dialect)),
+            (False, encode_request(command)[:3]),
+            (False, encode_request(command)[3:]),
+            (True, encode_reply(Reply(ReplyKind.NACK, MODE.id, code=ErrorCode.SEQUENCE), dialect)),
+        ],
+        dialect,
+    )
+    assert found[0] == ("telemetry", "device_status?")
+    assert found[1][0] == "reply"
+    assert found[1][1].startswith("device_status mode=boot error=none")
+    assert found[2] == ("part", "part of a message")
+    assert found[3] == ("telecommand", "set_mode mode=standby")
+    assert found[4] == ("nack", "set_mode refused: sequence")
+
+
+def test_segments_on_can_are_joined_for_each_pair_of_nodes():
+    data = STATUS.encode(STATUS.example(), saturate=True)
+    reply = Reply(ReplyKind.TELEMETRY, STATUS.id, data, destination=1)
+    other = Reply(ReplyKind.TELEMETRY, STATUS.id, data, destination=253)
+    segments = zip(encode_reply_frames(reply, 4), encode_reply_frames(other, 4), strict=True)
+    found = lines([(True, frame) for pair in segments for frame in pair])
+    assert all(text.endswith("segment of device_status") for _, text in found[:-2])
+    assert found[-2][1].startswith("4→1 device_status mode=boot")
+    assert found[-1][1].startswith("4→253 device_status mode=boot")
+
+
+def test_requests_on_can_and_junk_are_told_apart():
+    (frame,) = encode_request_frames(Request.of(STATUS.id), 1, 4)
+    found = lines(
+        [(False, frame), (False, CanFrame(0x1FFFFFFF, b"\x01")), (True, CanFrame(0x05EE0401, bytes(3)))]
+    )
+    assert found[0] == ("telemetry", "1→4 device_status?")
+    assert found[1][0] == "fault"
+    assert found[2][0] == "reply"
+    assert found[2][1].startswith("4→1 id 238") or "bytes" in found[2][1]
+
+
+@pytest.mark.parametrize(
+    ("can_id", "text"),
+    [
+        (0x000, "NMT command"), (0x080, "SYNC"), (0x0AC, "node 44 EMCY"), (0x1AC, "node 44 TPDO 1"),
+        (0x5AC, "node 44 SDO reply"), (0x62C, "node 44 SDO request"), (0x72C, "node 44 heartbeat"), (0x7E5, "LSS request"),
+        (0x101, "COB-ID 101"),
+    ],
+)  # fmt: skip
+def test_frames_of_canopen_are_named_by_their_function(can_id, text):
+    assert canopen_text(CanFrame(can_id, extended=False)) == text
