@@ -349,6 +349,8 @@ def test_echo_is_the_ack_of_a_telecommand_that_has_no_other_answer() -> None:
 
 def test_refusal_that_the_header_cannot_express_sends_nothing() -> None:
     assert NOS3.encode_reply(Reply(ReplyKind.NACK, 2, code=ErrorCode.BUSY)) == b""
+    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, klass="get")) == b""
+    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, klass="set"))
 
 
 def test_code_that_does_not_fit_the_header_is_an_error() -> None:
