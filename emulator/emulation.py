@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from starhil.emulator.clock import Clock, SteppedClock, make_clock
 from starhil.emulator.device.cycle import Measurement
@@ -329,7 +330,13 @@ class Emulation:
             awake.cancel()
             raise error
         await awake
-        fields = {**self.ready_fields, "seed": str(self.profile.run.seed), "clock": self.clock.name}
+        unit = quote(self.profile.unit_source, safe="/:.~")  # a field has no blanks
+        fields = {
+            **self.ready_fields,
+            "unit": unit,
+            "seed": str(self.profile.run.seed),
+            "clock": self.clock.name,
+        }
         return "ready " + " ".join(f"{key}={value}" for key, value in fields.items())
 
     async def close(self) -> None:

@@ -45,7 +45,7 @@ class SessionRequest:
 
     script: Path
     options: LinkOptions
-    unit: str = DEFAULT_UNIT
+    unit: str | None = None
     start: bool = False
     profile: str | None = None
     folder: Path | None = None
@@ -81,7 +81,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     BenchError
         The script is invalid, a port is not available, or the emulator does not start.
     """
-    icd = load_unit(request.unit)
+    icd = load_unit(request.unit or DEFAULT_UNIT)
     path = find_script(request.script)
     script = load_script(path, icd)
     if request.keep_going:
@@ -107,6 +107,8 @@ def run_session(request: SessionRequest) -> SessionResult:
                 state = stack.enter_context(temporary_folder("starhil-session-"))
                 emulator = _emulator(request, script, options, folder, state)
             bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+            if emulator is not None:
+                emulator.check_unit(request.unit)
             for link in bench.links:
                 bench.client(link)  # report a missing port before the first step
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()

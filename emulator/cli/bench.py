@@ -10,8 +10,9 @@ from typing import Annotated, Any, Final, TypeAlias
 
 import typer
 
-from starhil.emulator.cli.options import DIALECTS, AsJson, DeviceAddress, SerialDialect, one_of
+from starhil.emulator.cli.options import DIALECTS, AsJson, DeviceAddress, SerialDialect, Unit, one_of
 from starhil.emulator.cli.output import output_help, prepare_output
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 _MIN_TABLE_WIDTH: Final = 134
 
@@ -78,17 +79,17 @@ def latency(
     workers: Annotated[
         list[str] | None, typer.Option("--worker", help="process or thread. May be repeated.")
     ] = None,
+    unit: Unit = DEFAULT_UNIT,
     as_json: AsJson = False,
 ) -> None:
     """Measure reply latency on both links while frames are solved, and the start-up of the emulator."""
     from starhil.hil_tests.latency import measure
-    from starhil.protocol.icd import load_unit
 
     chosen = [one_of("--worker", worker, ("process", "thread")) for worker in workers or ["process"]]
     report = _progress()
     rows, processes = [], []
     for worker in chosen:
-        links, process = measure(load_unit(), rates or [0.0, 1.0, 10.0], seconds, worker, report)
+        links, process = measure(unit, rates or [0.0, 1.0, 10.0], seconds, worker, report)
         rows += links
         processes.append(process)
     if as_json:

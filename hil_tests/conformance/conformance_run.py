@@ -32,7 +32,7 @@ DEFAULT_BAUD: Final = 115200
 class ConformanceRequest:
     """Options of the user; see `starhil conformance --help`."""
 
-    unit: str = DEFAULT_UNIT
+    unit: str | None = None
     serial: str | None = None
     can: str | None = None
     canopen_node: int | None = None
@@ -91,7 +91,7 @@ def run_conformance(
     BenchError, ProtocolError
         A port, a bus or the emulator is not available.
     """
-    icd = load_unit(request.unit)
+    icd = load_unit(request.unit or DEFAULT_UNIT)
     cases = all_cases(request, icd)
     outcomes: list[Outcome] = []
     complete = False
@@ -196,6 +196,7 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
         extra=extra,
     )
     emulator = stack.enter_context(EmulatorProcess(command))
+    emulator.check_unit(request.unit)
     return emulator.ready.get("serial"), emulator.ready.get("can")
 
 

@@ -12,6 +12,8 @@ from starhil.emulator.cli.unit import group
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
+from starhil.hil_tests.emulator_process import EmulatorProcess
+from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.unit_folders import shipped_units
 
@@ -83,3 +85,20 @@ def test_units_that_ship_are_listed_and_described():
 
 def test_an_unknown_unit_is_answered_with_similar_names():
     assert "did you mean cubestar" in str(unit("describe", "cubstar").exception)
+
+
+def test_a_profile_names_its_unit_by_name_or_by_a_folder_beside_it(tmp_path):
+    profile = tmp_path / "profile.toml"
+    for unit_, source in (("sagitta", "sagitta"), ("mine", str(tmp_path / "mine")), ("/a/b", "/a/b")):
+        profile.write_text(f'extends = "cubestar"\nunit = "{unit_}"\n', encoding="utf-8")
+        assert load_profile(str(profile)).unit_source == source
+
+
+def test_a_bench_that_speaks_another_unit_than_the_profile_says_so():
+    process = EmulatorProcess(["none"])
+    process.ready = {"unit": "/my%20units/one"}
+    process.check_unit("/my units/one")
+    with pytest.raises(BenchError, match="the profile's unit is /my units/one: give --unit"):
+        process.check_unit(None)
+    process.ready = {"unit": "cubestar"}
+    process.check_unit(None)
