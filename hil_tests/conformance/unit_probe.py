@@ -52,7 +52,8 @@ class UnitProbe:
         self.timeout_s = icd.link.serial.timeout if icd.link.serial is not None else 0.5
         self.lively = min(icd.telemetry.values(), key=lambda row: row.size)
         """Row by which the unit shows that it answers."""
-        self._style = style
+        self.style = style or getattr(self.stack, "dialect", None)
+        """Dialect of the replies, of a unit that has dialects."""
         self._settings: list[tuple[Row, bytes]] = []
         self.drain()
 
@@ -84,7 +85,7 @@ class UnitProbe:
         self.raw = b""
         """All bytes received since the last drain."""
         self._received = bytearray()
-        self._receiver = self.stack.host(self._style)
+        self._receiver = self.stack.host(self.style)
         self._expected: deque[tuple[Request, int]] = deque()
         self._replies: deque[Reply | LinkFault] = deque()
         self._unsolicited: list[Reply] = []
