@@ -60,7 +60,7 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     cases: list[Case[Any]] = []
     if request.serial is not None:
         cases += serial_suite(icd)
-    if request.can is not None:
+    if request.can is not None and (icd.link.can is not None or request.canopen_node is None):
         cases += can_suite(icd)
     if request.canopen_node is not None:
         from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
