@@ -83,7 +83,9 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
     spec, unit = request.config.getoption(f"--starhil-{link}"), request.config.getoption("--starhil-unit")
     if spec is None:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
-        spec, unit = emulator.ready[link], emulator.unit
+        spec, unit = emulator.ready.get(link), emulator.unit
+        if spec is None:
+            pytest.fail(f"unit {unit} has no {link} link")
     timeout_s = request.config.getoption("--starhil-timeout")
     common = {"unit": unit or "cubestar", "timeout_s": timeout_s}
     if link == "can":

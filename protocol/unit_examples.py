@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from starhil.protocol.can_framing import encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Row
@@ -32,7 +32,7 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
     """
     for row in icd.rows:
         data = row.encode(row.example())
-        request = icd.request(row, data if row.kind == "telecommand" else b"", HOST_ADDRESS)
+        request = icd.request(row, data if row.kind == "telecommand" else b"")
         replies = [_reply(icd, row, answer, request) for answer in row.answers]
         if icd.link.serial is not None:
             stack = build_serial_stack(icd)
@@ -46,7 +46,11 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
             )
         if icd.link.can is not None and icd.link.can.kind == "cubespace":
             sent = encode_request_frames(request, HOST_ADDRESS, DEVICE_ADDRESS)
-            came = [frame for reply in replies for frame in encode_reply_frames(reply, DEVICE_ADDRESS)]
+            came = [
+                frame
+                for reply in replies
+                for frame in encode_reply_frames(replace(reply, destination=HOST_ADDRESS), DEVICE_ADDRESS)
+            ]
             yield Exchange(
                 row,
                 "CAN",
@@ -60,9 +64,9 @@ def _reply(icd: InterfaceDefinition, row: Row, answer: str, request: Request) ->
         return Reply.echo(request)
     named = icd.telemetry[answer.partition(":")[2]] if answer.startswith("row:") else row
     if named.kind == "telecommand":
-        return Reply(ReplyKind.ACK, row.id, destination=HOST_ADDRESS, klass=row.klass)
+        return Reply(ReplyKind.ACK, row.id, klass=row.klass)
     data = named.encode(named.example(), saturate=True)
-    return Reply(ReplyKind.TELEMETRY, named.id, data, destination=HOST_ADDRESS, klass=named.klass)
+    return Reply(ReplyKind.TELEMETRY, named.id, data, klass=named.klass)
 
 
 def _hex(data: bytes) -> str:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from starhil.emulator.cli.unit import group
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile import load_profile
+from starhil.emulator.profile import Profile, load_profile
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
@@ -102,3 +102,23 @@ def test_a_bench_that_speaks_another_unit_than_the_profile_says_so():
         process.check_unit(None)
     process.ready = {"unit": "cubestar"}
     process.check_unit(None)
+
+
+@pytest.mark.parametrize(
+    ("unit_", "links", "message"),
+    [
+        ("sagitta", {"serial": {"port": "off"}}, "can.channel: unit sagitta has none of the links"),
+        ("nos3", {"canopen": {"node": 5}}, "canopen.node: unit nos3 has no CANopen"),
+        ("oresat", {"can": {"channel": "off"}}, "serial.port: unit .* has none of the links"),
+    ],
+)
+def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch, unit_, links, message):
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: pytest.fail("the pipeline was started"))
+    with pytest.raises(EmulatorError, match=message):
+        Emulation(Profile.model_validate({"unit": unit_, "links": links}))
+
+
+def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, caplog):
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: None)
+    Emulation(Profile.model_validate({"unit": "sagitta", "links": {"can": {"channel": "vcan0"}}}))
+    assert "links.can.channel: unit sagitta has no such link" in caplog.text

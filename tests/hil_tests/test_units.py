@@ -1,0 +1,97 @@
+"""The OBC client on another unit: answers of other rows, errors by the unit's numbers, telecommands without an answer."""
+
+import asyncio
+import struct
+
+import pytest
+
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.errors import NackError
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import Reply, ReplyKind
+
+DEFINITION = """
+[unit]
+name = "x"
+version = "1"
+doc = "d"
+[errors]
+busy = 66
+[[class]]
+name = "do"
+kind = "telecommand"
+code = 1
+[[class]]
+name = "get"
+kind = "telemetry"
+code = 2
+"""
+
+
+def row(kind: str, number: int, name: str, fields: str = "", more: str = "") -> str:
+    """Text of a row."""
+    return f'[[{kind}]]\nid = {number}\nname = "{name}"\ndoc = "d"\nprovenance = "ours"\n{more}\nfields = [{fields}]\n'
+
+
+class FakeLink:
+    """Answers each request as it is told to."""
+
+    def __init__(self, *replies: Reply) -> None:
+        self.replies = replies
+        self.requests = []
+        self.on_reply = self.on_fault = None
+
+    def request(self, request, _reply_size):
+        self.requests.append(request)
+        for reply in self.replies:
+            self.on_reply(reply)
+
+
+@pytest.fixture
+def ask(tmp_path):
+    """Ask a client something, with a link that answers as given."""
+    text = (
+        DEFINITION
+        + row("telemetry", 1, "status", '{ name = "count", type = "u16" }')
+        + row("telemetry", 2, "other", '{ name = "count", type = "u16" }')
+        + row("telecommand", 1, "go", more='answer = ["row:status"]')
+        + row("telecommand", 3, "silent", more="answer = []")
+    )
+    (tmp_path / "unit.toml").write_text(text, encoding="utf-8")
+    icd = load_unit(tmp_path)
+
+    def ask(call, *replies):
+        async def whole():
+            client = AsyncObcClient(FakeLink(*replies), icd, timeout_s=5.0)
+            return client, await call(client)
+
+        return asyncio.run(whole())
+
+    return ask
+
+
+STATUS = Reply(ReplyKind.TELEMETRY, 1, struct.pack("<H", 7), klass="get")
+
+
+def test_a_row_is_told_from_one_of_another_class_with_its_id(ask):
+    client, values = ask(lambda obc: obc.telemetry("status"), Reply(ReplyKind.ACK, 1, klass="do"), STATUS)
+    assert values == {"count": 7}
+    assert [reply.klass for reply in client.stray_replies] == ["do"]
+
+
+def test_a_telecommand_is_answered_by_the_row_that_the_unit_names(ask):
+    other = Reply(ReplyKind.TELEMETRY, 2, b"\0\0", klass="get")
+    client, ack = ask(lambda obc: obc.command("go"), other, STATUS)
+    assert ack.name == "go"
+    assert list(client.stray_replies) == [other]
+
+
+def test_a_telecommand_without_an_answer_is_not_waited_for(ask):
+    client, ack = ask(lambda obc: obc.command("silent"))
+    assert ack.name == "silent"
+    assert [request.id for request in client.link.requests] == [3]
+
+
+def test_a_refusal_has_the_name_that_the_unit_gives_its_number(ask):
+    with pytest.raises(NackError, match=r"error 66 \(busy\)"):
+        ask(lambda obc: obc.command("go"), Reply(ReplyKind.NACK, 1, code=66, klass="do"))
