@@ -48,6 +48,11 @@ class HeaderField:
     classes: frozenset[str] | None
     bits: tuple[_Bit, ...]
 
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Roles of the field and of its bits."""
+        return tuple(role for role in (self.role, *(bit.role for bit in self.bits)) if role)
+
     def in_class(self, klass: str) -> bool:
         """Return whether messages of a class have this field."""
         return self.classes is None or klass in self.classes
@@ -108,10 +113,8 @@ class Header:
         )
         self._class_of = class_of
         self._overhead = overhead
-        self.roles: Final = frozenset(
-            role for field in self.fields for role in (field.role, *(bit.role for bit in field.bits)) if role
-        )
-        """Roles that the header carries."""
+        self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
+        """Roles that the header carries, in messages of any class."""
         self.defaults: Final = {
             role: default
             for field in self.fields
@@ -122,6 +125,10 @@ class Header:
             if role
         }
         """Value of each role where a message has none."""
+
+    def roles_in(self, klass: str) -> frozenset[str]:
+        """Return the roles that the header carries in messages of a class."""
+        return frozenset(role for field in self.fields if field.in_class(klass) for role in field.roles)
 
     def size(self, klass: str) -> int:
         """Return the bytes of the header in messages of a class."""

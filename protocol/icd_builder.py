@@ -467,7 +467,7 @@ class _Builder:
                 slots=tuple(layout.slots),
                 doc=model.doc,
                 provenance=model.provenance,
-                source=model.source,
+                source=model.source or (self._unit.source if model.provenance == "confirmed" else ""),
                 klass=klass,
                 action=model.action,
                 arguments={

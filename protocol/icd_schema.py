@@ -36,6 +36,8 @@ class UnitModel(_Model):
     """Version of the definition."""
     doc: str
     """What the unit is, in one sentence."""
+    source: str = ""
+    """The public source of the confirmed rows that name none themselves."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Ids from this one up are telemetry, those below are telecommands; left out if classes or rows decide."""
     plugin: str | None = None

@@ -341,7 +341,7 @@ class ComposedStack(SerialStack):
             return self.encode_request(echo)
         refused = reply.kind is ReplyKind.NACK
         header = self.reply_header
-        if refused and not header.roles & {"status", "ack"}:
+        if refused and not header.roles_in(reply.klass) & {"status", "ack"}:
             return b""
         values = {
             "id": reply.id or 0,

@@ -349,6 +349,8 @@ def test_echo_is_the_ack_of_a_telecommand_that_has_no_other_answer() -> None:
 
 def test_refusal_that_the_header_cannot_express_sends_nothing() -> None:
     assert NOS3.encode_reply(Reply(ReplyKind.NACK, 2, code=ErrorCode.BUSY)) == b""
+    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, klass="get")) == b""
+    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, klass="set"))
 
 
 def test_code_that_does_not_fit_the_header_is_an_error() -> None:
@@ -473,6 +475,50 @@ def test_binary_message_that_contains_the_delimiter_is_an_error_with_a_remedy() 
     }
     with pytest.raises(ProtocolError, match='encoding = "hex"'):
         stack_of(link).encode_request(Request(TC, 1, b"\r\n"))
+
+
+def counted(includes: list[str], covers: list[str], start: list[int]) -> ComposedStack:
+    header = [{"role": "length", "type": "u8", "includes": includes}, {"role": "id", "type": "u8"}]
+    return stack_of(
+        {
+            "framing": {"kind": "length", "start": start, "end": [0x0A]},
+            "check": {"kind": "xor", "covers": covers},
+            "request_header": header,
+            "reply_header": header,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("includes", "covers", "expected"),
+    [
+        (["data"], ["header", "data"], "55 02 07 01 03 07 0A"),
+        (["header", "data"], ["data"], "55 04 07 01 03 02 0A"),
+        (["header", "data", "check"], ["header"], "55 05 07 01 03 02 0A"),
+        (["start", "header", "data", "check", "end"], ["start", "header", "data"], "55 07 07 01 03 57 0A"),
+    ],
+)
+def test_length_counts_and_check_covers_the_parts_that_are_named(
+    includes: Any, covers: Any, expected: str
+) -> None:
+    stack = counted(includes, covers, [0x55])
+    request = Request(TC, 7, b"\x01\x03")
+    assert stack.encode_request(request).hex(" ").upper() == expected
+    assert stack.device().feed(bytes.fromhex(expected), 0.0) == [request]
+
+
+def test_link_without_a_start_is_in_step_again_after_a_silence() -> None:
+    stack = counted(["data"], ["header", "data"], [])
+    request = Request(TC, 7, b"\x01\x03")
+    sent = stack.encode_request(request)
+    receiver = stack.device()
+    wrong = sent[:-1] + b"\x00"
+    assert faults(list(receiver.feed(wrong + sent, 0.0))) == [FaultKind.UART_PROTOCOL]
+    assert receiver.busy
+    assert receiver.feed(sent, 0.1) == []
+    assert receiver.flush(0.7) == []
+    assert not receiver.busy
+    assert receiver.feed(sent, 0.8) == [request]
 
 
 # -- definitions that do not fit ---------------------------------------------------------------------------------------

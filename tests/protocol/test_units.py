@@ -224,6 +224,14 @@ def test_the_skeleton_can_be_emulated(tmp_path):
     assert examples[0].request[0].startswith("C0 10 01 01")
 
 
+@pytest.mark.parametrize("name", [name for name in shipped_units() if name != "cubestar"])
+def test_every_row_of_a_foreign_unit_names_its_public_source(name):
+    rows = list(load_unit(name).rows)
+    assert {row.provenance for row in rows} <= {"confirmed", "ours"}
+    assert all(row.source for row in rows if row.provenance == "confirmed")
+    assert not any(row.source for row in rows if row.provenance == "ours")
+
+
 @pytest.mark.parametrize("name", shipped_units())
 def test_every_shipped_unit_can_be_emulated(name):
     assert check_unit(name) == []

@@ -116,3 +116,14 @@ def test_card_is_restarted_by_an_entry():
         assert struct.unpack("<H", upload(unit, 0x3003, 6))[0] == before + 1
 
     with_unit("oresat", "canopen", scenario)
+
+
+def test_unit_whose_only_link_is_canopen_opens_it_by_itself(run):
+    async def scenario(emulation, line):
+        assert emulation.serial is None
+        assert emulation.can is None
+        return line
+
+    links = {"serial": {"port": "auto"}, "can": {"channel": "auto"}}
+    line = run(scenario, unit="oresat", links=links)
+    assert f"canopen={NODE}" in line.split()

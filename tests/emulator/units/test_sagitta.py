@@ -118,6 +118,8 @@ PARAMETERS = [
     (16, struct.pack("<BfBfB", 2, 0.25, 4, 0.125, 5)),
     (23, struct.pack("<BBHHf", 1, 20, 3, 200, 0.25)),
     (25, struct.pack("<2f", 0.25, 0.5)),
+    (30, struct.pack("<4H", 1, 2, 3, 4)),
+    (31, struct.pack("<5Q3B", 1 << 60, 2, 3, 4, 5, 6, 7, 8)),
 ]
 
 
@@ -196,7 +198,7 @@ def test_stars_are_reported_interleaved():
 
 
 @pytest.mark.parametrize(
-    ("row", "size"), [(11, 64), (27, 12), (28, 144), (36, 38), (37, 146), (39, 4), (40, 321)]
+    ("row", "size"), [(11, 64), (27, 12), (28, 144), (36, 38), (37, 146), (39, 4), (40, 321), (49, 64)]
 )
 def test_telemetry_has_the_length_of_the_table(row, size):
     def scenario(unit: Emulated) -> None:
@@ -211,6 +213,7 @@ def test_boot_is_accepted_and_wrong_lengths_are_refused():
         assert ask(unit, ACTION, 14, b"\x01") != b"\0"
         assert ask(unit, SET, 99, b"\x01") != b"\0"
         assert ask(unit, TELEMETRY, 99)[0] != 0
+        assert unit.ask(request(GET, 99)) == b""
 
     with_unit("sagitta", "serial", scenario)
 
