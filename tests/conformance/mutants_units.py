@@ -130,7 +130,7 @@ def any_class(unit: SimulatedUnit) -> None:
     stack = stack_of(unit)
     names = stack.classes._requests
     for code in range(256):
-        names.setdefault(code, "parameter")
+        names.setdefault(code, "telemetry")
 
 
 def times_out_never(unit: SimulatedUnit) -> None:

@@ -24,7 +24,7 @@ def test_a_unit_that_ships_passes_every_case_of_its_definition(unit: str) -> Non
     assert len(outcomes) >= 15
 
 
-@pytest.mark.parametrize("mutant", mutants(), ids=lambda mutant: f"{mutant.unit}: {mutant.name}")
+@pytest.mark.parametrize("mutant", list(mutants()), ids=lambda mutant: f"{mutant.unit}: {mutant.name}")
 def test_a_mutant_of_a_unit_is_caught_by_its_case(mutant: UnitMutant) -> None:
     cases = {case.id: case for case in serial_suite(load_unit(mutant.unit))}
     with SimulatedUnit("serial", mutant.damage, unit=mutant.unit) as simulated:
