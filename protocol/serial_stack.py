@@ -329,7 +329,7 @@ class ComposedStack(SerialStack):
             values["flags"] = request.flags
         if "class" in self.request_header.roles:
             values["class"] = self.classes.request_code(request.klass)
-        return self._close(self.request_header.pack(values, request.klass, len(request.data)), request.data)
+        return self.close(self.request_header.pack(values, request.klass, len(request.data)), request.data)
 
     def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:  # noqa: ARG002 -- one style
         """Return a reply as bytes on the line; none for a refusal that the unit's header cannot express."""
@@ -361,9 +361,10 @@ class ComposedStack(SerialStack):
                 reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
             )
         data = b"" if refused else reply.data
-        return self.framing.encode(self._close(header.pack(values, reply.klass, len(data)), data))
+        return self.framing.encode(self.close(header.pack(values, reply.klass, len(data)), data))
 
-    def _close(self, header: bytes, data: bytes) -> bytes:
+    def close(self, header: bytes, data: bytes) -> bytes:
+        """Return header, data and check of a message."""
         return header + data + self.check.compute(self._covered(header, data))
 
     def _covered(self, header: bytes, data: bytes) -> bytes:

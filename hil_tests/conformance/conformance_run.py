@@ -11,10 +11,11 @@ from typing import Any, Final
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
-from starhil.hil_tests.conformance.ports import live_can, live_serial
+from starhil.hil_tests.conformance.ports import Port, live_can, live_serial
 from starhil.hil_tests.conformance.runner import Outcome, not_run, run_cases, select_cases
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.suites import can_suite, serial_suite
+from starhil.hil_tests.conformance.suites import can_suite, is_cubestar, serial_suite
+from starhil.hil_tests.conformance.unit_probe import UnitProbe
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
@@ -62,7 +63,7 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     cases: list[Case[Any]] = []
     if request.serial is not None:
         cases += serial_suite(icd)
-    if request.can is not None:
+    if request.can is not None and (icd.link.can is not None or request.canopen_node is None):
         cases += can_suite(icd)
     if request.canopen_node is not None:
         from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
@@ -168,8 +169,7 @@ def _run_on_links(
             baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
             if baud is not None:  # the line itself keeps its pace
                 baud = round(baud / request.speed)
-            probe = SerialProbe(port, icd, dialect=request.dialect, baud=baud, times=request.times)
-            run_cases(probe, mine, on_outcome, port=serial)
+            run_cases(_serial_probe(request, icd, port, baud), mine, on_outcome, port=serial)
         mine = [item for item in cases if item.id.startswith("can.")]
         if mine and can is not None:
             bus = stack.enter_context(live_can(can, request.speed))
@@ -179,6 +179,14 @@ def _run_on_links(
         mine = [item for item in cases if item.id.startswith("canopen.")]
         if mine and can is not None:
             _run_canopen(request, icd, can, mine, on_outcome)
+
+
+def _serial_probe(
+    request: ConformanceRequest, icd: InterfaceDefinition, port: Port[bytes], baud: int | None
+) -> SerialProbe | UnitProbe:
+    if is_cubestar(icd):
+        return SerialProbe(port, icd, dialect=request.dialect, baud=baud, times=request.times)
+    return UnitProbe(port, icd, times=request.times)
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:

@@ -126,11 +126,11 @@ def _length_cases(row: Row) -> Iterator[Case[LinkProbe]]:
 
 def _field_cases(row: Row) -> Iterator[Case[LinkProbe]]:
     for index, (name, field) in enumerate(row.named_fields.items()):
-        for why, data in _bad_values(row, field):
+        for why, data in bad_values(row, field):
             yield _bad_field_case(row, name, index, why, data)
 
 
-def _bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
+def bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
     """Yield parameters of a telecommand with one field outside its limits."""
     good = bytearray(row.encode(row.example()))
 
@@ -138,7 +138,7 @@ def _bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
         return bytes(good[: field.offset] + raw + good[field.offset + field.size :])
 
     if field.kind == "float":
-        form = "<f" if field.type == "f32" else "<d"
+        form = ("<" if field.slot.order == "little" else ">") + ("f" if field.type == "f32" else "d")
         yield "nan", with_raw(struct.pack(form, math.nan))
         yield "infinite", with_raw(struct.pack(form, math.inf))
         low, high = field.physical_limits
@@ -150,16 +150,16 @@ def _bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
     elif field.kind == "enum" and not field.width:
         known = field.enum.values.values() if field.enum is not None else ()
         unknown = next(number for number in range(255, -1, -1) if number not in known)
-        yield "unknown", with_raw(unknown.to_bytes(field.size, "little"))
+        yield "unknown", with_raw(unknown.to_bytes(field.size, field.slot.order))
     elif field.kind == "integer":
         signed = field.type.startswith("i")
         low_raw, high_raw = field.raw_limits
         bits = 8 * field.size
         least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
         if low_raw > least:
-            yield "low", with_raw((low_raw - 1).to_bytes(field.size, "little", signed=signed))
+            yield "low", with_raw((low_raw - 1).to_bytes(field.size, field.slot.order, signed=signed))
         if high_raw < greatest:
-            yield "high", with_raw((high_raw + 1).to_bytes(field.size, "little", signed=signed))
+            yield "high", with_raw((high_raw + 1).to_bytes(field.size, field.slot.order, signed=signed))
 
 
 def _bad_field_case(row: Row, name: str, index: int, why: str, data: bytes) -> Case[LinkProbe]:

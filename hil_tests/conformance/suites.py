@@ -4,23 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from starhil.hil_tests.conformance import behaviour_cases, can_cases, image_cases, serial_cases, traffic_cases
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.row_cases import row_cases
-from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.unit_cases import unit_cases
+from starhil.hil_tests.errors import BenchError
 from starhil.protocol.icd import InterfaceDefinition
 
+CUBESTAR_ROWS: Final = frozenset(
+    {"identification", "communication_status", "acknowledge", "device_status", "parameter"}
+)
+"""Telemetry by which the cases of a CubeStar follow what the unit does."""
 
-def serial_suite(icd: InterfaceDefinition) -> tuple[Case[SerialProbe], ...]:
-    """Return the cases for a device on a serial line."""
-    return _named("serial", serial_cases.CASES, _common(icd))
+
+def is_cubestar(icd: InterfaceDefinition) -> bool:
+    """Return whether a unit has the rows that the cases of a CubeStar need; others get those of any unit."""
+    return icd.telemetry.keys() >= CUBESTAR_ROWS
+
+
+def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
+    """Return the cases for a unit on a serial line: those of a CubeStar, or those that its definition yields.
+
+    Raises
+    ------
+    BenchError
+        The unit has no serial link.
+    """
+    if icd.link.serial is None:
+        raise BenchError(f"unit {icd.name}: has no serial link")
+    return _named("serial", *((serial_cases.CASES, _common(icd)) if is_cubestar(icd) else (unit_cases(icd),)))
 
 
 def can_suite(icd: InterfaceDefinition) -> tuple[Case[CanProbe], ...]:
-    """Return the cases for a device on CAN."""
+    """Return the cases for a CubeStar on CAN.
+
+    Raises
+    ------
+    BenchError
+        The unit is not one.
+    """
+    if not is_cubestar(icd):
+        raise BenchError(
+            f"unit {icd.name}: there are no cases for its CAN link; those for its serial line are run with --serial"
+        )
     return _named("can", can_cases.CASES, _common(icd))
 
 

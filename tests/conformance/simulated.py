@@ -22,10 +22,13 @@ from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.suites import is_cubestar
+from starhil.hil_tests.conformance.unit_probe import UnitProbe
 from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import PacedWriter
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
 
@@ -176,11 +179,16 @@ class SimulatedUnit:
     """
 
     def __init__(
-        self, link: str, damage: Callable[[SimulatedUnit], None] | None = None, dialect: str = "b"
+        self,
+        link: str,
+        damage: Callable[[SimulatedUnit], None] | None = None,
+        dialect: str = "b",
+        unit: str = DEFAULT_UNIT,
     ) -> None:
         self.loop = SimulatedLoop()
         self.kind = link
         self.dialect = dialect
+        self.icd = load_unit(unit)
         self._damage = damage
 
     def __enter__(self) -> Self:
@@ -188,12 +196,13 @@ class SimulatedUnit:
         self.loop.run_until_complete(self._start())
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
-        icd = load_unit()
-        self.probe = (
-            SerialProbe(port, icd, dialect=self.dialect, baud=BAUD, times=times)
-            if self.kind == "serial"
-            else CanProbe(port, icd, times=times)
-        )
+        self.probe: SerialProbe | CanProbe | UnitProbe
+        if not is_cubestar(self.icd):
+            self.probe = UnitProbe(port, self.icd, times=times)
+        elif self.kind == "serial":
+            self.probe = SerialProbe(port, self.icd, dialect=self.dialect, baud=BAUD, times=times)
+        else:
+            self.probe = CanProbe(port, self.icd, times=times)
         self.probe.sleep(1.0)
         return self
 
@@ -201,10 +210,11 @@ class SimulatedUnit:
         self.imager = DirectImager(TruthImager().handle)
         attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
         links = {"serial": {"dialect": self.dialect}}
-        profile = Profile.model_validate({"links": links})
+        parameters = {} if is_cubestar(self.icd) else {"start_mode": "lost_in_space"}
+        profile = Profile.model_validate({"links": links, "parameters": parameters})
         self.store = MemoryStore()
         self.device = Device(
-            profile, load_unit(), LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
+            profile, self.icd, LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
         )
         self.requests = Requests(self.device)
         self.transport = MemoryTransport(self.loop, paced=self.kind == "serial")

@@ -40,6 +40,14 @@ def emulator(bus, tmp_path_factory):
         yield process
 
 
+@pytest.fixture(scope="module")
+def sagitta(tmp_path_factory):
+    """An emulated Sagitta on a pty."""
+    command = emulator_command(unit="sagitta", seed=1, state_dir=tmp_path_factory.mktemp("sagitta"))
+    with EmulatorProcess(command) as process:
+        yield process
+
+
 @pytest.fixture
 def serial_obc(emulator):
     """An OBC on the serial line."""

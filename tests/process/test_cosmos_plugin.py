@@ -12,6 +12,7 @@ from typing import Any, Self
 import pytest
 
 from starhil.hil_tests.client import ObcClient
+from starhil.protocol.export.cosmos import _state
 from starhil.protocol.icd import load_unit
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import same
@@ -137,3 +138,25 @@ def test_requests_in_a_row_keep_their_names(cosmos: Cosmos) -> None:
         cosmos.send(f"REQUEST_{name}")
     assert [cosmos.receive()[0] for _ in names] == names
     assert time.monotonic() - begin < 60.0
+
+
+def test_a_unit_with_another_link_is_driven_through_its_plugin(sagitta, tmp_path: Path) -> None:
+    pytest.importorskip(
+        "openc3.packets.packet_config", reason="openc3 drives the emulator; it is not installed (make cosmos)"
+    )
+    icd = load_unit("sagitta")
+    with Cosmos(Plugin(icd, tmp_path, port=sagitta.ready["serial"])) as cosmos:
+        for row in icd.telecommands.values():
+            if row.action == "subscribe":
+                continue
+            cosmos.send(row.name.upper(), **{name.upper(): value for name, value in row.example().items()})
+            name, packet = cosmos.receive()
+            assert (name, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", row.name.upper(), 0)
+        for row in icd.telemetry.values():
+            cosmos.send(f"REQUEST_{row.name.upper()}")
+            name, packet = cosmos.receive()
+            assert name == row.name.upper()
+            for field, value in row.decode(bytes(packet.buffer)[2:]).items():
+                read = packet.read(field.upper(), "CONVERTED")
+                expected = _state(str(value)) if row.named_fields[field].enum is not None else value
+                assert same(read, expected), f"{row.name}.{field}"

@@ -11,6 +11,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.export import export_folder
+from starhil.protocol.export.row_key import key_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial_framing import Dialect
@@ -101,3 +102,22 @@ def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) 
     assert counts == "acknowledges 1, refusals 0, faults 0"
     seen = [float(word) for word in attitude.removeprefix("valid 1, q ").split()]
     assert seen == pytest.approx([truth[name] for name in ("q_x", "q_y", "q_z", "q_w")], abs=1e-4)
+
+
+def test_a_unit_with_another_link_is_driven_through_its_c(sagitta, tmp_path: Path) -> None:
+    """Each telecommand is accepted, and each telemetry row is read, over SLIP with XXH32."""
+    icd = load_unit("sagitta")
+    with CDriver(icd, tmp_path) as driver:
+        assert driver("open", sagitta.ready["serial"], 0) == ["0"]
+        for row in icd.telecommands.values():
+            if row.action == "subscribe":
+                continue
+            _, data = driver("encode", row.name, *c_words(row, row.example()))
+            assert driver("ask", key_of(icd, row), data) == ["2", str(key_of(icd, row)), "0", "-"]
+        for row in icd.telemetry.values():
+            kind, key, _, data = driver("ask", key_of(icd, row), "-")
+            assert (kind, key, len(data) // 2) == ("1", str(key_of(icd, row)), row.size)
+            values = row.decode(bytes.fromhex(data))
+            assert driver("decode", row.name, data) == ["0", *c_words(row, values)]
+        refused = key_of(icd, icd.telecommands["set_camera"])
+        assert driver("ask", refused, "00")[:2] == ["3", str(refused)]

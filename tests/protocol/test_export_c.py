@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -37,7 +38,7 @@ def test_a_row_has_the_same_bytes_and_values_both_ways(c: CDriver, row: Row) -> 
 
 
 def refused_at(row: Row, data: bytes) -> int:
-    """Position of the value that our codec refuses, from 1; 0 if it takes all."""
+    """Position of the value of a telecommand that our codec refuses, from 1; 0 if it takes all."""
     try:
         row.decode(data)
     except FieldError as error:
@@ -147,3 +148,25 @@ def test_the_receiver_of_the_c_reads_streams_as_ours(c: CDriver, dialect: Dialec
 def test_a_message_that_is_too_long_is_one_fault(c: CDriver) -> None:
     data = b"\x1f\x7f\x80" + bytes(600) + b"\x1f\xff"
     assert c_events(c, Dialect.A, 128, data) == events(Dialect.A, 128, data)
+
+
+# -- other units -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["sagitta", "nos3", "st16", "cubestar-gen2"])
+def test_the_rows_of_a_unit_have_the_same_bytes_and_values_both_ways(name: str, tmp_path: Path) -> None:
+    icd = load_unit(name)
+    rng = random.Random(name)
+    with CDriver(icd, tmp_path) as driver:
+        for row in (row for row in icd.rows if row.named_fields):
+            for values, data in packets(row):
+                assert driver("decode", row.name, data.hex()) == ["0", *c_words(row, row.decode(data))]
+                assert driver("encode", row.name, *c_words(row, values)) == ["0", data.hex()], row.name
+            if any(field.kind in ("float", "text") for field in row.fields):
+                continue
+            data = rng.randbytes(row.size)
+            result, *words = driver("decode", row.name, data.hex())
+            assert (int(result), words) == (
+                refused_at(row, data),
+                c_words(row, row.decode(data, check=False)),
+            )

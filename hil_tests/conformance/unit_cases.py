@@ -1,0 +1,495 @@
+"""Conformance of any unit on a serial line, derived from its definition."""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Final
+
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.row_cases import bad_values
+from starhil.hil_tests.conformance.unit_probe import UnitProbe
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.envelope import HeaderField
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, FixedFraming, SlipFraming
+from starhil.protocol.messages import DEFAULT_MAX_SIZE, ErrorCode, Request
+from starhil.protocol.serial_stack import ComposedStack, build_serial_stack
+from starhil.protocol.values import Value
+
+FLOOD: Final = 50
+ATTITUDE_S: Final = 20.0
+CLOCK_S: Final = 1_700_000_000
+SECOND_NS: Final = 1_000_000_000
+QUATERNION: Final = ("attitude.x", "attitude.y", "attitude.z", "attitude.w")
+
+Run = Callable[[UnitProbe], None]
+
+
+def unit_cases(icd: InterfaceDefinition) -> list[Case[UnitProbe]]:
+    """Make the cases of a unit with a serial link."""
+    stack = build_serial_stack(icd)
+    cases = [*_framing(icd)]
+    if isinstance(stack, ComposedStack):
+        cases += [*_check(stack), *_header(stack)]
+    cases += [*_identifiers(icd, stack), *_rows(icd), *_lengths(icd), *_limits(icd), *_settings(icd)]
+    cases += [*_echoes(icd), *_subscriptions(icd), *_clock(icd, stack), *_recovery()]
+    return cases
+
+
+def _case(
+    area: str, name: str, title: str, run: Run, clause: str = "[link.serial]", *, intrusive: bool = False
+) -> Case[UnitProbe]:
+    return Case(f"{area}.{name}", area, title, clause, run, intrusive)
+
+
+def _clause(row: Row) -> str:
+    return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
+
+
+def marks(icd: InterfaceDefinition) -> bytes:
+    """Return the bytes that have a meaning in the framing."""
+    link = icd.link.serial
+    match link.framing if link is not None else None:
+        case SlipFraming() as framing:
+            pair = framing.substitutes or (0xDC, 0xDD)
+            return bytes((framing.end, framing.escape, *pair))
+        case EscapedFraming() as framing:
+            return bytes((framing.escape, framing.start, framing.end))
+        case DelimitedFraming() as framing:
+            return bytes((*framing.start, *framing.end))
+        case None:
+            return b""
+        case framing:
+            start, end = getattr(framing, "start", []), getattr(framing, "end", [])
+            return bytes((*start, *end)) or b"\x1f\x7f\xff"
+
+
+# --- framing ---
+
+
+def _framing(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    used = marks(icd)
+    plain = bytes(byte for byte in range(0x20, 0x60) if byte not in used)
+
+    def asked(probe: UnitProbe, times: int = 1) -> bytes:
+        request = probe.request(probe.lively)
+        probe.expecting(*[request] * times)
+        return probe.stack.encode_request(request) * times
+
+    def answered(probe: UnitProbe, times: int = 1) -> None:
+        for _ in range(times):
+            probe.expect_telemetry(probe.lively)
+        probe.expect_silence("no more was asked for")
+
+    def one(probe: UnitProbe) -> None:
+        probe.send(asked(probe))
+        answered(probe)
+
+    def two(probe: UnitProbe) -> None:
+        probe.send(asked(probe, 2))
+        answered(probe, 2)
+
+    def bytewise(probe: UnitProbe) -> None:
+        for byte in asked(probe):
+            probe.send(bytes((byte,)))
+            probe.sleep(0.005)
+        answered(probe)
+
+    def junk(probe: UnitProbe) -> None:
+        probe.send(plain[:9])
+        probe.sleep_past_timeout()
+        probe.drain()
+        one(probe)
+
+    def half(probe: UnitProbe) -> None:
+        whole = asked(probe)
+        probe.send(whole[: len(whole) // 2])
+        probe.sleep_past_timeout()
+        probe.send(whole[len(whole) // 2 :])
+        probe.expect_silence("the message has timed out")
+        probe.sleep_past_timeout()
+        probe.expect_alive()
+
+    def overlong(probe: UnitProbe) -> None:
+        size = getattr(probe.stack, "max_size", DEFAULT_MAX_SIZE)
+        request = replace(probe.request(probe.lively), data=plain[:1] * (size + 64))
+        probe.send(probe.stack.encode_request(request))
+        probe.expect_silence("the message was too long")
+        probe.sleep_past_timeout()
+        probe.expect_alive()
+
+    def form(probe: UnitProbe) -> None:
+        sent = asked(probe)
+        probe.send(sent)
+        reply = probe.expect_telemetry(probe.lively)
+        probe.sleep(probe.times.quiet_s)
+        echo = sent if "echo" in probe.lively.answers else b""
+        whole = echo + probe.stack.encode_reply(reply, probe.style)
+        slip = icd.link.serial is not None and isinstance(icd.link.serial.framing, SlipFraming)
+        end = used[:1] if slip else b""  # which a sender may leave out before a frame
+        check_equal(probe.raw.strip(end), whole.strip(end), "bytes")
+
+    yield _case("framing", "one", "a request is answered once", one)
+    yield _case("framing", "reply-form", "a reply is its frame, and not a byte more", form)
+    yield _case("framing", "two-at-once", "two requests in one piece are both answered", two)
+    yield _case("framing", "byte-by-byte", "a request may come byte by byte", bytewise)
+    yield _case("framing", "junk", "bytes that are no message are passed over", junk)
+    yield _case("framing", "half", "an incomplete message is dropped after a time-out", half)
+    yield _case("framing", "overlong", "a message that is too long is dropped", overlong)
+
+
+# --- check ---
+
+
+def _check(stack: ComposedStack) -> Iterator[Case[UnitProbe]]:
+    size = stack.check.size
+    if not size:
+        return
+
+    def silent(probe: UnitProbe, bodies: Iterator[bytes]) -> None:
+        for body in bodies:
+            probe.send(stack.framing.encode(body))
+        probe.expect_silence("the check is wrong")
+        probe.expect_alive()
+
+    def body_of(probe: UnitProbe) -> bytes:
+        return stack.request_body(probe.request(probe.lively))
+
+    def flipped(body: bytes, bits: range) -> Iterator[bytes]:
+        for bit in bits:
+            damaged = bytearray(body)
+            damaged[bit // 8] ^= 1 << bit % 8
+            yield bytes(damaged)
+
+    def wrong(probe: UnitProbe) -> None:
+        body = body_of(probe)
+        silent(probe, flipped(body, range(8 * (len(body) - size), 8 * len(body))))
+
+    def damaged(probe: UnitProbe) -> None:
+        body = body_of(probe)
+        silent(probe, flipped(body, range(8 * (len(body) - size))))
+
+    def swapped(probe: UnitProbe) -> None:
+        body = body_of(probe)
+        silent(probe, iter([body[:-size] + body[-size:][::-1]]))
+
+    def missing(probe: UnitProbe) -> None:
+        silent(probe, iter([body_of(probe)[:-size]]))
+
+    yield _case("check", "wrong", "a message with a bit of the check flipped is not answered", wrong)
+    yield _case("check", "damaged", "a message with a bit flipped is not answered", damaged)
+    yield _case("check", "missing", "a message without the check is not answered", missing)
+    if size > 1:
+        yield _case("check", "swapped", "a check with its bytes in the other order is not accepted", swapped)
+
+
+# --- header ---
+
+
+def _header(stack: ComposedStack) -> Iterator[Case[UnitProbe]]:
+    for field in stack.request_header.fields:
+        if field.role == "address":
+            own = field.default
+            values = [own ^ 1, own ^ 1 << 8 * field.size - 1, 0 if own else 1]
+            yield _silent_header(stack, "address", field, values, "another address")
+        elif field.role == "class":
+            codes = {item.code for item in stack.classes.classes}
+            values = [code for code in range(256) if code not in codes][:8]
+            yield _silent_header(stack, "class", field, values, "a class that the unit does not have")
+        elif field.role is None and field.const is not None:
+            yield _silent_header(stack, "constant", field, [field.const ^ 1], "another constant")
+
+
+def _silent_header(
+    stack: ComposedStack, name: str, field: HeaderField, values: list[int], what: str
+) -> Case[UnitProbe]:
+    def run(probe: UnitProbe) -> None:
+        klass = probe.lively.klass
+        header = stack.request_body(probe.request(probe.lively))[: stack.request_header.size(klass)]
+        before = [item for item in stack.request_header.fields if item.in_class(klass)]
+        start = sum(item.size for item in before[: before.index(field)])
+        for value in values:
+            changed = header[:start] + field.to_bytes(value) + header[start + field.size :]
+            probe.send(stack.framing.encode(stack.close(changed, b"")))
+        probe.expect_silence(what)
+        probe.expect_alive()
+
+    return _case("header", name, f"a message with {what} is not answered", run)
+
+
+# --- identifiers ---
+
+
+def _identifiers(icd: InterfaceDefinition, stack: object) -> Iterator[Case[UnitProbe]]:
+    for klass in [item.name for item in icd.classes if item.code is not None] or [""]:
+        yield _case(
+            "identifiers",
+            klass or "unknown",
+            f"unknown identifiers{f' of class {klass}' if klass else ''} are refused",
+            _unknown(icd, stack, klass),
+            intrusive=True,
+        )
+
+
+def _unknown(icd: InterfaceDefinition, stack: object, klass: str) -> Run:
+    rows = [row for row in icd.rows if not klass or row.klass == klass]
+    known = {row.id for row in rows}
+    top = 255
+    if isinstance(stack, ComposedStack):
+        bits = [bit for field in stack.request_header.fields for bit in field.bits if bit.role == "id"]
+        top = bits[0].mask if bits else top
+    near = {row_id + step for row_id in known for step in (-1, 1)} | {0, top}
+    kinds = {item.name: item.kind for item in icd.classes}
+
+    def run(probe: UnitProbe) -> None:
+        for row_id in sorted(number for number in near - known if 0 <= number <= top):
+            request = Request(kinds.get(klass, icd.kind_of_id(row_id)), row_id, klass=klass)
+            probe.expect_refusal(request, ErrorCode.INVALID_ID)
+
+    return run
+
+
+# --- telemetry ---
+
+
+def _rows(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    for row in icd.telemetry.values():
+        title = f"{row.name} has {row.size} bytes and values within their limits"
+        yield _case("telemetry", row.name, title, _read_twice(row), _clause(row))
+        bound = {field.value: name for name, field in row.named_fields.items() if field.value}
+        if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
+            title = f"{row.name} has a quaternion of length 1 when it is valid"
+            yield _case("attitude", row.name, title, _unit_length(row, bound), _clause(row))
+
+
+def _read_twice(row: Row) -> Run:
+    def run(probe: UnitProbe) -> None:
+        for _ in range(2):
+            probe.values(row)
+
+    return run
+
+
+def _unit_length(row: Row, bound: dict[str, str]) -> Run:
+    step = max(abs(row.named_fields[bound[name]].scale) for name in QUATERNION)
+    tolerance = 1e-5 + (2.0 * step if step < 1.0 else 0.0)
+
+    def run(probe: UnitProbe) -> None:
+        end = probe.now() + ATTITUDE_S
+        while str((seen := probe.values(row))[bound["attitude.valid"]]).lower() not in ("true", "1"):
+            if probe.now() > end:
+                raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
+            probe.sleep(0.1)
+        length = sum(float(seen[bound[name]]) ** 2 for name in QUATERNION) ** 0.5
+        check(abs(length - 1.0) < tolerance, "a quaternion of length 1", f"{length:.7f}")
+
+    return run
+
+
+# --- lengths and limits ---
+
+
+def _lengths(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    link = icd.link.serial
+    if link is not None and isinstance(link.framing, FixedFraming):
+        return
+    for row in icd.rows:
+        whole = row.encode(row.example()) if row.kind == "telecommand" else b""
+        for why, data in (("long", whole + b"\0"), ("short", whole[:-1])):
+            if data != whole:
+                title = f"{row.name} with {len(data)} bytes of data ({why}) is refused for its length"
+                run = _refused(row, data, ErrorCode.INVALID_LENGTH)
+                yield _case(
+                    "lengths",
+                    f"{row.name}.{why}",
+                    title,
+                    run,
+                    _clause(row),
+                    intrusive=row.kind == "telecommand",
+                )
+
+
+def _limits(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    for row in icd.telecommands.values():
+        for name, field in row.named_fields.items():
+            for why, data in bad_values(row, field):
+                title = f"{row.name} with {name} {why} is refused"
+                run = _refused(row, data, ErrorCode.INVALID_PARAMETER)
+                yield _case("limits", f"{row.name}.{name}.{why}", title, run, _clause(row), intrusive=True)
+
+
+def _refused(row: Row, data: bytes, code: ErrorCode) -> Run:
+    return lambda probe: probe.expect_refusal(probe.request(row, data), code)
+
+
+# --- telecommands ---
+
+
+def _settings(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    used = marks(icd)
+    for row in icd.telecommands.values():
+        if row.action in (None, "nothing") or row.action in icd.plugin.actions:
+            title = f"{row.name} is accepted"
+            yield _case("commands", row.name, title, _accepted(row), _clause(row), intrusive=True)
+    for row in icd.telemetry.values():
+        source = next((field.telecommand for field in row.named_fields.values() if field.telecommand), None)
+        if source is not None and icd.telecommands[source].action in (None, "nothing"):
+            title = f"{row.name} reports what {source} has set, whatever the bytes"
+            run = _read_back(icd.telecommands[source], row, used)
+            yield _case("settings", row.name, title, run, _clause(row), intrusive=True)
+
+
+def _accepted(row: Row) -> Run:
+    return lambda probe: probe.command(row, row.encode(row.example()))
+
+
+def _read_back(command: Row, row: Row, used: bytes) -> Run:
+    def run(probe: UnitProbe) -> None:
+        before = probe.telemetry(row).data
+        rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
+        for turn in range(3):
+            values = {name: _value(field, used, turn, rng) for name, field in command.named_fields.items()}
+            data = command.encode(values)
+            probe.command(command, data)
+            check_equal(probe.telemetry(row).data, data, f"the bytes of {command.name}")
+        probe.command(command, before)
+
+    return run
+
+
+def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
+    """Return a value within the limits: of bytes that the framing uses, if it may have them, or random."""
+    pattern = (used * 8)[turn : turn + field.size] if turn < 2 and used else rng.randbytes(field.size)
+    match field.kind:
+        case "bytes":
+            return pattern
+        case "text":
+            return "star"[: field.size]
+        case "flag":
+            return rng.random() < 0.5
+        case "enum":
+            return rng.choice(list(field.enum.values)) if field.enum is not None else 0
+        case "float":
+            order = "<" if field.slot.order == "little" else ">"
+            (value,) = struct.unpack(order + ("f" if field.type == "f32" else "d"), pattern)
+            low, high = field.physical_limits
+            return float(min(max(value, low), high)) if abs(value) < 1e30 else 0.0
+        case _:
+            low_raw, high_raw = field.raw_limits
+            raw = int.from_bytes(pattern, field.slot.order)
+            return field.to_physical(raw if low_raw <= raw <= high_raw else rng.randint(low_raw, high_raw))
+
+
+# --- echoes ---
+
+
+def _echoes(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    for row in icd.rows:
+        if "echo" in row.answers:
+            title = f"{row.name} is echoed byte for byte before anything else"
+            yield _case(
+                "echo", row.name, title, _echoed(row), _clause(row), intrusive=row.kind == "telecommand"
+            )
+
+
+def _echoed(row: Row) -> Run:
+    def run(probe: UnitProbe) -> None:
+        request = probe.request(row, row.encode(row.example()) if row.kind == "telecommand" else b"")
+        sent = probe.stack.encode_request(request)
+        probe.ask(request)
+        check_equal(probe.raw[: len(sent)] or None, sent, "the echo")
+
+    return run
+
+
+# --- subscriptions and the clock ---
+
+
+def _subscriptions(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
+    for row in icd.telecommands.values():
+        fields = [
+            name
+            for name, field in row.named_fields.items()
+            if (field.argument or "").startswith("telemetry[")
+        ]
+        klass = str(row.arguments.get("class", ""))
+        offered = [item for item in icd.telemetry.values() if klass in ("", item.klass)][:2]
+        if row.action == "subscribe" and fields and offered:
+            title = f"{row.name} starts and stops telemetry that is not asked for"
+            run = _subscribed(row, fields, offered)
+            yield _case("subscriptions", row.name, title, run, _clause(row), intrusive=True)
+
+
+def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
+    nothing = command.encode({**command.example(), **dict.fromkeys(fields, 0)})
+
+    def run(probe: UnitProbe) -> None:
+        chosen = dict.fromkeys(fields, 0) | {name: row.id for name, row in zip(fields, offered, strict=False)}
+        probe.command(command, command.encode({**command.example(), **chosen}))
+        seen = probe.receive_unsolicited(3.0)
+        probe.command(command, nothing)
+        probe.sleep(0.5)
+        wanted = {(row.klass, row.id, row.size) for row in offered[: len(fields)]}
+        check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
+        check_equal({(reply.klass, reply.id, len(reply.data)) for reply in seen}, wanted, "rows and sizes")
+        check_equal(len(probe.receive_unsolicited(2.0)), 0, "messages after the end of the subscription")
+
+    return run
+
+
+def _clock(icd: InterfaceDefinition, stack: object) -> Iterator[Case[UnitProbe]]:
+    if not isinstance(stack, ComposedStack) or "time" not in stack.reply_header.roles:
+        return
+    timed = next(field.classes for field in stack.reply_header.fields if field.role == "time")
+    row = next((row for row in icd.telemetry.values() if timed is None or row.klass in timed), None)
+    for command in icd.telecommands.values():
+        arguments = {field.argument: name for name, field in command.named_fields.items()}
+        if command.action == "set_clock" and "microseconds" in arguments and row is not None:
+            title = "the times of replies run from what the clock was set to"
+            run = _clock_runs(command, arguments["microseconds"], row)
+            yield _case("clock", command.name, title, run, _clause(command), intrusive=True)
+
+
+def _clock_runs(command: Row, name: str, row: Row) -> Run:
+    field = command.named_fields[name]
+
+    def run(probe: UnitProbe) -> None:
+        before, began = probe.telemetry(row).time_ns, probe.now()
+        probe.command(command, command.encode({name: field.to_physical(CLOCK_S * 1_000_000)}))
+        first = probe.telemetry(row).time_ns
+        probe.sleep(0.5)
+        second = probe.telemetry(row).time_ns
+        back = before + round((probe.now() - began) * SECOND_NS)
+        probe.command(command, command.encode({name: field.to_physical(back // 1000)}))
+        check(0 <= first - CLOCK_S * SECOND_NS <= SECOND_NS, f"a time just after {CLOCK_S} s", f"{first} ns")
+        check(0.4 <= (second - first) / SECOND_NS <= 1.5, "half a second more", f"{second - first} ns")
+
+    return run
+
+
+# --- recovery ---
+
+
+def _recovery() -> Iterator[Case[UnitProbe]]:
+    def noise(probe: UnitProbe) -> None:
+        rng = random.Random(7)  # noqa: S311 -- noise, not a secret
+        used = marks(probe.icd)
+        for _ in range(10):
+            probe.send(bytes(byte for byte in rng.randbytes(200) if byte not in used))
+        probe.sleep_past_timeout()
+        probe.expect_alive()
+
+    def flood(probe: UnitProbe) -> None:
+        rows = sorted(probe.icd.telemetry.values(), key=lambda row: row.size)[:2] * (FLOOD // 2)
+        requests = [probe.request(row) for row in rows]
+        probe.expecting(*requests)
+        for request in requests:
+            probe.send(probe.stack.encode_request(request))
+        for row in rows:
+            probe.expect_telemetry(row)
+
+    yield _case("recovery", "noise", "after noise and a pause the next request is answered", noise)
+    yield _case("recovery", "flood", "a flood of requests is answered whole and in order", flood)

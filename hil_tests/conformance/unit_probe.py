@@ -1,0 +1,276 @@
+"""The tester's side of any unit on a serial line, by the link in its definition."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Final
+
+from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
+from starhil.hil_tests.conformance.link_probe import RECOVERY_S, ProbeTimes, checked_values
+from starhil.hil_tests.conformance.ports import Port
+from starhil.protocol.codec import Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_stack import ComposedStack, build_serial_stack
+from starhil.protocol.values import Value
+
+SHOWN_BYTES: Final = 48
+PAUSE: Final = 1.6
+"""Silence after which a message has surely timed out, in time-outs."""
+
+
+class UnitProbe:
+    """Talks over a serial port.
+
+    Parameters
+    ----------
+    port
+        The port.
+    icd
+        Definition of the unit.
+    style
+        Dialect of the replies, of a unit that has dialects.
+    """
+
+    link = "serial"
+
+    def __init__(
+        self,
+        port: Port[bytes],
+        icd: InterfaceDefinition,
+        *,
+        style: Dialect | None = None,
+        times: ProbeTimes | None = None,
+    ) -> None:
+        self.port = port
+        self.icd = icd
+        self.stack = build_serial_stack(icd)
+        self.times = times or ProbeTimes()
+        self.log: list[str] = []
+        self.timeout_s = icd.link.serial.timeout if icd.link.serial is not None else 0.5
+        self.lively = min(icd.telemetry.values(), key=lambda row: row.size)
+        """Row by which the unit shows that it answers."""
+        self.style = style or getattr(self.stack, "dialect", None)
+        """Dialect of the replies, of a unit that has dialects."""
+        self._settings: list[tuple[Row, bytes]] = []
+        self.drain()
+
+    # --- the line ---
+
+    def now(self) -> float:
+        """Time of the port, s."""
+        return self.port.now()
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass; received data are kept."""
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0:
+            self._receive(left)
+
+    def sleep_past_timeout(self) -> None:
+        """Let a message that has begun time out."""
+        self.sleep(PAUSE * self.timeout_s)
+
+    def send(self, data: bytes) -> None:
+        """Send raw bytes."""
+        self._note("->", data)
+        self.port.send(data)
+
+    def drain(self) -> None:
+        """Discard everything received and expected."""
+        while self.port.receive(0.0) is not None:
+            pass
+        self.raw = b""
+        """All bytes received since the last drain."""
+        self._received = bytearray()
+        self._receiver = self.stack.host(self.style)
+        self._expected: deque[tuple[Request, int]] = deque()
+        self._replies: deque[Reply | LinkFault] = deque()
+        self._unsolicited: list[Reply] = []
+
+    def _note(self, way: str, data: bytes) -> None:
+        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
+        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
+
+    def _receive(self, timeout_s: float) -> bool:
+        data = self.port.receive(timeout_s)
+        if data is None:
+            return False
+        self._note("<-", data)
+        self.raw += data
+        self._received += data
+        while self._received:  # byte by byte, since each reply decides what is expected next
+            self._take(self._received.pop(0))
+        return True
+
+    def _take(self, byte: int) -> None:
+        for event in self._receiver.feed(bytes((byte,)), self.now()):
+            if isinstance(event, Reply) and event.kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT):
+                self._unsolicited.append(event)
+                continue
+            self._replies.append(event)
+            if self._expected and (isinstance(event, LinkFault) or event.final):
+                self._expected.popleft()
+                self._expect_next()
+
+    def _expect_next(self) -> None:
+        if self._expected:
+            self._receiver.expect(*self._expected[0])
+
+    # --- requests ---
+
+    def expecting(self, *requests: Request) -> None:
+        """Note what is asked, in order."""
+        for request in requests:
+            row = self.icd.rows_by_key.get((request.klass, request.id))
+            self._expected.append((request, row.size if row is not None and row.kind == "telemetry" else 0))
+            if len(self._expected) == 1:
+                self._expect_next()
+
+    def request(self, row: Row, data: bytes = b"") -> Request:
+        """Return the request of a row."""
+        return self.icd.request(row, data)
+
+    def next_answer(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+        """Return the next reply, None if none comes in time; one with data in several parts as one."""
+        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        while not self._replies and (left := end - self.now()) > 0:
+            self._receive(left)
+        return self._replies.popleft() if self._replies else None
+
+    def ask(self, request: Request) -> Reply | LinkFault | None:
+        """Send a request and return the answer."""
+        self.expecting(request)
+        self.send(self.stack.encode_request(request))
+        answer = self.next_answer()
+        while isinstance(answer, Reply) and not answer.final:
+            answer = self.next_answer()
+        return answer
+
+    def telemetry(self, row: Row) -> Reply:
+        """Return the telemetry of a row; anything else fails the case."""
+        request = self.request(row)
+        self.expecting(request)
+        self.send(self.stack.encode_request(request))
+        return self.expect_telemetry(row)
+
+    def expect_telemetry(self, row: Row) -> Reply:
+        """Take the next answer, which must be the telemetry of a row."""
+        answer = self.next_answer()
+        what = f"telemetry {row.name} of {row.size} bytes"
+        if not isinstance(answer, Reply) or answer.kind is not ReplyKind.TELEMETRY:
+            raise CaseFailed(what, describe(answer))
+        if (answer.id, answer.klass, len(answer.data)) != (row.id, row.klass, row.size):
+            raise CaseFailed(what, describe(answer))
+        return answer
+
+    def values(self, row: Row) -> dict[str, Value]:
+        """Return the checked values of a telemetry row."""
+        return checked_values(row, self.telemetry(row).data)
+
+    def command(self, row: Row, data: bytes) -> None:
+        """Send a telecommand that must be accepted."""
+        answer = self.ask(self.request(row, data))
+        accepted = isinstance(answer, Reply) and answer.kind is ReplyKind.ACK and answer.id == row.id
+        check(accepted, f"acknowledge of {row.name}", describe(answer))
+
+    def expect_refusal(self, request: Request, code: ErrorCode) -> None:
+        """Send a request that must be refused, or not answered where the unit's replies cannot refuse."""
+        what = f"{request.klass} {request.id}".strip()
+        if not self.can_refuse(request.klass):
+            self.send(self.stack.encode_request(request))
+            self.expect_silence(f"no reply can refuse {what}")
+            return
+        answer = self.ask(request)
+        refused = isinstance(answer, Reply) and answer.kind is ReplyKind.NACK
+        check(refused, f"refusal of {what}", describe(answer))
+        if isinstance(answer, Reply) and self.has_codes:
+            check_equal(int(answer.code), int(self.icd.error_number(code)), f"code of the refusal of {what}")
+
+    def can_refuse(self, klass: str) -> bool:
+        """Return whether replies of a class can say that a request is refused."""
+        stack = self.stack
+        return not isinstance(stack, ComposedStack) or bool(
+            stack.reply_header.roles_in(klass) & {"status", "ack"}
+        )
+
+    @property
+    def has_codes(self) -> bool:
+        """Whether a refusal carries a code."""
+        return not isinstance(self.stack, ComposedStack) or "status" in self.stack.reply_header.roles
+
+    def expect_silence(self, why: str, seconds: float | None = None) -> None:
+        """Fail the case if anything comes within a time."""
+        before = len(self.raw)
+        self.sleep(self.times.quiet_s if seconds is None else seconds)
+        check(len(self.raw) == before, f"nothing ({why})", self.raw[before:][:SHOWN_BYTES])
+
+    def expect_alive(self) -> None:
+        """Fail the case unless the next good request is answered."""
+        self.drain()
+        self.telemetry(self.lively)
+
+    def receive_unsolicited(self, seconds: float) -> list[Reply]:
+        """Return the messages of unsolicited telemetry that come within a time."""
+        self._unsolicited.clear()
+        self.sleep(seconds)
+        return list(self._unsolicited)
+
+    # --- around a run and a case ---
+
+    def silence(self, *, booting: bool) -> str | None:
+        """Return the invalid answer to three requests, None if one is answered correctly."""
+        end = self.now() + (self.times.boot_s if booting else 0.0)
+        while True:
+            self.drain()
+            answer = self.ask(self.request(self.lively))
+            if isinstance(answer, Reply) and len(answer.data) == self.lively.size:
+                return None
+            if self.now() >= end:
+                return describe(answer)
+
+    def settings(self) -> Sequence[tuple[Row, Row]]:
+        """Return the telecommands whose values a telemetry row reports, with that row."""
+        rows = ((row, next(iter(row.named_fields.values()), None)) for row in self.icd.telemetry.values())
+        return [
+            (self.icd.telecommands[field.telecommand], row)
+            for row, field in rows
+            if field is not None and field.telecommand is not None
+        ]
+
+    def prepare(self) -> None:
+        """Note the settings that can be read."""
+        self._settings = [(command, self.telemetry(row).data) for command, row in self.settings()]
+
+    def restore(self) -> None:
+        """Put the settings back."""
+        self.recover()
+        self.drain()
+        for command, data in self._settings:
+            self.command(command, data)
+
+    def begin(self, *, intrusive: bool) -> None:  # noqa: ARG002 (the same for all cases)
+        """Start a case with an empty line."""
+        self.drain()
+
+    def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
+        """End a case: nothing more may come."""
+        if passed:
+            self.expect_silence("the case is over", self.times.quiet_s / 4)
+
+    def recover(self) -> None:
+        """Let time-outs of the device pass after a failed case."""
+        self.sleep(RECOVERY_S)
+
+
+def describe(answer: Reply | LinkFault | None) -> str:
+    """Describe an answer in a line."""
+    if answer is None:
+        return "nothing"
+    if isinstance(answer, LinkFault):
+        return f"malformed: {answer.detail}"
+    code = f" with code {int(answer.code)}" if answer.kind is ReplyKind.NACK else ""
+    where = f"{answer.klass} {answer.id}".strip()
+    return f"{answer.kind.value} {where}{code}, {len(answer.data)} bytes: {answer.data[:24].hex(' ')}"

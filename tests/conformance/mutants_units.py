@@ -1,0 +1,371 @@
+"""Mutants of units on composed links, put in at the same seams as those of the CubeStar."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from starhil.emulator.device.device import Device
+from starhil.protocol.codec import Row
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_stack import ComposedStack
+from tests.conformance.mutant_seams import Damage, handling, incoming, outgoing
+from tests.conformance.simulated import SimulatedUnit
+
+Change = Callable[[Reply, Device], Reply | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class UnitMutant:
+    """A defect of a unit, and the case that has to fail because of it."""
+
+    unit: str
+    name: str
+    caught_by: str
+    damage: Damage
+
+
+def stack_of(unit: SimulatedUnit) -> ComposedStack:
+    stack = unit.link._stack
+    assert isinstance(stack, ComposedStack)
+    return stack
+
+
+def bodies(change: Callable[[bytes, ComposedStack], bytes]) -> Damage:
+    """Change the bodies of the frames that the device sends."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        framing = stack_of(unit).framing
+        encode = framing.encode
+        framing.encode = lambda body: encode(change(body, stack_of(unit)))  # type: ignore[method-assign]
+
+    return damage
+
+
+def raw_frames(change: Callable[[bytes, ComposedStack], bytes]) -> Damage:
+    """Change the bytes that the device sends, knowing its link."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        outgoing(lambda data: [change(data, stack_of(unit))])(unit)
+
+    return damage
+
+
+def replies(change: Change) -> Damage:
+    """Change the replies, or drop those that become None."""
+
+    def changed(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+        found = handle(request) or []
+        return [new for reply in found if (new := change(reply, device)) is not None]
+
+    return handling(changed)
+
+
+def telemetry_data(change: Callable[[bytes, Row], bytes]) -> Damage:
+    """Change the data of telemetry."""
+
+    def changed(reply: Reply, device: Device) -> Reply:
+        row = device.icd.rows_by_key.get((reply.klass, reply.id or 0))
+        if reply.kind is not ReplyKind.TELEMETRY or row is None or not reply.data:
+            return reply
+        return dataclasses.replace(reply, data=change(reply.data, row))
+
+    return replies(changed)
+
+
+def reversed_numbers(data: bytes, row: Row) -> bytes:
+    return b"".join(
+        data[slot.offset : slot.offset + slot.size][:: -1 if slot.type != "bytes" else 1]
+        for slot in row.slots
+    )
+
+
+def with_code(old: ErrorCode, code: ErrorCode | None) -> Damage:
+    """Give refusals another code, or accept what would be refused."""
+
+    def changed(reply: Reply, device: Device) -> Reply:
+        if reply.kind is not ReplyKind.NACK or int(reply.code) != int(device.icd.error_number(old)):
+            return reply
+        if code is None:
+            return dataclasses.replace(reply, kind=ReplyKind.ACK, code=ErrorCode.OK)
+        return dataclasses.replace(reply, code=device.icd.error_number(code))
+
+    return replies(changed)
+
+
+def unchecked(unit: SimulatedUnit) -> None:
+    """Accept any check."""
+    stack_of(unit)._checks = lambda *_: True  # type: ignore[method-assign]
+
+
+def only_whole_check_missing(unit: SimulatedUnit) -> None:
+    """Compare the lowest byte of the check only."""
+    stack = stack_of(unit)
+
+    def checks(body: bytes, size: int, end: int) -> bool:
+        covered = stack._covered(body[:size], body[size:end])
+        return stack.check.compute(covered)[:1] == body[end:][:1]
+
+    stack._checks = checks  # type: ignore[method-assign]
+
+
+def any_address(unit: SimulatedUnit) -> None:
+    """Take messages to other addresses for one's own."""
+    stack = stack_of(unit)
+    opened = stack.open
+
+    def open_any(header: Any, body: bytes) -> Any:
+        result = opened(header, body)
+        if isinstance(result, LinkFault) and result.kind is FaultKind.UART_ADDRESS:
+            envelope = header.unpack(body[: len(body) - stack.check.size])
+            return envelope, body[envelope.size : len(body) - stack.check.size]
+        return result
+
+    stack.open = open_any  # type: ignore[method-assign]
+
+
+def any_class(unit: SimulatedUnit) -> None:
+    """Take an unknown class for that of telemetry."""
+    stack = stack_of(unit)
+    names = stack.classes._requests
+    for code in range(256):
+        names.setdefault(code, "telemetry")
+
+
+def times_out_never(unit: SimulatedUnit) -> None:
+    stack = stack_of(unit)
+    stack.link = stack.link.model_copy(update={"timeout": 1e9})  # type: ignore[misc]
+    unit.link._receiver = unit.link._new_receiver()
+
+
+def takes_any_length(unit: SimulatedUnit) -> None:
+    stack = stack_of(unit)
+    stack.max_size = 1 << 20  # type: ignore[misc]
+    unit.link._receiver = unit.link._new_receiver()
+
+
+def unescaped(data: bytes, stack: ComposedStack) -> bytes:
+    """Send the body as it is between the marks of a SLIP frame."""
+    framing: Any = stack.framing
+    body = framing.decode(data.strip(framing.end))
+    return framing.end + (body if isinstance(body, bytes) else data) + framing.end
+
+
+def escapes_left(data: bytes) -> list[bytes]:
+    """Replace escaped bytes on their way in, so that they reach the device changed."""
+    return [data.replace(b"\xdb\xdc", b"\x5b\xdc").replace(b"\xdb\xdd", b"\x5b\xdd")]
+
+
+def every_fifth_missing() -> Damage:
+    count = iter(range(10**9))
+    return replies(lambda reply, _device: None if next(count) % 5 == 4 else reply)
+
+
+def twice(data: bytes) -> list[bytes]:
+    return [data, data]
+
+
+def class_changed(reply: Reply, device: Device) -> Reply:
+    other = {"telemetry": "parameter", "parameter": "telemetry"}.get(reply.klass, reply.klass)
+    return dataclasses.replace(reply, klass=other)
+
+
+def subscription_deaf(
+    _device: Device, request: Request, handle: Callable[[Request], list[Reply]]
+) -> list[Reply]:
+    if (request.klass, request.id) == ("set", 18) and not any(request.data):
+        return [Reply(ReplyKind.ACK, request.id, klass=request.klass, destination=request.source)]
+    return handle(request)
+
+
+def cut_to_size(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+    row = device.icd.rows_by_key.get((request.klass, request.id))
+    size = row.size if row is not None and row.kind == "telecommand" else 0
+    return handle(dataclasses.replace(request, data=request.data[:size].ljust(size, b"\0")))
+
+
+def without_limits(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+    return [
+        dataclasses.replace(reply, kind=ReplyKind.ACK, code=ErrorCode.OK)
+        if reply.kind is ReplyKind.NACK and reply.code == device.icd.error_number(ErrorCode.INVALID_PARAMETER)
+        else reply
+        for reply in handle(request)
+    ]
+
+
+def clock_stays(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+    if (request.klass, request.id) == ("action", 14):
+        return [Reply(ReplyKind.ACK, request.id, klass=request.klass, destination=request.source)]
+    return handle(request)
+
+
+def setting_forgotten(
+    device: Device, request: Request, handle: Callable[[Request], list[Reply]]
+) -> list[Reply]:
+    if (request.klass, request.id) == ("set", 9):
+        return [Reply(ReplyKind.ACK, request.id, klass=request.klass, destination=request.source)]
+    return handle(request)
+
+
+def mutants() -> Iterator[UnitMutant]:
+    first = {"sagitta": "auto_blob", "nos3": "housekeeping", "st16": "ping"}
+    for unit, row in first.items():
+        one = "serial.framing.one"
+        yield UnitMutant(unit, "replies come twice", one, outgoing(twice))
+        yield UnitMutant(
+            unit,
+            "a stray byte follows each reply",
+            "serial.framing.reply-form",
+            outgoing(lambda data: [data + b"\x42"]),
+        )
+        yield UnitMutant(
+            unit,
+            "the last byte of telemetry is missing",
+            f"serial.telemetry.{row}",
+            telemetry_data(lambda data, _row: data[:-1]),
+        )
+        yield UnitMutant(unit, "replies are missing", "serial.recovery.flood", every_fifth_missing())
+        yield UnitMutant(unit, "incomplete messages never time out", "serial.framing.half", times_out_never)
+        yield UnitMutant(
+            unit,
+            "only the first request of a piece is taken",
+            "serial.framing.two-at-once",
+            incoming(lambda data: [data[: (len(data) + 1) // 2]] if len(data) > 12 else [data]),
+        )
+    for unit, row in (("sagitta", "solution"), ("nos3", "data")):
+        yield UnitMutant(
+            unit,
+            "fields are shifted by a byte",
+            f"serial.attitude.{row}",
+            telemetry_data(lambda data, _row: data[1:] + data[:1]),
+        )
+        yield UnitMutant(
+            unit,
+            "numbers have the other byte order",
+            f"serial.attitude.{row}",
+            telemetry_data(reversed_numbers),
+        )
+    for unit in ("sagitta", "st16"):
+        one = "serial.framing.one"
+        yield UnitMutant(
+            unit, "the check is wrong", one, bodies(lambda body, _stack: body[:-1] + bytes((body[-1] ^ 1,)))
+        )
+        yield UnitMutant(
+            unit,
+            "the check has the other byte order",
+            one,
+            bodies(lambda body, stack: body[: -stack.check.size] + body[-stack.check.size :][::-1]),
+        )
+        yield UnitMutant(unit, "no check is sent", one, bodies(lambda body, stack: body[: -stack.check.size]))
+        yield UnitMutant(unit, "the check of requests is not looked at", "serial.check.wrong", unchecked)
+        yield UnitMutant(
+            unit, "one byte of the check is looked at", "serial.check.wrong", only_whole_check_missing
+        )
+        yield UnitMutant(unit, "other addresses are answered", "serial.header.address", any_address)
+        yield UnitMutant(
+            unit,
+            "replies come from another address",
+            one,
+            bodies(
+                lambda body, stack: stack.close(
+                    bytes((body[0] ^ 1, body[1] ^ 1)) + body[2 : -stack.check.size], b""
+                )
+            ),
+        )
+        yield UnitMutant(
+            unit,
+            "replies carry another identifier",
+            one,
+            replies(lambda reply, _device: dataclasses.replace(reply, id=(reply.id or 0) ^ 1)),
+        )
+        yield UnitMutant(
+            unit, "messages of any length are taken", "serial.framing.overlong", takes_any_length
+        )
+        yield UnitMutant(
+            unit,
+            "unknown identifiers are accepted",
+            "serial.identifiers.unknown" if unit == "st16" else "serial.identifiers.set",
+            with_code(ErrorCode.INVALID_ID, None),
+        )
+        yield UnitMutant(
+            unit,
+            "data of any length are taken",
+            "serial.lengths.init.long" if unit == "st16" else "serial.lengths.set_camera.short",
+            handling(cut_to_size),
+        )
+    sagitta: dict[str, tuple[str, Damage]] = {
+        "escapes of replies are swallowed": ("serial.settings.camera", raw_frames(unescaped)),
+        "escapes of requests are not undone": ("serial.settings.camera", incoming(escapes_left)),
+        "replies carry another class": ("serial.framing.one", replies(class_changed)),
+        "unknown classes are answered": ("serial.header.class", any_class),
+        "a wrong length gets another code": ("serial.lengths.set_camera.short", with_code(ErrorCode.INVALID_LENGTH, ErrorCode.BUSY)),
+        "limits are not checked": ("serial.limits.set_camera.focal_length.nan", handling(without_limits)),
+        "a setting is acknowledged and forgotten": ("serial.settings.camera", handling(setting_forgotten)),
+        "a subscription does not end": ("serial.subscriptions.set_subscription", handling(subscription_deaf)),
+        "the clock is not set": ("serial.clock.set_time", handling(clock_stays)),
+        "unsolicited telemetry has the class of a reply": ("serial.subscriptions.set_subscription", _as_replies),
+    }  # fmt: skip
+    for name, (caught_by, damage) in sagitta.items():
+        yield UnitMutant("sagitta", name, caught_by, damage)
+    nos3: dict[str, tuple[str, Damage]] = {
+        "the echo is missing": ("serial.echo.noop", replies(lambda reply, _device: None if reply.kind is ReplyKind.ECHO else reply)),
+        "the echo is altered": ("serial.echo.noop", replies(lambda reply, _device: dataclasses.replace(reply, flags=1) if reply.kind is ReplyKind.ECHO else reply)),
+        "the echo comes after the reply": ("serial.framing.one", handling(lambda _device, request, handle: handle(request)[::-1])),
+        "the end mark is wrong": ("serial.framing.one", outgoing(lambda data: [data[:-1] + b"\xee"])),
+        "unknown commands are answered": ("serial.identifiers.unknown", handling(_answers_all)),
+    }  # fmt: skip
+    for name, (caught_by, damage) in nos3.items():
+        yield UnitMutant("nos3", name, caught_by, damage)
+    yield from gen2()
+
+
+def gen2() -> Iterator[UnitMutant]:
+    """Mutants of the framing `1F 7F … 1F FF` at a unit that is no CubeStar."""
+
+    def stuffing_missing(data: bytes) -> list[bytes]:
+        return [data[:2] + data[2:-2].replace(b"\x1f\x1f", b"\x1f") + data[-2:]]
+
+    length = "serial.lengths.set_unix_time.long"
+    found: dict[str, tuple[str, Damage]] = {
+        "replies come twice": ("serial.framing.one", outgoing(twice)),
+        "a stray byte follows each reply": (
+            "serial.framing.reply-form",
+            outgoing(lambda data: [data + b"\x42"]),
+        ),
+        "replies are missing": ("serial.recovery.flood", every_fifth_missing()),
+        "replies carry another identifier": (
+            "serial.framing.one",
+            replies(lambda reply, _device: dataclasses.replace(reply, id=(reply.id or 0) ^ 1)),
+        ),
+        "the last byte of telemetry is missing": (
+            "serial.telemetry.identification",
+            telemetry_data(lambda data, _row: data[:-1]),
+        ),
+        "replies are not stuffed": ("serial.settings.unsolicited_telemetry", outgoing(stuffing_missing)),
+        "stuffed bytes of requests are changed": (
+            "serial.settings.unsolicited_telemetry",
+            incoming(lambda data: [data.replace(b"\x1f\x1f", b"\x1e")]),
+        ),
+        "unknown identifiers are accepted": (
+            "serial.identifiers.unknown",
+            with_code(ErrorCode.INVALID_ID, None),
+        ),
+        "data of any length are taken": (length, handling(cut_to_size)),
+        "a wrong length gets another code": (length, with_code(ErrorCode.INVALID_LENGTH, ErrorCode.BUSY)),
+    }
+    for name, (caught_by, damage) in found.items():
+        yield UnitMutant("cubestar-gen2", name, caught_by, damage)
+
+
+def _as_replies(unit: SimulatedUnit) -> None:
+    send = unit.link._send_unsolicited
+    unit.requests.unsolicited_receivers[:] = [
+        lambda reply: send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY))
+    ]
+
+
+def _answers_all(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+    if (request.klass, request.id) in device.icd.rows_by_key:
+        return handle(request)
+    return [Reply(ReplyKind.TELEMETRY, request.id, bytes(4), klass=request.klass)]

@@ -1,0 +1,41 @@
+"""The units that ship pass the cases that their definitions yield."""
+
+from __future__ import annotations
+
+import pytest
+
+from starhil.hil_tests.conformance.runner import run_case, run_cases
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
+from starhil.hil_tests.errors import BenchError
+from starhil.protocol.icd import load_unit
+from tests.conformance.mutants_units import UnitMutant, mutants
+from tests.conformance.simulated import SimulatedUnit
+
+UNITS = ("sagitta", "nos3", "st16", "cubestar-gen2")
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_unit_that_ships_passes_every_case_of_its_definition(unit: str) -> None:
+    cases = serial_suite(load_unit(unit))
+    with SimulatedUnit("serial", unit=unit) as simulated:
+        outcomes = run_cases(simulated.probe, cases)
+    assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
+    assert [o.id for o in outcomes if o.status == "skipped"] == []
+    assert len(outcomes) >= 15
+
+
+@pytest.mark.parametrize("mutant", list(mutants()), ids=lambda mutant: f"{mutant.unit}: {mutant.name}")
+def test_a_mutant_of_a_unit_is_caught_by_its_case(mutant: UnitMutant) -> None:
+    cases = {case.id: case for case in serial_suite(load_unit(mutant.unit))}
+    with SimulatedUnit("serial", mutant.damage, unit=mutant.unit) as simulated:
+        outcome = run_case(simulated.probe, cases[mutant.caught_by])
+    assert outcome.status == "failed", f"{mutant.caught_by} passed on a {mutant.unit} where {mutant.name}"
+    assert outcome.expected
+    assert outcome.seen
+
+
+def test_a_unit_without_cases_for_a_link_is_named() -> None:
+    with pytest.raises(BenchError, match="unit oresat: has no serial link"):
+        serial_suite(load_unit("oresat"))
+    with pytest.raises(BenchError, match="unit sagitta: there are no cases for its CAN link"):
+        can_suite(load_unit("sagitta"))
