@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import EarthLimb, Moon, PointSource, SunGlare
 from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
-from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, earth_state, in_metres, sun_position, terrestrial_time
+from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, earth_and_sun, in_metres, terrestrial_time
 
 Vector = NDArray[np.float64]
 
@@ -68,38 +68,35 @@ class Observer:
     relative_velocity_m_s: Vector | None = None
 
     @cached_property
-    def _state(self) -> tuple[Vector, Vector]:
-        position, velocity = self.earth
-        if self.offset_m is not None:
-            position = position + self.offset_m
-        if self.relative_velocity_m_s is not None:
-            velocity = velocity + self.relative_velocity_m_s
-        return position, velocity
+    def _earth_and_sun(self) -> tuple[Vector, Vector, Vector]:
+        return earth_and_sun(self.unix_s)
 
-    @cached_property
+    @property
     def earth(self) -> tuple[Vector, Vector]:
         """Barycentric position, m, and velocity, m/s, of the Earth's centre, ICRS."""
-        return earth_state(self.unix_s)
+        return self._earth_and_sun[:2]
+
+    @property
+    def sun(self) -> Vector:
+        """Barycentric position (3,) of the Sun, m, ICRS."""
+        return self._earth_and_sun[2]
+
+    @cached_property
+    def position_m(self) -> Vector:
+        """Barycentric position (3,), ICRS."""
+        position = self.earth[0]
+        return position if self.offset_m is None else position + self.offset_m
+
+    @cached_property
+    def velocity_m_s(self) -> Vector:
+        """Barycentric velocity (3,), ICRS."""
+        velocity = self.earth[1]
+        return velocity if self.relative_velocity_m_s is None else velocity + self.relative_velocity_m_s
 
     @cached_property
     def sun_direction(self) -> Vector:
         """Apparent direction (3,) of the Sun."""
         return self.towards(self.sun)
-
-    @property
-    def position_m(self) -> Vector:
-        """Barycentric position (3,), ICRS."""
-        return self._state[0]
-
-    @property
-    def velocity_m_s(self) -> Vector:
-        """Barycentric velocity (3,), ICRS."""
-        return self._state[1]
-
-    @cached_property
-    def sun(self) -> Vector:
-        """Barycentric position (3,) of the Sun, m, ICRS."""
-        return sun_position(self.unix_s)
 
     def towards(self, place_m: Vector) -> Vector:
         """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
