@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
@@ -49,6 +49,9 @@ _SATURN_POLE: Final = (0.08547, 0.07323, 0.99365)
 """Direction of the pole of Saturn's rings, ICRS (IAU 2015: right ascension 40.589°, declination 83.537°)."""
 
 _LIGHT_TIME_ROUNDS: Final = 2
+
+PLANETS_KEPT_S: Final = 600.0
+"""Time for which the planets move on straight lines, seconds: 0.01″ for Mercury."""
 
 
 @dataclass(frozen=True)
@@ -168,20 +171,37 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
 
 def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
     """Return the planets from Mercury to Neptune in their places, with their magnitudes."""
+    slot = math.floor(observer.unix_s / PLANETS_KEPT_S)
+    places, velocities, magnitudes = _planets_of(slot)
+    now = observer.towards(places + (observer.unix_s - slot * PLANETS_KEPT_S) * velocities)
+    return tuple(
+        PointSource(**_place(direction), magnitude=magnitude, name=name)
+        for (name, _, _), magnitude, direction in zip(_PLANETS, magnitudes, now, strict=True)
+    )
+
+
+@lru_cache(maxsize=2)
+def _planets_of(slot: int) -> tuple[Vector, Vector, tuple[float, ...]]:
+    """Barycentric places (7, 3), m, of the planets where the Earth sees them at the start of a slot of time.
+
+    Also their velocities (7, 3), m/s, by which they move until the next one, and their magnitudes.
+    """
     import erfa
 
+    observer = Observer(slot * PLANETS_KEPT_S)
     numbers = np.array([number for _, number, _ in _PLANETS])
     first, rest = terrestrial_time(observer.unix_s)
     delay_s = np.zeros(len(numbers))
-    places = np.zeros((len(numbers), 3))
+    places = velocities = np.zeros((len(numbers), 3))
     for _ in range(_LIGHT_TIME_ROUNDS):
-        heliocentric, _ = in_metres(erfa.plan94(first, rest - delay_s / DAY_S, numbers))
+        heliocentric, velocities = in_metres(erfa.plan94(first, rest - delay_s / DAY_S, numbers))
         places = observer.sun + heliocentric
         delay_s = np.linalg.norm(places - observer.position_m, axis=1) / SPEED_OF_LIGHT_M_S
-    return tuple(
-        PointSource(**_place(direction), magnitude=_planet_magnitude(observer, place, name, law), name=name)
-        for (name, _, law), place, direction in zip(_PLANETS, places, observer.towards(places), strict=True)
+    magnitudes = tuple(
+        _planet_magnitude(observer, place, name, law)
+        for (name, _, law), place in zip(_PLANETS, places, strict=True)
     )
+    return places, velocities, magnitudes
 
 
 def _planet_magnitude(observer: Observer, place_m: Vector, name: str, law: tuple[float, ...]) -> float:
