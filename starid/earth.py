@@ -49,25 +49,28 @@ def julian_year(unix_s: float) -> float:
     return 2000.0 + ((first - 2_451_545.0) + rest) / 365.25
 
 
-def earth_state(unix_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Barycentric position (3,), m, and velocity (3,), m/s, of the Earth's centre, ICRS (`erfa.epv00`)."""
-    import erfa
+def earth_and_sun(
+    unix_s: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Position and velocity (3,) of the Earth's centre, and position (3,) of the Sun's.
 
-    _, barycentric = erfa.epv00(*terrestrial_time(unix_s))
-    return in_metres(barycentric)
-
-
-def sun_position(unix_s: float) -> NDArray[np.float64]:
-    """Barycentric position (3,) of the Sun's centre, ICRS, m."""
+    Barycentric, ICRS, m and m/s (`erfa.epv00`).
+    """
     import erfa
 
     heliocentric, barycentric = erfa.epv00(*terrestrial_time(unix_s))
-    return in_metres(barycentric)[0] - in_metres(heliocentric)[0]
+    position, velocity = in_metres(barycentric)
+    return position, velocity, position - in_metres(heliocentric)[0]
+
+
+def earth_state(unix_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Barycentric position (3,), m, and velocity (3,), m/s, of the Earth's centre, ICRS."""
+    return earth_and_sun(unix_s)[:2]
 
 
 def earth_velocity(unix_s: float) -> NDArray[np.float64]:
     """Barycentric velocity (3,) of the Earth's centre, ICRS, m/s."""
-    return earth_state(unix_s)[1]
+    return earth_and_sun(unix_s)[1]
 
 
 def in_metres(pv: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import EarthLimb, Moon, PointSource, SunGlare
 from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
-from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, earth_state, in_metres, sun_position, terrestrial_time
+from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, earth_and_sun, in_metres, terrestrial_time
 
 Vector = NDArray[np.float64]
 
@@ -50,6 +50,9 @@ _SATURN_POLE: Final = (0.08547, 0.07323, 0.99365)
 
 _LIGHT_TIME_ROUNDS: Final = 2
 
+PLANETS_KEPT_S: Final = 600.0
+"""Time for which the planets move on straight lines, seconds: 0.01″ for Mercury."""
+
 
 @dataclass(frozen=True)
 class Observer:
@@ -68,38 +71,35 @@ class Observer:
     relative_velocity_m_s: Vector | None = None
 
     @cached_property
-    def _state(self) -> tuple[Vector, Vector]:
-        position, velocity = self.earth
-        if self.offset_m is not None:
-            position = position + self.offset_m
-        if self.relative_velocity_m_s is not None:
-            velocity = velocity + self.relative_velocity_m_s
-        return position, velocity
+    def _earth_and_sun(self) -> tuple[Vector, Vector, Vector]:
+        return earth_and_sun(self.unix_s)
 
-    @cached_property
+    @property
     def earth(self) -> tuple[Vector, Vector]:
         """Barycentric position, m, and velocity, m/s, of the Earth's centre, ICRS."""
-        return earth_state(self.unix_s)
+        return self._earth_and_sun[:2]
+
+    @property
+    def sun(self) -> Vector:
+        """Barycentric position (3,) of the Sun, m, ICRS."""
+        return self._earth_and_sun[2]
+
+    @cached_property
+    def position_m(self) -> Vector:
+        """Barycentric position (3,), ICRS."""
+        position = self.earth[0]
+        return position if self.offset_m is None else position + self.offset_m
+
+    @cached_property
+    def velocity_m_s(self) -> Vector:
+        """Barycentric velocity (3,), ICRS."""
+        velocity = self.earth[1]
+        return velocity if self.relative_velocity_m_s is None else velocity + self.relative_velocity_m_s
 
     @cached_property
     def sun_direction(self) -> Vector:
         """Apparent direction (3,) of the Sun."""
         return self.towards(self.sun)
-
-    @property
-    def position_m(self) -> Vector:
-        """Barycentric position (3,), ICRS."""
-        return self._state[0]
-
-    @property
-    def velocity_m_s(self) -> Vector:
-        """Barycentric velocity (3,), ICRS."""
-        return self._state[1]
-
-    @cached_property
-    def sun(self) -> Vector:
-        """Barycentric position (3,) of the Sun, m, ICRS."""
-        return sun_position(self.unix_s)
 
     def towards(self, place_m: Vector) -> Vector:
         """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
@@ -171,20 +171,37 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
 
 def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
     """Return the planets from Mercury to Neptune in their places, with their magnitudes."""
+    slot = math.floor(observer.unix_s / PLANETS_KEPT_S)
+    places, velocities, magnitudes = _planets_of(slot)
+    now = observer.towards(places + (observer.unix_s - slot * PLANETS_KEPT_S) * velocities)
+    return tuple(
+        PointSource(**_place(direction), magnitude=magnitude, name=name)
+        for (name, _, _), magnitude, direction in zip(_PLANETS, magnitudes, now, strict=True)
+    )
+
+
+@lru_cache(maxsize=2)
+def _planets_of(slot: int) -> tuple[Vector, Vector, tuple[float, ...]]:
+    """Barycentric places (7, 3), m, of the planets where the Earth sees them at the start of a slot of time.
+
+    Also their velocities (7, 3), m/s, by which they move until the next one, and their magnitudes.
+    """
     import erfa
 
+    observer = Observer(slot * PLANETS_KEPT_S)
     numbers = np.array([number for _, number, _ in _PLANETS])
     first, rest = terrestrial_time(observer.unix_s)
     delay_s = np.zeros(len(numbers))
-    places = np.zeros((len(numbers), 3))
+    places = velocities = np.zeros((len(numbers), 3))
     for _ in range(_LIGHT_TIME_ROUNDS):
-        heliocentric, _ = in_metres(erfa.plan94(first, rest - delay_s / DAY_S, numbers))
+        heliocentric, velocities = in_metres(erfa.plan94(first, rest - delay_s / DAY_S, numbers))
         places = observer.sun + heliocentric
         delay_s = np.linalg.norm(places - observer.position_m, axis=1) / SPEED_OF_LIGHT_M_S
-    return tuple(
-        PointSource(**_place(direction), magnitude=_planet_magnitude(observer, place, name, law), name=name)
-        for (name, _, law), place, direction in zip(_PLANETS, places, observer.towards(places), strict=True)
+    magnitudes = tuple(
+        _planet_magnitude(observer, place, name, law)
+        for (name, _, law), place in zip(_PLANETS, places, strict=True)
     )
+    return places, velocities, magnitudes
 
 
 def _planet_magnitude(observer: Observer, place_m: Vector, name: str, law: tuple[float, ...]) -> float:

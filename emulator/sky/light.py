@@ -32,6 +32,9 @@ GLARE_STEP: Final = 8
 _SMOOTH_PX: Final = 7.0 * GLARE_STEP
 """Distance to a source, or softness of its glare, from which its light is smooth, pixels."""
 
+_SPOT_SIGMAS: Final = 2.0
+"""Width of a spot in units of its standard deviation."""
+
 _GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
 
@@ -71,7 +74,7 @@ class AreaLight:
         """Fraction of the image that receives less than half of the sky's light."""
         if self.transmission is None:
             return float(self.flooded)
-        return float(np.mean(self.transmission < 0.5))
+        return float(np.count_nonzero(self.transmission < 0.5) / self.transmission.size)
 
 
 @compiled_ieee
@@ -180,52 +183,71 @@ def _add_glare(
 
 
 @compiled_ieee
-def _earth_face(
-    shine: Image,
-    clear: Image,
+def _add_earth(
+    electrons_s: Image,
+    transmission: Image,
     directions: Image,
     nadir: npt.NDArray[np.float64],
     sun: npt.NDArray[np.float64],
-    radius: float,
-    atmosphere: float,
+    angles: tuple[float, float],
+    brightness: float,
 ) -> None:
-    """Fill in the Earth's brightness, 1 where the Sun is in the zenith, and the transmission of its edge.
+    """Put the Earth in front of light and sky, in place.
 
     Parameters
     ----------
-    shine, clear : ndarray (h, w), float32
-        Filled: brightness, and fraction of the sky's light that passes.
+    electrons_s, transmission : ndarray (h, w), float32
+        As in `AreaLight`.
     directions : ndarray (3, h, w), float32
         Of the pixels, sensor frame.
     nadir, sun : ndarray (3,)
         To the Earth's centre and to the Sun, sensor frame; zeros instead of the Sun light all of the disc.
-    radius, atmosphere : float
-        Angular radius of the disc and height over which its limb fades, radians.
+    angles : (float, float)
+        Angular radius of the disc, and height over which its limb fades, radians.
+    brightness : float
+        Electrons/s per pixel where the Sun is in the zenith.
     """
-    n0, n1, n2 = nadir[0], nadir[1], nadir[2]
-    s0, s1, s2 = sun[0], sun[1], sun[2]
-    all_lit = s0 == 0.0 and s1 == 0.0 and s2 == 0.0
+    radius, atmosphere = angles
     distance = 1.0 / math.sin(radius)
-    behind = -distance * (n0 * s0 + n1 * s1 + n2 * s2)
     inner, outer = math.cos(radius), math.cos(min(radius + _GLOW_HEIGHTS * atmosphere, math.pi))
-    for y in range(shine.shape[0]):
+    n0, n1, n2 = np.float32(nadir[0]), np.float32(nadir[1]), np.float32(nadir[2])
+    s0, s1, s2 = np.float32(sun[0]), np.float32(sun[1]), np.float32(sun[2])
+    behind = np.float32(-distance * (nadir[0] * sun[0] + nadir[1] * sun[1] + nadir[2] * sun[2]))
+    if sun[0] == 0.0 and sun[1] == 0.0 and sun[2] == 0.0:
+        behind = np.float32(1.0)
+    far, far2 = np.float32(distance), np.float32(distance * distance)
+    edge, end, full = np.float32(inner), np.float32(outer), np.float32(brightness)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    width = electrons_s.shape[1]
+    cosines, shades = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    for y in range(electrons_s.shape[0]):
         dx, dy, dz = directions[0, y], directions[1, y], directions[2, y]
-        for x in range(shine.shape[1]):
-            u, v, w = float(dx[x]), float(dy[x]), float(dz[x])
-            cosine = n0 * u + n1 * v + n2 * w
-            if cosine < outer:
-                shine[y, x], clear[y, x] = 0.0, 1.0
-                continue
-            light, passed = 1.0, 0.0
-            if cosine < inner:
-                height = (math.acos(max(cosine, -1.0)) - radius) / atmosphere
-                light, passed = math.exp(-height), min(height, 1.0)
-            if not all_lit:
-                # cosine of the Sun's zenith distance where the line of sight meets a sphere of radius 1
-                under = max(1.0 - distance * distance * (1.0 - cosine * cosine), 0.0)
-                along = distance * cosine - math.sqrt(under)
-                light *= min(max(behind + along * (s0 * u + s1 * v + s2 * w), 0.0), 1.0)
-            shine[y, x], clear[y, x] = light, passed
+        light, passed = electrons_s[y], transmission[y]
+        least, most = one, -one
+        for x in range(width):
+            cosine = n0 * dx[x] + n1 * dy[x] + n2 * dz[x]
+            cosines[x] = cosine
+            least, most = min(least, cosine), max(most, cosine)
+        if most < end:
+            continue
+        for x in range(width):
+            # brightness by the Sun's zenith distance where the line of sight meets a sphere of radius 1
+            cosine = cosines[x]
+            along = far * cosine - np.sqrt(max(one - far2 * (one - cosine * cosine), zero))
+            shade = behind + along * (s0 * dx[x] + s1 * dy[x] + s2 * dz[x])
+            shades[x] = full * min(max(shade, zero), one)
+        for x in range(width):
+            inside = cosines[x] >= edge
+            light[x] = shades[x] if inside else light[x]
+            passed[x] = zero if inside else passed[x]
+        if least >= edge:
+            continue
+        for x in range(width):
+            if end <= cosines[x] < edge:
+                height = (math.acos(cosines[x]) - radius) / atmosphere
+                clear = np.float32(min(height, 1.0))
+                light[x] = light[x] * clear + shades[x] * np.float32(math.exp(-height))
+                passed[x] *= clear
 
 
 class AreaPainter:
@@ -257,6 +279,12 @@ class AreaPainter:
         steps = (GLARE_STEP * np.arange(-(-size // GLARE_STEP) + 1) for size in self._size)
         return self._directions_of(*steps)
 
+    @cached_property
+    def _buffers(self) -> tuple[Image, Image]:
+        """Light and transmission (h, w) of the last image, to be used again."""
+        shape = (self._camera.height, self._camera.width)
+        return np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+
     @property
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
@@ -268,7 +296,7 @@ class AreaPainter:
         return np.ascontiguousarray(vectors.T.reshape(3, rows.size, columns.size), dtype=np.float32)
 
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
-        """Return light and transmission of all extended objects at one attitude."""
+        """Return light and transmission of all extended objects at one attitude, valid until the next call."""
         if baffle_passed(objects, attitude):
             return AreaLight(flooded=True)
         moon, earth = objects.moon, objects.earth
@@ -284,8 +312,9 @@ class AreaPainter:
                 _add_glare(glare, self._grid_directions, *source)
         if not (sharp or covered or disc):
             return AreaLight(glare)
-        shape = (self._camera.height, self._camera.width)
-        electrons_s, transmission = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32)
+        electrons_s, transmission = self._buffers
+        electrons_s.fill(0.0)
+        transmission.fill(1.0)
         for source in sharp:
             _add_glare(electrons_s, self._directions, *source)
         light = AreaLight(glare, electrons_s, transmission)
@@ -389,27 +418,18 @@ class AreaPainter:
     def _paint_earth(
         self, electrons_s: Image, transmission: Image, earth: EarthLimb, attitude: Attitude
     ) -> None:
-        """Add the Earth's disc, fading over the atmosphere; it hides everything behind it."""
-        import cv2
-
-        shine, clear = np.empty_like(electrons_s), np.empty_like(electrons_s)
+        """Add the Earth's disc; its limb fades over the atmosphere, and at least over the width of a spot."""
         sun = _sun_of(earth)
-        _earth_face(
-            shine,
-            clear,
+        spot = _SPOT_SIGMAS * self._psf_sigma_px * self._camera.pixel_scale_rad
+        _add_earth(
+            electrons_s,
+            transmission,
             self._directions,
             attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg)),
             np.zeros(3) if sun is None else attitude.to_sensor(sun),
-            math.radians(earth.radius_deg),
-            math.radians(earth.atmosphere_deg),
+            (math.radians(earth.radius_deg), max(math.radians(earth.atmosphere_deg), spot)),
+            earth.electrons_s,
         )
-        shine *= np.float32(earth.electrons_s)
-        if math.radians(earth.atmosphere_deg) < 3.0 * self._psf_sigma_px * self._camera.pixel_scale_rad:
-            # a wider limb is smooth already
-            shine = np.asarray(cv2.GaussianBlur(shine, (0, 0), self._psf_sigma_px), dtype=np.float32)
-        electrons_s *= clear
-        electrons_s += shine
-        transmission *= clear
 
     def _earth_in_field(self, earth: EarthLimb, attitude: Attitude) -> bool:
         """Whether the Earth or the glow of its limb reaches into the field."""

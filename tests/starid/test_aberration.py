@@ -11,7 +11,7 @@ import pytest
 from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.earth import earth_state, earth_velocity, julian_year, sun_position, terrestrial_time
+from starid.earth import earth_and_sun, earth_velocity, julian_year, terrestrial_time
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.interface import make_identifier
@@ -75,10 +75,8 @@ def test_the_earth_moves_as_in_epv00_and_de421():
     assert earth_velocity(NEW_YEAR) == pytest.approx(barycentric["v"] * 149_597_870_700 / 86400, abs=1e-3)
     # JPL DE421 by jplephem, 2026-01-01T00:00:00 UTC
     assert earth_velocity(NEW_YEAR) == pytest.approx([-29776.429878, -4951.149713, -2146.394704], abs=0.01)
-    position, _ = earth_state(NEW_YEAR)
-    assert np.linalg.norm(position - sun_position(NEW_YEAR)) == pytest.approx(
-        0.98335 * 149_597_870_700, rel=1e-4
-    )
+    position, _, sun = earth_and_sun(NEW_YEAR)
+    assert np.linalg.norm(position - sun) == pytest.approx(0.98335 * 149_597_870_700, rel=1e-4)
 
 
 @pytest.mark.parametrize(
