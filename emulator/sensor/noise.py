@@ -239,6 +239,11 @@ def digitize(
     rounding_e = digitizer.gain_e_per_dn / math.sqrt(12.0)
     few = FEW_ELECTRONS if math.hypot(digitizer.read_noise_e, rounding_e) < QUIET_NOISE_E else -1.0
     near_full = digitizer.full_well_e - _WELL_MARGIN_SIGMA * math.sqrt(digitizer.full_well_e)
+    least_e = near_full - _WELL_MARGIN_SIGMA * math.hypot(
+        math.sqrt(digitizer.full_well_e), digitizer.read_noise_e
+    )
+    if few < 0.0 and least_e / digitizer.gain_e_per_dn + digitizer.offset_dn > digitizer.max_dn:
+        near_full = math.inf  # the converter saturates before the well: no pixel needs its own number
     levels = (
         digitizer.read_noise_e,
         digitizer.full_well_e,

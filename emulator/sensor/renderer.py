@@ -15,7 +15,9 @@ from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
 from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
-from starhil.emulator.sky.light import AreaLight, AreaPainter, icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.ephemeris import Observer
+from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area, add_glare
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -27,6 +29,9 @@ _MAX_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
 _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
+_FLOOD_WELLS: Final = 10.0
+"""Full wells of electrons in every pixel when light passes the baffle."""
+
 _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
 
@@ -152,6 +157,8 @@ class Renderer:
         rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
+        parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
+        self._parallax_rad = np.radians(parallax_mas / 3.6e6)
         self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])
         self._cos_cone = math.cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
@@ -179,6 +186,7 @@ class Renderer:
         *,
         exposure_s: float | None = None,
         objects: SkyObjects | None = None,
+        observer: Observer | None = None,
     ) -> Frame:
         """Render one exposure.
 
@@ -194,6 +202,8 @@ class Renderer:
             Exposure instead of the sensor's, seconds.
         objects : SkyObjects, optional
             Sky objects instead of the renderer's default.
+        observer : Observer, optional
+            Whose place and motion give the stars parallax and aberration; by default they have neither.
 
         Raises
         ------
@@ -208,15 +218,20 @@ class Renderer:
         rate = _rate(rate_rad_s)
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
-        mean = self._mean_without_stars(exposure)
-        path, chosen, inside = self._paths(attitude, rate, exposure)
+        area = None
+        if others is not None and others.has_extended_objects:
+            area = self._painter.paint(others, attitude)
+        mean = self._mean_without_stars(exposure, area)
+        path, chosen, inside = self._paths(attitude, rate, exposure, observer)
         electrons = self._flux_e_s[chosen] * exposure
         drawn = electrons
         object_truth = None
         if others is not None:
             drawn = electrons.copy()
             drawn[np.flatnonzero(inside)[: others.missing_stars]] = 0.0
-            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, path, drawn)
+            if area is not None:
+                drawn *= area.seen_at(path[:, :2])
+            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, area)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[inside]]
@@ -239,25 +254,14 @@ class Renderer:
         rate: npt.NDArray[np.float64],
         exposure_s: float,
         index: int,
-        path: npt.NDArray[np.float64],
-        electrons: npt.NDArray[np.float64],
+        area: AreaLight | None,
     ) -> ObjectTruth:
-        """Add sky objects to `mean`, and dim the stars behind them; both in place."""
+        """Add planets, false stars and particles to `mean`, in place."""
         rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
-        covered = 0.0
-        area: AreaLight | None = None
-        if objects.has_extended_objects:
-            area = self._painter.paint(objects, attitude)
-            light = area.electrons_s + (area.transmission - np.float32(1.0)) * self._sky_e_s
-            light *= self._pattern.sensitivity * np.float32(exposure_s)
-            mean += light
-            np.maximum(mean, 0.0, out=mean)
-            electrons *= area.seen_at(path[:, :2])
-            covered = float(np.mean(area.transmission < 0.5))
         planet_xy = self._add_planets(mean, objects.planets, attitude, rate, exposure_s, area)
         false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
         streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
-        return ObjectTruth(false_xy, planet_xy, streaks, covered)
+        return ObjectTruth(false_xy, planet_xy, streaks, 0.0 if area is None else area.covered_share)
 
     def _add_planets(
         self,
@@ -275,6 +279,8 @@ class Renderer:
         vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
         path, inside, touching = self._path_of(vectors, attitude, rate, exposure_s)
         xy[inside] = path[inside, :2]
+        if not touching.any():
+            return xy
         electrons = np.array([self.sensor.electrons(planet.magnitude, exposure_s) for planet in planets])
         path, electrons = path[touching], electrons[touching]
         self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))
@@ -307,18 +313,32 @@ class Renderer:
         end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
         return end - start
 
-    def _mean_without_stars(self, exposure_s: float) -> npt.NDArray[np.float32]:
-        """Return the mean electrons (h, w) of sky and dark current, in a buffer that is reused."""
+    def _mean_without_stars(self, exposure_s: float, area: AreaLight | None) -> npt.NDArray[np.float32]:
+        """Return the mean electrons (h, w) of sky, dark current and extended objects, in a buffer that is reused."""
         if exposure_s != self._still_exposure_s:
             np.multiply(self._pattern.sensitivity, self._sky_e_s, out=self._still)
             self._still += self._pattern.dark_e_s
             self._still *= np.float32(exposure_s)
             self._still_exposure_s = exposure_s
-        np.copyto(self._work, self._still)
+        sensitivity = self._pattern.sensitivity
+        if area is not None and area.flooded:
+            self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
+        elif area is not None and area.glare is not None:
+            add_glare(self._work, self._still, sensitivity, area.glare, exposure_s)
+        else:
+            np.copyto(self._work, self._still)
+        if area is not None and area.electrons_s is not None and area.transmission is not None:
+            add_area(
+                self._work, area.electrons_s, area.transmission, sensitivity, float(self._sky_e_s), exposure_s
+            )
         return self._work
 
     def _paths(
-        self, attitude: Attitude, rate: npt.NDArray[np.float64], exposure_s: float
+        self,
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        observer: Observer | None,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars whose light may reach the image.
 
@@ -327,7 +347,10 @@ class Renderer:
         sweep = float(np.linalg.norm(rate)) * exposure_s
         cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
         near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
-        path, inside, touching = self._path_of(self._vectors[near], attitude, rate, exposure_s)
+        icrs = self._vectors[near]
+        if observer is not None:
+            icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
+        path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
 
     def _path_of(

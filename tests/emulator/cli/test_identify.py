@@ -144,3 +144,41 @@ def test_a_tolerance_of_the_automatic_field_is_refused(tmp_path):
     cv2.imwrite(str(image), np.arange(64 * 64, dtype=np.uint16).reshape(64, 64))
     result = starhil("identify", str(image), "--fov", "auto", "--fov-tolerance", "0")
     assert "--fov-tolerance has no effect with --fov auto" in str(result.exception)
+
+
+def test_the_aberration_of_a_dated_image_is_corrected(tmp_path):
+    profile, image = tmp_path / "dated.toml", tmp_path / "sky.png"
+    orbit = "[orbit]\nkind = 'state'\nposition_m = [7e6, 0.0, 0.0]\nvelocity_m_s = [0.0, 0.0, 7500.0]\n"
+    profile.write_text(f"extends = 'cubestar'\n[sky]\ndate = 2026-12-20T12:00:00Z\n{orbit}")
+    where = ["--ra", "83.8", "--dec", "-1.2", "--roll", "30"]
+    assert (
+        starhil("render", "--profile", str(profile), *where, "--bits", "16", "-o", str(image)).exit_code == 0
+    )
+    truth = Attitude.from_radec_roll(83.8, -1.2, 30.0)
+
+    def error_arcsec(*options: str) -> float:
+        found = Attitude.from_quaternion(answer(image, *options)["quaternion_xyzw"])
+        return found.error_to(truth).cross_boresight_arcsec
+
+    dated = ["--date", "2026-12-20T12:00"]
+    assert error_arcsec() > 10.0
+    assert error_arcsec(*dated) == pytest.approx(5.2, abs=2.0)
+    assert error_arcsec(*dated, "--observer-velocity", "0,0,7500") < 1.5
+    assert error_arcsec(*dated, "--observer-velocity", "0,0,7500", "--fov", "41") < 3.0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--date", "yesterday"], "--date: must be a date from 1970 to 2100"),
+        (["--observer-velocity", "1,2"], "three numbers in m/s as X,Y,Z"),
+        (["--observer-velocity", "fast"], "three numbers in m/s as X,Y,Z"),
+        (["--observer-velocity", "0,0,3e8"], "at most 1e+06"),
+    ],
+)
+def test_a_bad_date_or_velocity_is_refused(tmp_path, options, said):
+    image = tmp_path / "dark.png"
+    cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (937, 937)).astype(np.uint8))
+    result = starhil("identify", str(image), *options)
+    assert result.exit_code != 0
+    assert said in str(result.exception)
