@@ -86,7 +86,7 @@ class Head:
         self.number = number
         self.emulation = emulation
         self._faults: Faults | None = None
-        self._truth_log: TruthLog | None = None
+        self._truth_logs: list[TruthLog] = []
 
     @property
     def faults(self) -> Faults:
@@ -101,25 +101,21 @@ class Head:
             raise EmulatorError("run: not started")
         return self._faults
 
-    def open_log(self, options: RunOptions) -> None:
-        """Open the truth log."""
-        path = options.truth_log
-        if path is None and options.record is not None:
-            path = options.record / TRUTH_FILE
-        if path is not None:
-            self._truth_log = TruthLog(
-                path_of_head(path, self.number),
-                overwrite=options.overwrite,
-                wall_times=self.emulation.clock.speed > 0.0,
-            )
+    def open_logs(self, options: RunOptions) -> None:
+        """Open the truth log, and that of a recording."""
+        wall_times = self.emulation.clock.speed > 0.0
+        if options.truth_log is not None:
+            path = path_of_head(options.truth_log, self.number)
+            self._truth_logs.append(TruthLog(path, overwrite=options.overwrite, wall_times=wall_times))
+        if options.record is not None:
+            self._truth_logs.append(TruthLog(options.record / TRUTH_FILE, wall_times=wall_times))
 
     async def open(self) -> None:
         """Open the links and switch the device on."""
         emulation = self.emulation
         await emulation.open()
         self._faults = Faults(emulation.device, emulation.links)
-        if self._truth_log is not None:
-            emulation.device.on_frame.append(self._truth_log.write)
+        emulation.device.on_frame += [log.write for log in self._truth_logs]
 
     def enter(self, scenario: Scenario) -> None:
         """Schedule a scenario; its truth is set once, by the first head."""
@@ -127,10 +123,10 @@ class Head:
         set_truth = emulation.set_truth if self.number == 1 else _leave_truth
         scenario.enter(emulation.device.scheduler, self.faults, set_truth, emulation.profile.folder)
 
-    def close_log(self) -> None:
-        """Close the truth log."""
-        if self._truth_log is not None:
-            self._truth_log.close()
+    def close_logs(self) -> None:
+        """Close the truth logs."""
+        for log in self._truth_logs:
+            log.close()
 
 
 class Run:
@@ -198,7 +194,7 @@ class Run:
         options = self.options
         scenario = load_scenario(options.scenario) if options.scenario else None
         for head in self.heads:
-            head.open_log(options)
+            head.open_logs(options)
         opened: list[Head] = []
         try:
             for head in self.heads:
@@ -248,7 +244,7 @@ class Run:
         closers += [head.emulation.close for head in reversed(self.heads)]
         if self.control is not None:
             closers.insert(0, self.control.close)
-        closers += [head.close_log for head in self.heads]
+        closers += [head.close_logs for head in self.heads]
         if self._recorder is not None:
             closers.append(self._recorder.close)
         await close_all(closers)

@@ -85,7 +85,7 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
         except OSError as error:
             self._socket.close()
             raise StarTrackerFeedError(
-                f"{address}: no emulator ({error.strerror}); see the truth field of its ready line"
+                f"{address}: no emulator ({error.strerror or error}); see the truth field of its ready line"
             ) from None
         self._socket.settimeout(ANSWER_WITHIN_S)
         self._answers = self._socket.makefile("rb")

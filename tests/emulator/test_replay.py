@@ -177,3 +177,13 @@ def test_a_folder_with_files_is_not_recorded_to(record, tmp_path):
     (tmp_path / "recorded" / "notes.txt").write_text("x")
     with pytest.raises(EmulatorError, match="not empty"):
         record(None)
+
+
+def test_a_recording_is_of_one_head(run, tmp_path):
+    with pytest.raises(EmulatorError, match="records one head"):
+        run(
+            None,
+            options=RunOptions(record=tmp_path / "recorded"),
+            others=[{"links": {"can": {"address": 5}}}],
+        )
+    assert not (tmp_path / "recorded").exists()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
 from starhil.hil_tests.private_can_bus import PrivateCanBus
 from tests.emulator.truth.simulators import blocks_of_42
 
@@ -62,7 +62,7 @@ def free_port() -> int:
 
 
 @needs_basilisk
-@pytest.mark.parametrize(("motion", "seconds"), [("tumble", 120), ("pointing", 15)])
+@pytest.mark.parametrize(("motion", "seconds"), [("tumble", 120), ("pointing", 10)])
 def test_basilisk_in_lock_step(motion, seconds, tmp_path):
     port = str(free_port())
     write_files(tmp_path, "basilisk.toml", port=port)
@@ -98,13 +98,13 @@ def send_as_42(server: socket.socket, blocks: list[bytes]) -> None:
                 return
 
 
-def test_42_in_lock_step(tmp_path):
+def test_42_in_lock_step_and_its_recording(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(WITHIN_S)
         command = emulator_command(
             settings=["truth.kind=42", f"truth.port={server.getsockname()[1]}", "parameters.start_mode=lost_in_space"],
             truth_log=tmp_path / "truth.csv",
-            extra=["--clock", "stepped"],
+            extra=["--clock", "stepped", "--record", str(tmp_path / "recorded")],
         )  # fmt: skip
         with EmulatorProcess(command) as emulator:
             write_files(tmp_path, "obc.py", serial=emulator.ready["serial"])
@@ -118,6 +118,10 @@ def test_42_in_lock_step(tmp_path):
     assert figures["largest error of the attitude"][0] < 20.0
     assert figures["largest error of the rate"][0] < 0.01
     assert (tmp_path / "42.png").read_bytes().startswith(PNG)
+    replay = [installed_command(), "replay", str(tmp_path / "recorded")]
+    done = subprocess.run(replay, capture_output=True, text=True, timeout=WITHIN_S)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "entries played: identical" in done.stdout
 
 
 def test_two_heads_on_one_bus(tmp_path):
