@@ -54,7 +54,7 @@ reproduce: $(VENV)/.product
 	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
-	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_serial_stack.py tests/protocol/canopen/test_slave_fuzz.py
+	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_serial_stack.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
 
 soak: $(VENV)/.product
 	$(BIN)/python tools/soak.py --minutes $(MINUTES)

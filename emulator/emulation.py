@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from starhil.emulator.clock import Clock, SteppedClock, make_clock
 from starhil.emulator.device.cycle import Measurement
@@ -35,6 +36,7 @@ from starhil.emulator.truth.live import LiveFeed, LiveTruth
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
+from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.values import Value
 
 log = logging.getLogger("starhil.run")
@@ -73,6 +75,10 @@ class Emulation:
         self.profile = profile
         self._previews = previews
         self.icd = load_unit(profile.unit_source)
+        missing = unbound(self.icd)
+        if missing:
+            raise EmulatorError(missing[0])
+        self._check_links()
         self.clock: Clock = make_clock(profile.run.clock)
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
@@ -228,7 +234,6 @@ class Emulation:
         stepped = isinstance(
             self.clock, SteppedClock
         )  # no time passes between two frames or bytes of one event
-        self._check_links()
         if links.serial.port != "off" and self.icd.link.serial is not None:
             from starhil.protocol.transports.serial import open_serial
 
@@ -260,19 +265,25 @@ class Emulation:
         return bool(links.canopen.node) or (only and links.can.channel != "off")
 
     def _check_links(self) -> None:
-        """Check that the unit has the links that the profile asks for by more than `auto`, and any at all."""
-        links, has = self.profile.links, self.icd.link
-        for key, wanted, there in (
-            ("serial.port", links.serial.port not in ("off", "auto"), has.serial is not None),
-            (
-                "can.channel",
-                links.can.channel not in ("off", "auto") and not links.canopen.node,
-                has.can is not None or self.icd.canopen is not None,
-            ),
-            ("canopen.node", bool(links.canopen.node), self.icd.canopen is not None),
-        ):
-            if wanted and not there:
-                raise EmulatorError(f"links.{key}: unit {self.icd.name} has no such link")
+        """Check that the unit has one of the links that the profile asks for; note those that it lacks.
+
+        Raises
+        ------
+        EmulatorError
+            It has none of them, or a CANopen node is asked for and it has no CANopen.
+        """
+        links, has, name = self.profile.links, self.icd.link, self.icd.name
+        canopen = self.icd.canopen is not None
+        if links.canopen.node and not canopen:
+            raise EmulatorError(f"links.canopen.node: unit {name} has no CANopen")
+        asked = {"serial.port": links.serial.port, "can.channel": links.can.channel}
+        there = {"serial.port": has.serial is not None, "can.channel": has.can is not None or canopen}
+        wanted = [key for key, value in asked.items() if value != "off"]
+        if wanted and not links.canopen.node and not any(there[key] for key in wanted):
+            raise EmulatorError(f"links.{wanted[0]}: unit {name} has none of the links that are asked for")
+        for key in wanted:
+            if asked[key] != "auto" and not there[key]:
+                log.warning("links.%s: unit %s has no such link; it is not opened", key, name)
 
     async def _open_canopen(self, requests: Requests) -> None:
         """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""
@@ -331,7 +342,13 @@ class Emulation:
             awake.cancel()
             raise error
         await awake
-        fields = {**self.ready_fields, "seed": str(self.profile.run.seed), "clock": self.clock.name}
+        unit = quote(self.profile.unit_source, safe="/:.~")  # a field has no blanks
+        fields = {
+            **self.ready_fields,
+            "unit": unit,
+            "seed": str(self.profile.run.seed),
+            "clock": self.clock.name,
+        }
         return "ready " + " ".join(f"{key}={value}" for key, value in fields.items())
 
     async def close(self) -> None:

@@ -17,7 +17,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import FixedConfig, Strict, TruthConfig
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.unit_folders import DEFAULT_UNIT, shipped_units
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_EXTENDS_DEPTH: Final = 8
@@ -206,9 +206,10 @@ class Profile(Strict):
 
     @property
     def unit_source(self) -> str:
-        """The unit for `load_unit`: a folder beside the profile's file, else its name or path as given."""
-        beside = self.folder / Path(self.unit).expanduser()
-        return str(beside) if "/" in self.unit or beside.is_dir() else self.unit
+        """The unit for `load_unit`: a name that ships, else a folder relative to the profile's file."""
+        if self.unit in shipped_units():
+            return self.unit
+        return str(self.folder / Path(self.unit).expanduser())
 
     @property
     def folder(self) -> Path:

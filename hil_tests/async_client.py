@@ -289,11 +289,17 @@ class AsyncObcClient:
             return
         if self._pending is not None:
             request, future = self._pending
-            fits = reply.id is None or (reply.id, reply.klass) == (request.id, request.klass)
-            if fits and reply.kind in _ANSWERS[request.kind] and not future.done():
+            if self._answers(request, reply) and not future.done():
                 future.set_result((reply, now))
                 return
         self.stray_replies.append(reply)
+
+    def _answers(self, request: Request, reply: Reply) -> bool:
+        """Return whether a reply is the answer to a request; a telecommand may be answered with a telemetry row."""
+        if reply.id is None or (reply.id, reply.klass) == (request.id, request.klass):
+            return reply.kind in _ANSWERS[request.kind]
+        row, answer = self.icd.rows_by_key.get((request.klass, request.id)), self._row_of(reply)
+        return row is not None and answer is not None and f"row:{answer.name}" in row.answers
 
     def _on_unsolicited(self, reply: Reply) -> None:
         row = self._row_of(reply)

@@ -23,7 +23,7 @@ from starhil.hil_tests.loop_thread import LoopThread
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.icd import InterfaceDefinition, load_unit
-from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
+from starhil.protocol.messages import LinkFault, Reply, RequestKind
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import Value
@@ -166,11 +166,12 @@ class ObcClient:
             self.core.command(name, values, timeout_s=timeout_s, retries=retries, checked=checked, **fields)
         )
 
-    def request(self, identifier: int, data: bytes = b"", *, timeout_s: float | None = None) -> Reply:
-        """Send a request by row ID with raw parameters; return the reply."""
-        row = self.icd.row_by_id(identifier)
-        kind = self.icd.kind_of_id(identifier)
-        request = Request(kind, identifier, data, klass="" if row is None else row.klass)
+    def request(
+        self, identifier: int, data: bytes = b"", *, klass: str | None = None, timeout_s: float | None = None
+    ) -> Reply:
+        """Send a request by row ID, and class where the unit has classes, with raw parameters; return the reply."""
+        request = self.icd.request_of(identifier, klass, data)
+        row = self.icd.rows_by_key.get((request.klass, identifier))
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
         return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
 

@@ -15,8 +15,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self
+from urllib.parse import unquote
 
-from starhil.hil_tests.errors import EmulatorProcessError
+from starhil.hil_tests.errors import BenchError, EmulatorProcessError
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
 """The first start on a machine compiles for minutes, later ones take about 3 s."""
@@ -132,6 +134,22 @@ class EmulatorProcess:
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._readers: list[threading.Thread] = []
+
+    @property
+    def unit(self) -> str:
+        """Name or folder of the emulator's unit."""
+        return unquote(self.ready.get("unit", DEFAULT_UNIT))
+
+    def check_unit(self, unit: str | None) -> None:
+        """Check that the emulator has the unit that the bench speaks.
+
+        Raises
+        ------
+        BenchError
+            It has another, from its profile.
+        """
+        if unit is None and self.unit != DEFAULT_UNIT:
+            raise BenchError(f"the profile's unit is {self.unit}: give --unit {self.unit} here too")
 
     def start(self) -> Self:
         """Start the process and wait for its ready line.

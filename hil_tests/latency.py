@@ -15,20 +15,20 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanFrame, encode_request_frames
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.messages import Request
-from starhil.protocol.serial_framing import encode_request
+from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.messages import Reply
+from starhil.protocol.serial_stack import build_serial_stack
 
 ROWS: Final = ("identification", "quaternion", "precise_attitude", "star_tracker", "unix_time")
-"""Telemetry rows, requested in turn."""
+"""Telemetry rows of the CubeStar, requested in turn; of another unit all rows."""
 
 PAUSE_S: Final = 0.004
 """Mean pause between two requests, seconds."""
@@ -74,12 +74,9 @@ class SerialRequester:
 
     def __init__(self, path: str, icd: InterfaceDefinition) -> None:
         self._icd = icd
-        self._path = path
-        self.open()
-
-    def open(self) -> None:
-        """Open the port."""
-        self._fd = os.open(self._path, os.O_RDWR | os.O_NOCTTY)
+        self._stack = build_serial_stack(icd)
+        self._host = self._stack.host()
+        self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._fd)
         os.set_blocking(self._fd, False)
         self._poll = select.poll()
@@ -91,14 +88,18 @@ class SerialRequester:
         Return the time until the last byte of the reply, s, or None without a reply.
         """
         row = self._icd.telemetry[name]
+        request = self._icd.request(row)
+        self._host.expect(request, row.size)
+        data = self._stack.encode_request(request)
         begin = time.perf_counter()
-        os.write(self._fd, encode_request(Request.of(row.id)))
-        data = b""
-        while len(data) < row.size + 4 or not data.endswith(b"\x1f\xff"):
-            if not self._poll.poll(REPLY_WITHIN_S * 1000.0):
-                return None
-            data += os.read(self._fd, 4096)
-        return time.perf_counter() - begin
+        os.write(self._fd, data)
+        while self._poll.poll(REPLY_WITHIN_S * 1000.0):
+            data = os.read(self._fd, 4096)
+            arrived = time.perf_counter()
+            if any(isinstance(event, Reply) for event in self._host.feed(data, arrived)):
+                return arrived - begin
+        self._host = self._stack.host()
+        return None
 
     def close(self) -> None:
         """Close the port."""
@@ -128,7 +129,7 @@ class HubRequester:
         row = self._icd.telemetry[name]
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
-        for frame in encode_request_frames(Request.of(row.id), 1, 4):
+        for frame in encode_request_frames(self._icd.request(row), 1, 4):
             self._socket.sendall(_socketcand(frame))
         try:
             for _ in range(frames):
@@ -155,6 +156,7 @@ class EchoRequester:
 
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._icd = icd
+        self._stack = build_serial_stack(icd)
         self._fd, other = os.openpty()
         tty.setraw(other)
         self._process = subprocess.Popen([sys.executable, "-c", ECHO, str(other)], pass_fds=[other])  # noqa: S603
@@ -164,7 +166,7 @@ class EchoRequester:
 
     def ask(self, name: str) -> float | None:
         """Send the bytes of a request; return the time until their echo, s, or None without one."""
-        request = encode_request(Request.of(self._icd.telemetry[name].id))
+        request = self._stack.encode_request(self._icd.request(self._icd.telemetry[name]))
         begin = time.perf_counter()
         os.write(self._fd, request)
         if not self._poll.poll(REPLY_WITHIN_S * 1000.0):
@@ -198,19 +200,19 @@ class Viewers:
 
 
 def measure(
-    icd: InterfaceDefinition,
+    unit: str,
     rates_hz: list[float],
     seconds: float,
     worker: str,
     report: Callable[[str], None] = lambda _text: None,
     viewers: int = 0,
 ) -> tuple[list[LatencyRow], ProcessRow]:
-    """Measure the latency of the links at rest and at each update rate.
+    """Measure the latency of the links of a unit at rest and at each update rate.
 
     Parameters
     ----------
-    icd
-        Interface definition of the CubeStar.
+    unit
+        Name or folder of the unit.
     rates_hz
         Update rates, Hz; 0 is standby.
     seconds
@@ -222,68 +224,84 @@ def measure(
     viewers
         Number of viewers of the console; each rate is then measured without and with them, in turns.
     """
-    from starhil.hil_tests.client import ObcClient
-
+    icd = load_unit(unit)
     rows: list[LatencyRow] = []
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
-    with ExitStack() as stack:
-        hub_process = stack.enter_context(EmulatorProcess(hub_command()))
-        begin = time.perf_counter()
-        emulator = stack.enter_context(
-            EmulatorProcess(
-                emulator_command(
-                    profile="demo",
-                    can=hub_process.ready["can"],
-                    settings=[f"run.worker={worker}", f"links.serial.baud={BAUD}"],
-                    extra=["--view", "auto"] if viewers else (),
+    names = [name for name in ROWS if name in icd.telemetry] or list(icd.telemetry)
+    ready_s = memory_mb = 0.0
+    for rate in rates_hz:
+        report(f"{worker}: {rate:g} Hz")
+        with ExitStack() as stack:
+            hub_process = stack.enter_context(EmulatorProcess(hub_command()))
+            moving = [f"parameters.update_rate={rate}", "parameters.start_mode=lost_in_space"]
+            begin = time.perf_counter()
+            emulator = stack.enter_context(
+                EmulatorProcess(
+                    emulator_command(
+                        profile="demo",
+                        unit=unit,
+                        can=hub_process.ready["can"],
+                        settings=[
+                            f"run.worker={worker}",
+                            f"links.serial.baud={BAUD}",
+                            *(moving if rate > 0.0 else ["parameters.start_mode=standby"]),
+                        ],
+                        extra=["--view", "auto"] if viewers else (),
+                    )
                 )
             )
-        )
-        ready, ready_s = emulator.ready, time.perf_counter() - begin
-        with ObcClient.open(serial=ready["serial"], dialect="b", baud=BAUD) as client:
-            client.command("set_mode", mode="standby")
-        serial, hub, echo = (
-            SerialRequester(ready["serial"], icd),
-            HubRequester(ready["can"], icd),
-            EchoRequester(icd),
-        )
-        for probe in (serial, hub, echo):
-            stack.callback(probe.close)
-        probes = {"serial": serial.ask, "can": hub.ask, "echo": echo.ask}
-        for rate in rates_hz:
-            report(f"{worker}: {rate:g} Hz")
-            serial.close()
-            with ObcClient.open(serial=ready["serial"], dialect="b", baud=BAUD) as client:
-                if rate > 0.0:
-                    client.command("set_update_rate", rate=rate)
-                client.command("set_mode", mode="lost_in_space" if rate > 0.0 else "standby")
-            serial.open()
-            rows += _measure_rate(probes, worker, rate, seconds, rng, ready.get("view", ""), viewers)
-        memory_mb = emulator.memory_bytes() / 2**20
+            ready_s = ready_s or time.perf_counter() - begin
+            probes = _probes(icd, emulator.ready, stack)
+            watched = _Watched(emulator.ready.get("view", ""), viewers)
+            rows += _measure_rate(probes, names, worker, rate, seconds, rng, watched)
+            memory_mb = max(memory_mb, emulator.memory_bytes() / 2**20)
     return rows, ProcessRow(worker, ready_s, memory_mb)
+
+
+def _probes(
+    icd: InterfaceDefinition, ready: Mapping[str, str], stack: ExitStack
+) -> dict[str, Callable[[str], float | None]]:
+    """Open the links that the emulator has, and the echo process for comparison."""
+    if "serial" not in ready:
+        raise BenchError(f"bench latency: unit {icd.name} has no serial link to be measured")
+    opened: dict[str, SerialRequester | HubRequester | EchoRequester] = {
+        "serial": SerialRequester(ready["serial"], icd)
+    }
+    if "can" in ready and icd.link.can is not None:
+        opened["can"] = HubRequester(ready["can"], icd)
+    opened["echo"] = EchoRequester(icd)
+    for probe in opened.values():
+        stack.callback(probe.close)
+    return {link: probe.ask for link, probe in opened.items()}
+
+
+@dataclass(frozen=True)
+class _Watched:
+    """The console's address, and how many viewers it gets."""
+
+    address: str
+    viewers: int
 
 
 def _measure_rate(
     probes: Mapping[str, Callable[[str], float | None]],
+    names: Sequence[str],
     worker: str,
     rate: float,
     seconds: float,
     rng: random.Random,
-    address: str,
-    viewers: int,
+    watched: _Watched,
 ) -> list[LatencyRow]:
     """Measure the links at one update rate, without viewers and with them in turns."""
-    counts = (0, viewers) if viewers else (0,)
+    counts = (0, watched.viewers) if watched.viewers else (0,)
     taken: dict[int, dict[str, list[float]]] = {count: {link: [] for link in probes} for count in counts}
     lost = {count: dict.fromkeys(probes, 0) for count in counts}
-    turns = PAIRS if viewers else 1
+    turns = PAIRS if watched.viewers else 1
     for _ in range(turns):
         for count in counts:
-            watching = Viewers(address, count)
-            if count:
-                time.sleep(SETTLE_S)
-            _measure_links(probes, seconds / turns, rng, taken[count], lost[count])
-            watching.close()
+            with closing(Viewers(watched.address, count)):
+                time.sleep(SETTLE_S if count else 0.0)
+                _measure_links(probes, names, seconds / turns, rng, taken[count], lost[count])
     return [
         _row(link, worker, rate, count, sorted(values), lost[count][link])
         for count in counts
@@ -293,6 +311,7 @@ def _measure_rate(
 
 def _measure_links(
     probes: Mapping[str, Callable[[str], float | None]],
+    names: Sequence[str],
     seconds: float,
     rng: random.Random,
     taken: Mapping[str, list[float]],
@@ -302,7 +321,7 @@ def _measure_links(
     end = time.monotonic() + seconds
     count = 0
     while time.monotonic() < end:
-        name = ROWS[count % len(ROWS)]
+        name = names[count % len(names)]
         count += 1
         for link, ask in probes.items():
             latency = ask(name)

@@ -37,9 +37,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     group.addoption(
         "--starhil-unit",
-        default="cubestar",
+        default=None,
         metavar="UNIT",
-        help="name or folder of the unit's definition (default cubestar)",
+        help="name or folder of the unit's definition (default: that of the profile, or cubestar)",
     )
     group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator")
     group.addoption(
@@ -80,12 +80,14 @@ def starhil_emulator(
 def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
     from starhil.hil_tests.client import ObcClient
 
-    spec = request.config.getoption(f"--starhil-{link}")
+    spec, unit = request.config.getoption(f"--starhil-{link}"), request.config.getoption("--starhil-unit")
     if spec is None:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
-        spec = emulator.ready[link]
+        spec, unit = emulator.ready.get(link), emulator.unit
+        if spec is None:
+            pytest.fail(f"unit {unit} has no {link} link")
     timeout_s = request.config.getoption("--starhil-timeout")
-    common = {"unit": request.config.getoption("--starhil-unit"), "timeout_s": timeout_s}
+    common = {"unit": unit or "cubestar", "timeout_s": timeout_s}
     if link == "can":
         return ObcClient.open(can=spec, **common)
     return ObcClient.open(serial=spec, dialect=request.config.getoption("--starhil-dialect"), **common)

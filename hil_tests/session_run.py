@@ -46,7 +46,7 @@ class SessionRequest:
 
     script: Path
     options: LinkOptions
-    unit: str = DEFAULT_UNIT
+    unit: str | None = None
     start: bool = False
     profile: str | None = None
     folder: Path | None = None
@@ -84,7 +84,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     BenchError
         The script is invalid, a port is not available, or the emulator does not start.
     """
-    icd = load_unit(request.unit)
+    icd = load_unit(request.unit or DEFAULT_UNIT)
     path = find_script(request.script)
     script = load_script(path, icd)
     if request.keep_going:
@@ -110,10 +110,11 @@ def run_session(request: SessionRequest) -> SessionResult:
                 state = stack.enter_context(temporary_folder("starhil-session-"))
                 emulator = _emulator(request, script, options, folder, state)
             bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+            if emulator is not None:
+                emulator.check_unit(request.unit)
             for link in bench.links:
                 bench.client(link)  # report a missing port before the first step
-            if request.view is not None:
-                show = _shown_on_console(request.view, script, bench, stack, show)
+            show = _shown_on_console(request.view, script, bench, stack, show)
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
     except EmulatorProcessError as error:
         if result is None:
@@ -135,9 +136,11 @@ def run_session(request: SessionRequest) -> SessionResult:
 
 
 def _shown_on_console(
-    view: str, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
+    view: str | None, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
 ) -> Callable[[StepResult], None]:
-    """Return what shows a result on the console too."""
+    """Return what shows a result on the console too, if there is one."""
+    if view is None:
+        return show
     address = console_address(view, bench.emulator)
     unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
     planned = len(script.steps) * (len(bench.links) if script.link == "both" else 1)

@@ -140,6 +140,20 @@ class InterfaceDefinition:
         """Return the request of a row."""
         return Request(RequestKind(row.kind), row.id, data, source, klass=row.klass)
 
+    def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
+        """Return a request by id, which need not be that of a row, and by class where the unit has classes.
+
+        Without a class: that of the first row with this id, else the first.
+        """
+        if not self.classes:
+            return Request(self.kind_of_id(row_id), row_id, data)
+        kinds = {item.name: item.kind for item in self.classes}
+        if klass is None:
+            klass = next((row.klass for row in self.rows if row.id == row_id), self.classes[0].name)
+        if klass not in kinds:
+            raise UnknownNameError(f"no class named {klass!r}; the unit has {', '.join(kinds)}")
+        return Request(kinds[klass], row_id, data, klass=klass)
+
     def error_number(self, code: ErrorCode) -> ErrorCode | int:
         """Return the number by which the unit reports an error."""
         if not self.errors:
@@ -195,5 +209,6 @@ def _load(path: Path) -> InterfaceDefinition:
 
     definition, mistakes = read_definition(path)
     if definition is None:
-        raise IcdError(mistakes[0])
+        more = f" ({len(mistakes) - 1} more mistakes: starhil unit check {path})" if len(mistakes) > 1 else ""
+        raise IcdError(f"{mistakes[0]}{more}")
     return definition

@@ -396,7 +396,7 @@ class _Builder:
                     f"{where}: no class named {model.class_!r}{did_you_mean(model.class_, self._classes)}"
                 )
             if found.kind.value != kind:
-                raise IcdError(f"{where}: class {model.class_} is one of {found.kind.value}s")
+                raise IcdError(f"{where}: class {model.class_} is of {found.kind.value}, not of {kind}")
             return model.class_
         names = [item.name for item in self._classes.values() if item.kind.value == kind]
         if len(names) > 1 or (self._classes and not names):

@@ -31,8 +31,11 @@ class UnitModel(_Model):
     """Name, version and description of a unit."""
 
     name: str
+    """Name of the unit."""
     version: str
+    """Version of the definition."""
     doc: str
+    """What the unit is, in one sentence."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Ids from this one up are telemetry, those below are telecommands; left out if classes or rows decide."""
     plugin: str | None = None
@@ -45,19 +48,22 @@ class ConventionsModel(_Model):
     quaternion: Literal["rotation", "attitude"] = "rotation"
     """`rotation`: v_sensor = q v q*; `attitude`: its conjugate, as in a textbook's A(q)."""
     scalar_sign: Literal["positive", "any"] = "positive"
-    """Whether the scalar part is never negative, or the sign is that of the solution."""
+    """Whether the scalar part is never negative, or the sign stays with the last quaternion that was reported."""
     axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] = ["+x", "+y", "+z"]
     """Axes of the reported frame in terms of the sensor's."""
     epoch: str = "unix"
     """Zero of times: `unix`, `gps`, `j2000`, `midnight` (of the day), or a date such as 2000-01-01."""
     byte_order: Order = "little"
+    """Order of the bytes of fields that do not say otherwise."""
 
 
 class ClassModel(_Model):
     """A class of rows, by which a request says what it is."""
 
     name: Name
+    """Name by which rows refer to it."""
     kind: Kind
+    """What its rows are."""
     code: Code | None = None
     """Its code in a request."""
     reply: Code | None = None
@@ -72,16 +78,22 @@ class EnumModel(_Model):
     """Names for numbers."""
 
     name: Name
+    """Name by which fields refer to it."""
     doc: str
+    """What is enumerated."""
     values: dict[Name, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(min_length=1)
+    """Name → number on the wire."""
 
 
 class _BoundModel(_Model):
     """What fields and bits have in common: where their value comes from, or goes to."""
 
     name: Name | None = None
+    """Name of the field; one without a name is sent as zeros."""
     enum: str | None = None
+    """Enumeration of the unit, or of the device model, that names the numbers."""
     default: Scalar | None = None
+    """Value where none is given: a telecommand without this field, a quantity without a value or without a number."""
     parameter: str | None = None
     """Name of the parameter that the field sets or reports."""
     value: str | None = None
@@ -93,19 +105,23 @@ class _BoundModel(_Model):
     map: dict[str, Scalar | list[Scalar]] | None = None
     """Number on the wire → value of the quantity or argument, or several values for one number."""
     doc: str = ""
+    """What the field is."""
 
 
 class BitModel(_BoundModel):
     """One bit or a group of bits, the lowest first; unused if it has no name."""
 
     width: Annotated[int, Field(ge=1, le=31)] = 1
+    """Bits."""
 
 
 class RepeatModel(_Model):
     """A group of fields that follows `count` times; `[n]` in a quantity's name is the number of the repetition."""
 
     count: Annotated[int, Field(ge=1, le=256)]
+    """Number of repetitions; their names end in _1, _2 …"""
     fields: list[FieldModel] = Field(min_length=1)
+    """Fields of the group."""
 
 
 class FieldModel(_BoundModel):
@@ -116,37 +132,51 @@ class FieldModel(_BoundModel):
     repeat: RepeatModel | None = None
     """A repeated group in place of one field."""
     type: FieldType | None = None
+    """Type on the wire."""
     size: Annotated[int, Field(ge=1, le=4096)] | None = None
     """Bytes of a `bytes` or `text` field."""
     order: Order | None = None
     """Order of the bytes; that of the unit unless given."""
     unit: str = ""
+    """Unit of the physical value; values are converted from that of the quantity (s, ms, us, ns; rad, deg, arcmin, arcsec; rad/s, deg/s …)."""
     scale: float = 1.0
     """Physical = raw * scale + offset."""
     offset: float = 0.0
+    """Added after the scale."""
     min: float | None = None
+    """Lowest physical value."""
     max: float | None = None
+    """Highest physical value."""
     bits: list[BitModel] = []
+    """Bits of a bit field, the lowest first."""
     wrap: bool = False
     """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
     nearest limit."""
     provenance: Provenance | None = None
+    """That of the row unless given."""
 
 
 class RowModel(_Model):
     """A telecommand or telemetry row."""
 
     id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    """Identifier on the wire."""
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Expands to the rows name_1 … for the ids id … last_id, all with the same layout; `[n]` is their number."""
     name: Name
+    """Name for clients, sessions and exports."""
     class_: str | None = Field(default=None, alias="class")
+    """Class of the row; needed where there are several of its kind."""
     doc: str
+    """What the row is."""
     provenance: Provenance
+    """`confirmed` by a public source, `proxy` from a relative of the unit, or `ours`."""
     source: str = ""
+    """The public source."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Bytes of data, to check the fields against."""
     fields: list[FieldModel] | None = None
+    """Fields in the order on the wire."""
     include: list[str] | None = None
     """Names of rows whose fields this row concatenates, in order."""
     action: str | None = None
@@ -161,14 +191,23 @@ class ParameterModel(_Model):
     """A parameter of the device that the unit exposes; what is left out is as in the device model."""
 
     id: Annotated[int, Field(ge=1, le=254)]
+    """Identifier in set_parameter and select_parameter."""
     name: Name
+    """Name of the parameter in the device model."""
     type: ParameterType | None = None
+    """Type on the wire."""
     unit: str | None = None
+    """Unit; that of the device model."""
     min: float | None = None
+    """Lowest value."""
     max: float | None = None
+    """Highest value."""
     default: Scalar | None = None
+    """Default of this unit."""
     enum: str | None = None
+    """Enumeration that names the numbers."""
     doc: str | None = None
+    """What the parameter does."""
 
 
 class SectionModel(_Model):

@@ -14,6 +14,9 @@ DEFAULT_UNIT: Final = "cubestar"
 UNITS_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "units"
 """Folder of the units that ship with the package."""
 
+SKELETON: Final = UNITS_FOLDER.parent / "new_unit.toml"
+"""Definition from which a user's own begins."""
+
 
 def shipped_units() -> list[str]:
     """Return the names of the units that ship with the package."""
@@ -33,4 +36,6 @@ def find_unit(name_or_folder: str | Path) -> Path:
         return path
     near = difflib.get_close_matches(path.name, shipped, n=3)
     hint = f"did you mean {', '.join(near)}?" if near else f"units that ship: {', '.join(shipped)}"
-    raise IcdError(f"unit {name_or_folder}: neither a folder nor a unit that ships with the package; {hint}")
+    raise IcdError(
+        f"unit {name_or_folder}: neither a folder nor a unit that ships with the package; {hint}; `starhil unit new FOLDER` writes one"
+    )

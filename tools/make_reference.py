@@ -136,9 +136,9 @@ def documented_names(item: Any) -> dict[str, str]:
 
 def limits(schema: Mapping[str, Any]) -> str:
     """Return what a JSON schema allows, in words."""
-    for inner in schema.get("anyOf", ()):
-        if inner.get("type") != "null":
-            return limits(inner)
+    alternatives = [inner for inner in schema.get("anyOf", ()) if inner.get("type") != "null"]
+    if alternatives:
+        return limits(alternatives[0]) if len(alternatives) == 1 else ""
     if "enum" in schema or "const" in schema:
         return ", ".join(f"`{item}`" for item in schema.get("enum", [schema.get("const")]))
     if schema.get("type") == "array":
@@ -348,6 +348,81 @@ def scenario() -> str:
     return table(model_rows(ScenarioEvent))
 
 
+def unit_definition() -> str:
+    """Tables and keys of the files of a unit."""
+    from starhil.protocol import icd_schema
+
+    headings: dict[str, type[BaseModel]] = {
+        "[unit]": icd_schema.UnitModel,
+        "[conventions]": icd_schema.ConventionsModel,
+        "[[class]]": icd_schema.ClassModel,
+        "[[enum]]": icd_schema.EnumModel,
+        "[[telecommand]], [[telemetry]]": icd_schema.RowModel,
+        "fields": icd_schema.FieldModel,
+        "bits": icd_schema.BitModel,
+        "repeat": icd_schema.RepeatModel,
+        "[[parameter]]": icd_schema.ParameterModel,
+    }
+    parts = []
+    for heading, model in headings.items():
+        texts: dict[str, str] = {}
+        for kind in reversed(model.__mro__[: model.__mro__.index(BaseModel)]):
+            texts |= attribute_docstrings(kind)
+        schema = model.model_json_schema()
+        properties = schema.get("properties") or schema["$defs"][model.__name__]["properties"]
+        rows: list[Row] = [
+            (f"`{key}`", "", limits(properties[key]), default(field), texts[name])
+            for name, field in model.model_fields.items()
+            for key in (field.alias or name,)
+        ]
+        parts.append(f"### `{heading}`\n\n{plain_text(model.__doc__ or '')}\n\n{table(rows)}")
+    return "\n\n".join(parts)
+
+
+def quantities() -> str:
+    """Every quantity of the device model."""
+    from starhil.protocol.device_model import device_model
+
+    model = device_model()
+    lines = ["| quantity | type | unit | meaning |", "|---|---|---|---|"]
+    for item in model.quantities.values():
+        kind = item.type if item.enum is None else f"name: {', '.join(model.enums[item.enum].values)}"
+        count = f" n from 1 to {item.count}." if item.count else ""
+        lines.append(f"| `{item.name}` | {kind} | {item.unit} | {item.doc}{count} |")
+    return "\n".join(lines)
+
+
+def actions() -> str:
+    """Every action of the device model and its arguments."""
+    from starhil.protocol.device_model import device_model
+
+    lines = ["| action | argument | type | unit | default | meaning |", "|---|---|---|---|---|---|"]
+    for action in device_model().actions.values():
+        lines.append(f"| `{action.name}` | | | | | {action.doc} |")
+        for item in action.arguments:
+            value = "required" if item.required else literal(item.default)
+            kind = item.type if item.enum is None else f"name of {item.enum}"
+            lines.append(f"| | `{item.name}` | {kind} | {item.unit} | {value} | {item.doc} |")
+    return "\n".join(lines)
+
+
+def device_parameters() -> str:
+    """Every parameter of the device model."""
+    from starhil.protocol.device_model import device_model
+
+    rows: list[Row] = [
+        (
+            f"`{item.name}`",
+            item.unit,
+            "" if item.min is None or item.max is None else f"{number(item.min)} to {number(item.max)}",
+            literal(item.default),
+            item.doc,
+        )
+        for item in device_model().parameters.values()
+    ]
+    return table(rows)
+
+
 def commands() -> str:
     """Every command of the command line, with its arguments and options."""
     import typer.main
@@ -416,14 +491,18 @@ def shown_default(value: Any) -> str:
 
 
 TABLES: Final[dict[str, Callable[[], str]]] = {
+    "actions": actions,
     "commands": commands,
+    "device_parameters": device_parameters,
     "faults": faults,
     "identifier": identifier,
     "profile": profile,
+    "quantities": quantities,
     "scenario": scenario,
     "sensor": sensor,
     "sky": sky,
     "truth": truth,
+    "unit_definition": unit_definition,
 }
 """Name of a table in a page → what writes it."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import itertools
 import math
 import sys
 from typing import Annotated, Any, Final, NoReturn
@@ -29,6 +30,7 @@ USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
 
 COMMANDS: Final[dict[str, str]] = {
     "icd": "icd",
+    "unit": "unit",
     "run": "run",
     "bench": "bench",
     "render": "render",
@@ -66,7 +68,7 @@ class FiniteCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, with the values of `OPTIONAL_VALUES` added where they are left out."""
         whole = []
-        for argument, after in zip(args, [*args[1:], "--"], strict=True):
+        for argument, after in itertools.pairwise([*args, "--"]):
             whole.append(argument)
             if argument in OPTIONAL_VALUES and after.startswith("-"):
                 whole.append(OPTIONAL_VALUES[argument])

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Final, TypeAlias
 
 import typer
 
-from starhil.emulator.cli.options import DIALECTS, AsJson, DeviceAddress, SerialDialect, one_of
+from starhil.emulator.cli.options import DIALECTS, AsJson, DeviceAddress, SerialDialect, Unit, one_of
 from starhil.emulator.cli.output import output_help, prepare_output
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 _MIN_TABLE_WIDTH: Final = 134
 
@@ -85,17 +86,17 @@ def latency(
             min=0, help="Viewers of the console: each rate is measured without and with them, in turns."
         ),
     ] = 0,
+    unit: Unit = DEFAULT_UNIT,
     as_json: AsJson = False,
 ) -> None:
     """Measure reply latency on both links while frames are solved, and the start-up of the emulator."""
     from starhil.hil_tests.latency import measure
-    from starhil.protocol.icd import load_unit
 
     chosen = [one_of("--worker", worker, ("process", "thread")) for worker in workers or ["process"]]
     report = _progress()
     rows, processes = [], []
     for worker in chosen:
-        links, process = measure(load_unit(), rates or [0.0, 1.0, 10.0], seconds, worker, report, viewers)
+        links, process = measure(unit, rates or [0.0, 1.0, 10.0], seconds, worker, report, viewers)
         rows += links
         processes.append(process)
     if as_json:

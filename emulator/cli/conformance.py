@@ -20,7 +20,7 @@ from starhil.emulator.cli.options import (
     JunitFile,
     SerialDialect,
     SerialPort,
-    Unit,
+    UnitChoice,
     one_of,
 )
 from starhil.emulator.cli.output import output_help
@@ -32,7 +32,7 @@ def command(
         list[str] | None,
         typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'; default: all."),
     ] = None,
-    unit: Unit = DEFAULT_UNIT,
+    unit: UnitChoice = None,
     serial: SerialPort = None,
     can: CanChannel = None,
     canopen: CanopenNode = None,
@@ -119,7 +119,7 @@ def command(
     )
     console = Console(highlight=False, quiet=as_json)
     if list_only:
-        for item in all_cases(request, load_unit(unit)):
+        for item in all_cases(request, load_unit(unit or DEFAULT_UNIT)):
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
         return

@@ -42,7 +42,7 @@ UnitChoice: TypeAlias = Annotated[
     str | None,
     typer.Option(
         "--unit",
-        help="Interface definition instead of the profile's: the name of a unit that ships with starhil, or a folder.",
+        help="Interface definition: the name of a unit that ships with starhil, or a folder. Default: that of the profile, or cubestar.",
     ),
 ]
 JunitFile: TypeAlias = Annotated[

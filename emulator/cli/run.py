@@ -182,7 +182,9 @@ def command(
 
 def _absolute_folder(unit: str) -> str:
     """Return a folder given on the command line as an absolute path: in a profile it is relative to the profile."""
-    return str(Path(unit).expanduser().absolute()) if Path(unit).expanduser().exists() else unit
+    from starhil.protocol.unit_folders import find_unit, shipped_units
+
+    return unit if unit in shipped_units() else str(find_unit(unit).absolute())
 
 
 def _quoted(text: str) -> str:

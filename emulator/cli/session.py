@@ -18,16 +18,15 @@ from starhil.emulator.cli.options import (
     JunitFile,
     SerialDialect,
     SerialPort,
-    Unit,
+    UnitChoice,
 )
-from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 
 def command(
     script: Annotated[
         Path, typer.Argument(help="Session script (TOML), or the name of one that ships with starhil.")
     ],
-    unit: Unit = DEFAULT_UNIT,
+    unit: UnitChoice = None,
     serial: SerialPort = None,
     can: CanChannel = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,

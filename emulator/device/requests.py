@@ -55,6 +55,11 @@ class Requests:
         self.telecommand_bindings = {
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
         }
+        serial = icd.link.serial
+        self._stamped = serial is not None and any(
+            item.role in ("ticks", "time") for item in serial.reply_header
+        )
+        """Whether replies carry the time."""
         device.subscriptions.send = self._send_unsolicited
         device.on_start.append(self._restart_subscriptions)
         device.on_frame.append(lambda _measurement: device.subscriptions.frame_published())
@@ -178,7 +183,9 @@ class Requests:
         )
 
     def _times(self) -> tuple[int, int]:
-        """Return the time since start-up and the device's clock since the unit's epoch, nanoseconds."""
+        """Return the time since start-up and the device's clock since the unit's epoch, ns; 0 if no reply carries it."""
+        if not self._stamped:
+            return 0, 0
         device = self.device
         uptime_ns = device.clock.now_ns() - device.started_ns
         return uptime_ns, device.icd.conventions.reported_ns(device.time.unix_ns())

@@ -32,7 +32,7 @@ DEFAULT_BAUD: Final = 115200
 class ConformanceRequest:
     """Options of the user; see `starhil conformance --help`."""
 
-    unit: str = DEFAULT_UNIT
+    unit: str | None = None
     serial: str | None = None
     can: str | None = None
     canopen_node: int | None = None
@@ -93,7 +93,7 @@ def run_conformance(
     BenchError, ProtocolError
         A port, a bus or the emulator is not available.
     """
-    icd = load_unit(request.unit)
+    icd = load_unit(request.unit or DEFAULT_UNIT)
     cases = all_cases(request, icd)
     outcomes: list[Outcome] = []
     complete = False
@@ -222,7 +222,9 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
         state_dir=folder,
         extra=extra,
     )
-    return stack.enter_context(EmulatorProcess(command))
+    emulator = stack.enter_context(EmulatorProcess(command))
+    emulator.check_unit(request.unit)
+    return emulator
 
 
 def _run_canopen(

@@ -29,7 +29,8 @@ from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth, TruthSource
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager, FakeImager
 
@@ -101,7 +102,7 @@ class Bench:
         profile: Profile | None = None,
         store: StateStore | None = None,
         truth: TruthSource | None = None,
-        unit: str = "cubestar",
+        unit: str = DEFAULT_UNIT,
     ) -> None:
         self.clock = SteppedClock()
         self.pipeline = FakePipeline()
@@ -138,19 +139,19 @@ class Bench:
     def send(self, name: str, data: bytes | None = None, **values: object) -> list[Reply]:
         """Send a telecommand; return all replies."""
         row = self.icd.telecommands[name]
-        request = Request.of(row.id, row.encode(values) if data is None else data)
+        request = self.icd.request(row, row.encode(values) if data is None else data)
         return self.requests.handle(request, self.later.append) or []
 
     def command(self, name: str, **values: object) -> ErrorCode:
         """Send a telecommand; return what it was answered with."""
         reply = self.send(name, **values)[0]
-        assert (reply.kind is ReplyKind.ACK) == (reply.code is ErrorCode.OK)
+        assert (reply.kind is ReplyKind.ACK) == (reply.code == ErrorCode.OK)
         return ErrorCode(reply.code)
 
     def read(self, name: str) -> dict:
         """Read telemetry in physical units."""
         row = self.icd.telemetry[name]
-        (reply,) = self.requests.handle(Request.of(row.id))
+        (reply,) = self.requests.handle(self.icd.request(row))
         assert reply.kind is ReplyKind.TELEMETRY, reply
         return row.decode(reply.data)
 

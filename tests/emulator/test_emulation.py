@@ -45,6 +45,7 @@ def test_the_ready_line_tells_what_was_taken(run):
         words = dict(word.split("=", 1) for word in line.removeprefix("ready ").split())
         assert words["serial"].startswith("/dev/pts/")
         assert words["dialect"] == "b"
+        assert words["unit"] == "cubestar"
         assert words["seed"] == "1"
         assert words["clock"] == "stepped"
         assert words["control"].startswith("unix:/")

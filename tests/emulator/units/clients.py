@@ -11,6 +11,7 @@ import numpy as np
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.truth.source import RateTruth
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.transports.base import Transport
 from tests.emulator.conftest import Bench
@@ -86,6 +87,14 @@ class Emulated:
         self.wire.take()
         self.wire.arrive(CanFrame(frame_id, data, extended=extended))
         return self.wire.take()
+
+    def turn(self, rate_deg_s: tuple[float, float, float]) -> None:
+        """Turn at a constant body rate from now on, and let some frames pass."""
+        device = self.bench.device
+        now_s = self.bench.clock.now_ns() / 1e9
+        attitude = device.cycle.truth.state(now_s).attitude
+        device.cycle.truth = RateTruth(attitude, np.radians(rate_deg_s), now_s)
+        self.step(4.0)
 
     def cover(self) -> None:
         """Cover the lens: no star is seen from now on."""

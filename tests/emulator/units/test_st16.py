@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 import pytest
@@ -88,6 +89,15 @@ def test_combination_has_a_frame_for_each_part(parts):
         frames = replies(unit, COMBINATION, struct.pack("<BI", 0, parts)[:4])
         wanted = [part for bit, part in enumerate(PARTS) if parts >> bit & 1]
         assert [(struct.unpack_from("<H", data)[0], len(data) - 2) for _, data in frames] == wanted
+
+    with_unit("st16", "serial", scenario)
+
+
+def test_rate_is_the_true_one_in_radians_a_second():
+    def scenario(unit: Emulated) -> None:
+        unit.turn((0.5, -0.25, 0.125))
+        found = struct.unpack_from("<3d", combination(unit, 0x08), 0x28)
+        assert found == pytest.approx([math.radians(rate) for rate in (0.5, -0.25, 0.125)], rel=1e-3)
 
     with_unit("st16", "serial", scenario)
 

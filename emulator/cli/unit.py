@@ -1,0 +1,174 @@
+"""`starhil unit`: list, write, check and describe the interface definitions of units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from starhil.emulator.cli.options import AsJson
+from starhil.emulator.cli.output import print_text
+from starhil.protocol.unit_folders import DEFAULT_UNIT
+
+group = typer.Typer(help="List, write, check and describe units.", no_args_is_help=True)
+
+UnitArgument = Annotated[
+    str,
+    typer.Argument(metavar="UNIT", help="Name of a unit that ships with starhil, or a folder of TOML files."),
+]
+
+
+@group.command("list")
+def list_units(as_json: AsJson = False) -> None:
+    """List the units that ship with starhil."""
+    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit_folders import shipped_units
+
+    units = {name: load_unit(name) for name in shipped_units()}
+    if as_json:
+        print(json.dumps([{"unit": name, **_summary(icd)} for name, icd in units.items()]))
+        return
+    for name, icd in units.items():
+        mark = " (default)" if name == DEFAULT_UNIT else ""
+        rows = f"{len(icd.telecommands)} telecommands, {len(icd.telemetry)} telemetry"
+        print(f"{name + mark:22s} {', '.join(_links(icd)):22s} {rows:36s} {icd.doc}")
+
+
+@group.command("new")
+def new(
+    folder: Annotated[Path, typer.Argument(help="Folder to write; it must hold no TOML file yet.")],
+) -> None:
+    """Write a commented definition that already runs, to be made yours."""
+    from starhil.emulator.errors import EmulatorError
+    from starhil.protocol.unit_folders import SKELETON
+    from starid.files import write_atomically
+
+    if folder.exists() and (not folder.is_dir() or any(folder.glob("*.toml"))):
+        raise EmulatorError(f"{folder}: is a file, or holds TOML files already; choose another folder")
+    name = folder.resolve().name
+    text = SKELETON.read_text(encoding="utf-8").replace("MY_UNIT", name.replace('"', "").replace("\\", ""))
+    file = folder / "unit.toml"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    except OSError as error:
+        raise EmulatorError(f"{file}: cannot be written ({error.strerror}); choose another folder") from None
+    print(f"wrote {file}; try: starhil unit check {folder}; starhil run --unit {folder} --serial auto")
+
+
+@group.command("check")
+def check(unit: UnitArgument, as_json: AsJson = False) -> None:
+    """Check a definition: print its mistakes, or an example exchange of each row in hexadecimal bytes.
+
+    Exit status 0: the unit can be emulated, 1: it has mistakes.
+    """
+    from starhil.protocol.errors import ProtocolError
+    from starhil.protocol.icd import check_unit, load_unit
+    from starhil.protocol.unit_examples import Exchange, exchanges
+
+    mistakes = check_unit(unit)
+    examples: list[Exchange] = []
+    if not mistakes:
+        try:
+            examples = list(exchanges(load_unit(unit)))
+        except ProtocolError as error:
+            mistakes = [f"unit {unit}: {error}"]
+    if as_json:
+        shown = [
+            {"row": item.row.name, "link": item.link, "request": item.request, "answers": item.answers}
+            for item in examples
+        ]
+        print(json.dumps({"unit": unit, "mistakes": mistakes, "examples": shown}))
+    else:
+        for text in mistakes:
+            print_text(text + "\n")
+        for item in examples:
+            print(f"{item.row.kind} {item.row.name}, id {item.row.id}, {item.row.size} B, on {item.link}")
+            for frame in item.request:
+                print(f"  > {frame}")
+            for frame in item.answers:
+                print(f"  < {frame}")
+        print(f"{len(mistakes)} mistakes" if mistakes else f"unit {unit}: good")
+    raise typer.Exit(1 if mistakes else 0)
+
+
+@group.command("describe")
+def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None:
+    """Describe a unit: links, conventions, and what each row is bound to."""
+    from starhil.protocol.icd import load_unit
+
+    icd = load_unit(unit)
+    if as_json:
+        print(json.dumps({**_summary(icd), "rows": [_row(row) for row in icd.rows]}))
+        return
+    conventions = icd.conventions
+    print(f"{icd.name} {icd.version}: {icd.doc}")
+    print(f"links: {', '.join(_links(icd)) or 'none'}")
+    print(
+        f"conventions: quaternion as {conventions.quaternion}, scalar {conventions.scalar_sign}, "
+        f"axes {', '.join(conventions.axes)}, time since {conventions.epoch}, {conventions.byte_order}-endian"
+    )
+    for item in icd.classes:
+        code = "none" if item.code is None else str(item.code)
+        print(f"class {item.name}: {item.kind.value}, code {code}")
+    for row in icd.rows:
+        klass = f"{row.klass} " if row.klass else ""
+        action = "" if row.action is None else f", action {row.action}"
+        print(f"{klass}{row.id} {row.kind} {row.name}: {row.size} B{action}, {row.provenance}")
+        for field in row.named_fields.values():
+            unit_text = f" {field.unit}" if field.unit else ""
+            print(f"    {field.offset:4d} {field.name}: {field.type}{unit_text}{_binding(field)}")
+
+
+def _binding(field: Any) -> str:
+    for name, arrow in (("value", "<-"), ("argument", "->"), ("parameter", "parameter"), ("const", "=")):
+        bound = getattr(field, name)
+        if bound is not None:
+            return f" {arrow} {bound}"
+    return ""
+
+
+def _links(icd: Any) -> list[str]:
+    serial, can = icd.link.serial, icd.link.can
+    links = [] if serial is None else [f"serial ({serial.framing.kind})"]
+    links += [] if can is None else [f"CAN ({can.kind})"]
+    return links + ([] if icd.canopen is None else ["CANopen"])
+
+
+def _summary(icd: Any) -> dict[str, Any]:
+    return {
+        "name": icd.name,
+        "version": icd.version,
+        "doc": icd.doc,
+        "links": _links(icd),
+        "telecommands": len(icd.telecommands),
+        "telemetry": len(icd.telemetry),
+        "parameters": len(icd.parameters),
+    }
+
+
+def _row(row: Any) -> dict[str, Any]:
+    return {
+        "kind": row.kind,
+        "class": row.klass,
+        "id": row.id,
+        "name": row.name,
+        "size": row.size,
+        "action": row.action,
+        "provenance": row.provenance,
+        "fields": [
+            {
+                "name": field.name,
+                "offset": field.offset,
+                "type": field.type,
+                "unit": field.unit,
+                "value": field.value,
+                "argument": field.argument,
+                "parameter": field.parameter,
+                "const": field.const,
+            }
+            for field in row.named_fields.values()
+        ],
+    }

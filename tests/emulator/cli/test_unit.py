@@ -1,0 +1,124 @@
+"""`starhil unit`: a definition that is written, checked and described, and one that does not start."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+from starhil.emulator.cli.unit import group
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import Profile, load_profile
+from starhil.hil_tests.emulator_process import EmulatorProcess
+from starhil.hil_tests.errors import BenchError
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.unit_folders import shipped_units
+
+
+def unit(*words: str):
+    """Run a command of the group."""
+    return CliRunner().invoke(group, words)
+
+
+def test_a_new_definition_is_good_and_shows_its_exchanges(tmp_path):
+    folder = tmp_path / "mine"
+    assert unit("new", str(folder)).exit_code == 0
+    assert 'name = "mine"' in (folder / "unit.toml").read_text(encoding="utf-8")
+    checked = unit("check", str(folder))
+    assert checked.exit_code == 0
+    assert "telecommand set_mode, id 2, 1 B, on serial\n  > C0 10 01 02 00 CE 35 C0\n" in checked.stdout
+    assert checked.stdout.endswith(f"unit {folder}: good\n")
+
+
+def test_a_definition_is_not_overwritten(tmp_path):
+    unit("new", str(tmp_path))
+    assert isinstance(unit("new", str(tmp_path)).exception, EmulatorError)
+
+
+def test_all_mistakes_are_printed_and_the_status_is_1(tmp_path):
+    unit("new", str(tmp_path))
+    file = tmp_path / "unit.toml"
+    text = (
+        file.read_text(encoding="utf-8").replace("attitude.w", "atitude.w").replace("set_clock", "set_clok")
+    )
+    file.write_text(text, encoding="utf-8")
+    checked = unit("check", str(tmp_path), "--json")
+    assert checked.exit_code == 1
+    clock, attitude = json.loads(checked.stdout)["mistakes"]
+    assert (
+        clock
+        == f"{file}: telecommand set_time: no action named 'set_clok'; did you mean set_clock, set_mode?"
+    )
+    assert attitude.startswith(
+        f"{file}: telemetry attitude: field q_w: no quantity named 'atitude.w'; did you mean"
+    )
+
+
+def test_a_profile_with_a_wrong_unit_starts_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: pytest.fail("the pipeline was started"))
+    unit("new", str(tmp_path / "mine"))
+    profile = tmp_path / "profile.toml"
+    profile.write_text('extends = "cubestar"\nunit = "mine"\n', encoding="utf-8")
+    file = tmp_path / "mine" / "unit.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace("attitude.w", "w"), encoding="utf-8")
+    with pytest.raises(ProtocolError, match="no quantity named 'w'"):
+        Emulation(load_profile(str(profile)))
+    file.write_text(file.read_text(encoding="utf-8").replace(', value = "w"', ""), encoding="utf-8")
+    with pytest.raises(EmulatorError, match="field q_w: no `value`"):
+        Emulation(load_profile(str(profile)))
+
+
+def test_units_that_ship_are_listed_and_described():
+    listed = json.loads(unit("list", "--json").stdout)
+    assert [item["unit"] for item in listed] == shipped_units()
+    assert "cubestar (default)" in unit("list").stdout
+    text = unit("describe", "cubestar").stdout
+    assert re.search(
+        r"160 telemetry precise_attitude: 56 B, ours\n +0 time_of_exposure: f64 s <- frame\.time\n", text
+    )
+    rows = json.loads(unit("describe", "cubestar", "--json").stdout)["rows"]
+    assert next(row for row in rows if row["name"] == "set_mode")["action"] == "set_mode"
+
+
+def test_an_unknown_unit_is_answered_with_similar_names():
+    assert "did you mean cubestar" in str(unit("describe", "cubstar").exception)
+
+
+def test_a_profile_names_its_unit_by_name_or_by_a_folder_beside_it(tmp_path):
+    profile = tmp_path / "profile.toml"
+    for unit_, source in (("sagitta", "sagitta"), ("mine", str(tmp_path / "mine")), ("/a/b", "/a/b")):
+        profile.write_text(f'extends = "cubestar"\nunit = "{unit_}"\n', encoding="utf-8")
+        assert load_profile(str(profile)).unit_source == source
+
+
+def test_a_bench_that_speaks_another_unit_than_the_profile_says_so():
+    process = EmulatorProcess(["none"])
+    process.ready = {"unit": "/my%20units/one"}
+    process.check_unit("/my units/one")
+    with pytest.raises(BenchError, match="the profile's unit is /my units/one: give --unit"):
+        process.check_unit(None)
+    process.ready = {"unit": "cubestar"}
+    process.check_unit(None)
+
+
+@pytest.mark.parametrize(
+    ("unit_", "links", "message"),
+    [
+        ("sagitta", {"serial": {"port": "off"}}, "can.channel: unit sagitta has none of the links"),
+        ("nos3", {"canopen": {"node": 5}}, "canopen.node: unit nos3 has no CANopen"),
+        ("oresat", {"can": {"channel": "off"}}, "serial.port: unit .* has none of the links"),
+    ],
+)
+def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch, unit_, links, message):
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: pytest.fail("the pipeline was started"))
+    with pytest.raises(EmulatorError, match=message):
+        Emulation(Profile.model_validate({"unit": unit_, "links": links}))
+
+
+def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, caplog):
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: None)
+    Emulation(Profile.model_validate({"unit": "sagitta", "links": {"can": {"channel": "vcan0"}}}))
+    assert "links.can.channel: unit sagitta has no such link" in caplog.text

@@ -1,0 +1,111 @@
+"""Every unit that ships: its decoders stand mutated input (STARHIL_FUZZ_INPUTS sets the number), another unit's bytes included."""
+
+from __future__ import annotations
+
+import os
+import random
+
+import pytest
+
+from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack
+from starhil.protocol.unit_folders import shipped_units
+from starhil.protocol.values import MessageError
+
+INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "1500"))
+SEED = 20261122
+UNITS = [name for name in shipped_units() if load_unit(name).link.serial is not None]
+FOREIGN = [
+    (unit, other)
+    for unit in UNITS
+    for other in UNITS
+    if unit != other and not (unit.startswith("cubestar") and other.startswith("cubestar"))
+]
+"""Pairs of units that do not speak the same framing with the same check."""
+MARKS = b"\xc0\xdb\xdc\xdd\x1f\x7f\xff\xde\xad\xbe\xef\x00\x21"
+
+
+def exchanges(icd: InterfaceDefinition, stack: SerialStack) -> tuple[list[bytes], list[bytes]]:
+    """Return good requests and good replies of each row as bytes."""
+    requests, replies = [], []
+    for row in icd.rows:
+        request = icd.request(row, row.encode(row.example()) if row.kind == "telecommand" else b"")
+        requests.append(stack.encode_request(request))
+        kind = ReplyKind.ACK if row.kind == "telecommand" else ReplyKind.TELEMETRY
+        data = b"" if kind is ReplyKind.ACK else row.encode()
+        if len(data) < 200:
+            replies.append(stack.encode_reply(Reply(kind, row.id, data, klass=row.klass)))
+    return requests, replies
+
+
+def mutated(seeds: list[bytes], source: random.Random) -> bytes:
+    data = bytearray(b"".join(source.choices(seeds, k=source.randrange(1, 3))))
+    for _ in range(source.randrange(5)):
+        place = source.randrange(len(data) + 1)
+        match source.randrange(5):
+            case 0 if place < len(data):
+                data[place] = source.randrange(256)
+            case 1:
+                data.insert(place, source.choice(MARKS))
+            case 2:
+                del data[place : place + source.randrange(1, 9)]
+            case 3:
+                data[place:place] = source.randbytes(source.randrange(12))
+            case _:
+                del data[place:]
+    return bytes(data)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_decoders_stand_mutated_input_and_read_the_next_request(unit):
+    icd = load_unit(unit)
+    stack = build_serial_stack(icd)
+    requests, replies = exchanges(icd, stack)
+    rows = list(icd.rows)
+    source = random.Random(SEED)
+    device, host = stack.device(), stack.host()
+    now = 0.0
+    decoded = 0
+    for _ in range(INPUTS):
+        now += source.choice((0.0, 0.01, 0.6))
+        for event in device.feed(mutated(requests, source), now):
+            decoded += decode(icd, event)
+        row = source.choice(rows)
+        host.expect(icd.request(row), row.size if row.kind == "telemetry" else 0)
+        for event in host.feed(mutated(replies, source), now):
+            decoded += decode(icd, event)
+    assert decoded > INPUTS // 10
+    device.flush(now + 1.0)
+    assert not device.busy
+    (request,) = device.feed(requests[-1], now + 2.0)
+    assert isinstance(request, Request)
+    assert request.id == rows[-1].id
+
+
+def decode(icd: InterfaceDefinition, event: Request | Reply | LinkFault) -> bool:
+    """Decode the data of a message as its row says; return whether that is possible."""
+    if isinstance(event, LinkFault):
+        return False
+    row = icd.rows_by_key.get((event.klass, event.id or 0))
+    if row is None:
+        return False
+    try:
+        row.decode(event.data)
+    except MessageError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(("unit", "other"), FOREIGN)
+def test_bytes_of_another_unit_are_flagged_and_survived(unit, other):
+    stack, foreign = build_serial_stack(load_unit(unit)), build_serial_stack(load_unit(other))
+    receiver = stack.device()
+    found: list[FaultKind] = []
+    for number, sent in enumerate(exchanges(load_unit(other), foreign)[0]):
+        events = [*receiver.feed(sent, number), *receiver.flush(number + 0.9)]
+        assert all(isinstance(event, LinkFault) for event in events), (sent.hex(), events)
+        found += [event.kind for event in events if isinstance(event, LinkFault)]
+    assert found
+    own = exchanges(load_unit(unit), stack)[0][0]
+    assert isinstance(receiver.feed(own, 1e6)[-1], Request)

@@ -1,0 +1,230 @@
+"""Definitions of other units: byte order, groups, maps, classes, bindings, and the mistakes in them."""
+
+from pathlib import Path
+
+import pytest
+
+from starhil.protocol.device_model import device_model
+from starhil.protocol.icd import check_unit, load_unit
+from starhil.protocol.plugin import quantity
+from starhil.protocol.unit_examples import exchanges
+from starhil.protocol.unit_folders import SKELETON, shipped_units
+from starhil.protocol.units_of_measure import factor
+from starhil.protocol.values import FieldError, IcdError
+
+HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\n'
+BIG = HEAD + '[conventions]\nbyte_order = "big"\n'
+
+
+def telemetry(fields: str, name: str = "row", number: int = 1, more: str = "") -> str:
+    """Text of a telemetry row."""
+    return f'[[telemetry]]\nid = {number}\nname = "{name}"\ndoc = "d"\nprovenance = "ours"\n{more}\nfields = [{fields}]\n'
+
+
+def telecommand(fields: str, action: str = "nothing", number: int = 9, more: str = "") -> str:
+    """Text of a telecommand row."""
+    return (
+        f'[[telecommand]]\nid = {number}\nname = "command"\ndoc = "d"\nprovenance = "ours"\naction = "{action}"\n'
+        f"{more}\nfields = [{fields}]\n"
+    )
+
+
+@pytest.fixture
+def unit(tmp_path: Path):
+    """Load a definition from its text."""
+
+    def load(text: str):
+        file = tmp_path / "unit.toml"
+        file.write_text(text, encoding="utf-8")
+        return load_unit(tmp_path)
+
+    return load
+
+
+CODED = [
+    ("big-endian integer", BIG, '{ name = "a", type = "u32" }', {"a": 0x01020304}, "01 02 03 04"),
+    ("big-endian float", BIG, '{ name = "a", type = "f32" }', {"a": 1.0}, "3F 80 00 00"),
+    ("big-endian double", BIG, '{ name = "a", type = "f64" }', {"a": 1.0}, "3F F0 00 00 00 00 00 00"),
+    ("one field in the other order", BIG, '{ name = "a", type = "u16" }, { name = "b", type = "u16", order = "little" }', {"a": 1, "b": 1}, "00 01 01 00"),
+    ("bits, big-endian", BIG, '{ type = "bits16", bits = [{ name = "a", width = 4 }, { width = 11 }, { name = "b" }] }', {"a": 5, "b": True}, "80 05"),
+    ("negative scale", HEAD, '{ name = "a", type = "i16", scale = -0.01 }', {"a": 1.5}, "6A FF"),
+    ("negative scale at its limit", HEAD, '{ name = "a", type = "i8", scale = -1, min = -100, max = 50 }', {"a": 50}, "CE"),
+    ("interleaved group", HEAD, '{ repeat = { count = 2, fields = [{ name = "x", type = "u8" }, { name = "y", type = "u16" }] } }',
+     {"x_1": 1, "y_1": 2, "x_2": 3, "y_2": 4}, "01 02 00 03 04 00"),
+    ("constant", HEAD, '{ name = "a", type = "u16", const = 0xBEEF }', {"a": 0xBEEF}, "EF BE"),
+    ("map", HEAD, '{ name = "a", type = "u8", map = { "7" = "on", "0x10" = "off" } }', {"a": "off"}, "10"),
+    ("filler", HEAD, '{ name = "a", type = "u8" }, { type = "u32" }, { name = "b", type = "u8" }', {"a": 1, "b": 2}, "01 00 00 00 00 02"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("head", "fields", "values", "wire"), [case[1:] for case in CODED], ids=[case[0] for case in CODED]
+)
+def test_fields_have_the_bytes_that_their_definition_says(unit, head, fields, values, wire):
+    row = unit(head + telemetry(fields)).telemetry["row"]
+    assert row.encode(values) == bytes.fromhex(wire)
+    assert row.decode(bytes.fromhex(wire)) == pytest.approx(values)
+
+
+def test_a_negative_scale_saturates_at_the_right_end(unit):
+    row = unit(HEAD + telemetry('{ name = "a", type = "i8", scale = -0.5 }')).telemetry["row"]
+    assert row.encode({"a": 1000.0}, saturate=True) == b"\x80"
+    assert row.encode({"a": -1000.0}, saturate=True) == b"\x7f"
+    assert row.named_fields["a"].clips(64.5)
+    assert not row.named_fields["a"].clips(64.2)
+
+
+def test_a_telecommand_with_another_constant_is_rejected(unit):
+    row = unit(HEAD + telecommand('{ name = "magic", type = "u16", const = 0xBEEF }')).telecommands["command"]
+    assert row.encode() == b"\xef\xbe"
+    with pytest.raises(FieldError, match=r"command\.magic"):
+        row.decode(b"\xee\xbe")
+
+
+CLASSES = """
+[[class]]
+name = "get"
+kind = "telemetry"
+code = 1
+[[class]]
+name = "watch"
+kind = "telemetry"
+code = 2
+"""
+
+
+def test_rows_of_two_classes_may_have_one_id(unit):
+    a, b = '{ name = "a", type = "u8" }', '{ name = "b", type = "u16" }'
+    icd = unit(
+        HEAD + CLASSES + telemetry(a, "one", 5, 'class = "get"') + telemetry(b, "two", 5, 'class = "watch"')
+    )
+    assert icd.rows_by_key["get", 5].name == "one"
+    assert icd.telemetry_row(5).name == "one"
+    assert icd.telemetry_row(5, "watch").name == "two"
+    assert icd.request(icd.telemetry["two"]).klass == "watch"
+
+
+def test_a_parameter_is_that_of_the_device_unless_the_unit_says_otherwise(unit):
+    icd = unit(HEAD + '[[parameter]]\nid = 7\nname = "exposure"\nmax = 1000\ndefault = 200\n')
+    exposure = icd.parameters["exposure"]
+    assert (exposure.id, exposure.unit, exposure.minimum, exposure.maximum, exposure.default) == (
+        7,
+        "ms",
+        1,
+        1000,
+        200,
+    )
+    assert list(icd.parameters) == ["exposure"]
+    assert icd.device_parameters["exposure"] is exposure
+    assert set(icd.device_parameters) == set(device_model().parameters)
+
+
+MISTAKES = [
+    ("unknown quantity", telemetry('{ name = "a", type = "f32", value = "atitude.w" }'), "row: field a: no quantity named 'atitude.w'; did you mean attitude.w"),
+    ("number beyond the last", telemetry('{ name = "a", type = "f32", unit = "px", value = "stars[99].x" }'), r"no quantity named 'stars\[99\].x'"),
+    ("no number", telemetry('{ name = "a", type = "f32", unit = "px", value = "stars[n].x" }'), r"\[n\] has no number"),
+    ("unit of measure", telemetry('{ name = "a", type = "f32", unit = "m", value = "rate.x" }'), "unit 'm', but quantity rate.x is in 'rad/s'; use one of 'rad/s', 'deg/s'"),
+    ("names without numbers", telemetry('{ name = "a", type = "u8", value = "mode" }'), "quantity mode has names: boot, standby.*give them numbers"),
+    ("name without a number", telemetry('{ name = "a", type = "u8", value = "mode", map = { "0" = "standby" } }'), "quantity mode may be boot, lost_in_space, tracking, error, which has no number"),
+    ("float in bytes", telemetry('{ name = "a", type = "bytes", size = 4, value = "attitude.w" }'), "of type float, which a bytes field does not hold"),
+    ("two sources", telemetry('{ name = "a", type = "f32", value = "attitude.w", const = 1 }'), "has value and const; keep one"),
+    ("value without a name", telemetry('{ type = "f32", value = "attitude.w" }'), "needs a name"),
+    ("value in a telecommand", telecommand('{ name = "a", type = "f32", value = "attitude.w" }'), "`value` is for telemetry"),
+    ("argument in telemetry", telemetry('{ name = "a", type = "u8", argument = "mode" }'), "`argument` is for telecommands"),
+    ("unknown action", telecommand("", "reboot"), "command: no action named 'reboot'"),
+    ("unknown argument", telecommand('{ name = "a", type = "u32", unit = "s", argument = "second" }', "set_clock"), "action set_clock has no argument 'second'; did you mean seconds"),
+    ("missing argument", telecommand("", "set_mode"), "action set_mode needs the argument mode"),
+    ("member of an argument", telecommand('{ name = "a", type = "u8", argument = "mode", map = { "1" = "trackin" } }', "set_mode"), "'trackin' is no value of argument mode; did you mean tracking"),
+    ("unknown answer", telecommand("", more='answer = ["ack"]'), "answer 'ack': must be echo, reply or row:NAME"),
+    ("answer with no such row", telecommand("", more='answer = ["row:stat"]') + telemetry('{ name = "a", type = "u8" }', "status"), "no telemetry of this name; did you mean status"),
+    ("unknown key", telemetry('{ name = "a", type = "u8", scal = 2 }'), r"row\.fields\.a\.scal: unknown key; did you mean scale"),
+    ("unknown key of a convention", '[conventions]\nquaternions = "attitude"\n', r"conventions\.quaternions: unknown key; did you mean quaternion"),
+    ("left-handed axes", '[conventions]\naxes = ["+x", "-y", "+z"]\n', "is not a right-handed frame"),
+    ("unknown epoch", '[conventions]\nepoch = "y2k"\n', "'y2k' is none of unix, gps, j2000, midnight"),
+    ("unknown error", "[errors]\nbad_id = 1\n", "errors.bad_id: no such error; did you mean invalid_id"),
+    ("unknown class", CLASSES + telemetry("", more='class = "gets"'), "no class named 'gets'; did you mean get"),
+    ("class left out", CLASSES + telemetry(""), "needs `class`, one of get, watch"),
+    ("class of the other kind", CLASSES + telecommand("", more='class = "get"'), "class get is of telemetry, not of telecommand"),
+    ("code twice", CLASSES.replace("code = 2", "code = 1"), "class watch: code 1 is already used by get"),
+    ("id twice", telemetry("", "one") + telemetry("", "two"), "two: id 1 is already used by one"),
+    ("id that the link cannot carry", telemetry("", number=256), "id 256 is above 255"),
+    ("unknown parameter", '[[parameter]]\nid = 1\nname = "exposur"\n', "the device has no parameter of this name; did you mean exposure"),
+    ("map that is no number", telemetry('{ name = "a", type = "u8", map = { one = "on" } }'), "'one' is not a number on the wire"),
+    ("no plugin", 'plugin = "unit.py"\n', "no such plugin"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [case[1:] for case in MISTAKES], ids=[case[0] for case in MISTAKES]
+)
+def test_a_mistake_is_named_with_file_row_field_and_remedy(tmp_path, text, message):
+    file = tmp_path / "unit.toml"
+    file.write_text(HEAD + text, encoding="utf-8")
+    with pytest.raises(IcdError, match=message) as caught:
+        load_unit(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+def test_all_mistakes_are_listed(tmp_path):
+    wrong = '{ name = "a", type = "f32", value = "atitude.w" }'
+    (tmp_path / "a.toml").write_text(
+        HEAD + telemetry(wrong, "one") + telecommand("", "reboot"), encoding="utf-8"
+    )
+    (tmp_path / "b.toml").write_text(telemetry(wrong, "two", 2), encoding="utf-8")
+    found = check_unit(tmp_path)
+    assert len(found) == 3
+    assert [text for text in found if "b.toml: telemetry two: field a" in text]
+    with pytest.raises(IcdError, match="2 more mistakes: starhil unit check"):
+        load_unit(tmp_path)
+
+
+def test_rows_that_are_bound_to_nothing_cannot_be_emulated(unit, tmp_path):
+    icd = unit(
+        HEAD + telemetry('{ name = "a", type = "u8" }') + telecommand("").replace('action = "nothing"\n', "")
+    )
+    assert icd.telemetry["row"].size == 1  # but exported and spoken by a client
+    command, row = check_unit(tmp_path)
+    assert "telecommand command: no `action`" in command
+    assert "telemetry row: field a: no `value`" in row
+
+
+def test_units_of_measure_are_converted_within_a_kind():
+    assert factor("s", "us") == 1e6
+    assert factor("rad/s", "deg/s") == pytest.approx(57.29577951308232)
+    assert factor("arcsec", "rad") == pytest.approx(4.84813681109536e-6)
+    assert factor("px", "px") == 1.0
+    assert factor("s", "deg") is None
+
+
+def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):
+    (tmp_path / "unit.toml").write_text(HEAD + 'plugin = "unit.py"\n', encoding="utf-8")
+    (tmp_path / "unit.py").write_text("1 / 0\n", encoding="utf-8")
+    with pytest.raises(IcdError, match=r"unit\.py: the plugin fails: ZeroDivisionError"):
+        load_unit(tmp_path)
+
+
+def test_a_quantity_outside_of_a_plugin_is_rejected():
+    with pytest.raises(IcdError, match="only while its unit is being loaded"):
+        quantity("a")(len)
+
+
+def test_the_skeleton_can_be_emulated(tmp_path):
+    (tmp_path / "unit.toml").write_text(SKELETON.read_text(encoding="utf-8"), encoding="utf-8")
+    assert check_unit(tmp_path) == []
+    examples = list(exchanges(load_unit(tmp_path)))
+    assert {item.row.name for item in examples} == {
+        "set_time",
+        "set_mode",
+        "set_exposure",
+        "attitude",
+        "status",
+        "stars",
+    }
+    assert examples[0].request[0].startswith("C0 10 01 01")
+
+
+@pytest.mark.parametrize("name", shipped_units())
+def test_every_shipped_unit_can_be_emulated(name):
+    assert check_unit(name) == []
+    assert all(item.request for item in exchanges(load_unit(name)))
