@@ -22,7 +22,7 @@ from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.can_framing import CanFrame, encode_request_frames
+from starhil.protocol.can_framing import CanFrame, CanId, encode_request_frames
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import Reply
 from starhil.protocol.serial_stack import build_serial_stack
@@ -34,6 +34,9 @@ PAUSE_S: Final = 0.004
 """Mean pause between two requests, seconds."""
 
 REPLY_WITHIN_S: Final = 1.0
+HOST: Final = 1
+DEVICE: Final = 4
+"""CAN addresses of the OBC and of the device."""
 SETTLE_S: Final = 3.0
 """Time for viewers to start and connect, seconds."""
 BAUD: Final = 921_600
@@ -129,22 +132,33 @@ class HubRequester:
         row = self._icd.telemetry[name]
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
-        for frame in encode_request_frames(self._icd.request(row), 1, 4):
+        for frame in encode_request_frames(self._icd.request(row), HOST, DEVICE):
             self._socket.sendall(_socketcand(frame))
         try:
-            for _ in range(frames):
-                self._receive_until(b" >")
+            while frames:
+                frames -= self._is_reply(self._receive_until(b" >"), row.id)
         except TimeoutError:
             return None
         return time.perf_counter() - begin
 
-    def _receive_until(self, end: bytes) -> None:
+    @staticmethod
+    def _is_reply(text: bytes, row_id: int) -> bool:
+        """Return whether a line of the hub is a frame of the device's reply to this OBC."""
+        words = text.split()
+        if words[:2] != [b"<", b"frame"]:
+            return False
+        can_id = CanId.unpack(int(words[2], 16))
+        return (can_id.id, can_id.source, can_id.destination) == (row_id, DEVICE, HOST)
+
+    def _receive_until(self, end: bytes) -> bytes:
+        """Return what comes before an end, and drop both."""
         while end not in self._buffer:
             data = self._socket.recv(4096)
             if not data:
                 raise BenchError("CAN hub: closed the connection; is the emulator still running?")
             self._buffer += data
-        self._buffer = self._buffer.partition(end)[2]
+        text, _, self._buffer = self._buffer.partition(end)
+        return text
 
     def close(self) -> None:
         """Leave the bus."""
