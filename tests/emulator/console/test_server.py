@@ -56,8 +56,10 @@ class Page:
         if message.type is aiohttp.WSMsgType.TEXT:
             self.messages.append(json.loads(message.data))
         elif message.data[:1] == b"F":
-            length = int.from_bytes(message.data[1:5], "little")
-            self.frames.append((json.loads(message.data[5 : 5 + length]), message.data[5 + length :]))
+            sizes = [int.from_bytes(message.data[start : start + 4], "little") for start in (1, 5)]
+            middle, end = 9 + sizes[0], 9 + sum(sizes)
+            head = json.loads(message.data[9:middle]) | json.loads(message.data[middle:end])
+            self.frames.append((head, message.data[end:]))
         else:
             self.history = np.frombuffer(message.data[8:]).reshape(-1, len(COLUMNS))
 
