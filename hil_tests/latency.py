@@ -16,13 +16,13 @@ import sys
 import time
 import tty
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.can_framing import CanFrame, encode_request_frames
+from starhil.protocol.can_framing import CanFrame, CanId, encode_request_frames
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import Reply
 from starhil.protocol.serial_stack import build_serial_stack
@@ -34,6 +34,9 @@ PAUSE_S: Final = 0.004
 """Mean pause between two requests, seconds."""
 
 REPLY_WITHIN_S: Final = 1.0
+HOST: Final = 1
+DEVICE: Final = 4
+"""CAN addresses of the OBC and of the device."""
 SETTLE_S: Final = 3.0
 """Time for viewers to start and connect, seconds."""
 BAUD: Final = 921_600
@@ -129,22 +132,33 @@ class HubRequester:
         row = self._icd.telemetry[name]
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
-        for frame in encode_request_frames(self._icd.request(row), 1, 4):
+        for frame in encode_request_frames(self._icd.request(row), HOST, DEVICE):
             self._socket.sendall(_socketcand(frame))
         try:
-            for _ in range(frames):
-                self._receive_until(b" >")
+            while frames:
+                frames -= self._is_reply(self._receive_until(b" >"), row.id)
         except TimeoutError:
             return None
         return time.perf_counter() - begin
 
-    def _receive_until(self, end: bytes) -> None:
+    @staticmethod
+    def _is_reply(text: bytes, row_id: int) -> bool:
+        """Return whether a line of the hub is a frame of the device's reply to this OBC."""
+        words = text.split()
+        if words[:2] != [b"<", b"frame"]:
+            return False
+        can_id = CanId.unpack(int(words[2], 16))
+        return (can_id.id, can_id.source, can_id.destination) == (row_id, DEVICE, HOST)
+
+    def _receive_until(self, end: bytes) -> bytes:
+        """Return what comes before an end, and drop both."""
         while end not in self._buffer:
             data = self._socket.recv(4096)
             if not data:
                 raise BenchError("CAN hub: closed the connection; is the emulator still running?")
             self._buffer += data
-        self._buffer = self._buffer.partition(end)[2]
+        text, _, self._buffer = self._buffer.partition(end)
+        return text
 
     def close(self) -> None:
         """Leave the bus."""
@@ -252,8 +266,8 @@ def measure(
             )
             ready_s = ready_s or time.perf_counter() - begin
             probes = _probes(icd, emulator.ready, stack)
-            address = emulator.ready.get("view", "")
-            rows += _measure_rate(probes, names, worker, rate, seconds, rng, address, viewers)
+            watched = _Watched(emulator.ready.get("view", ""), viewers)
+            rows += _measure_rate(probes, names, worker, rate, seconds, rng, watched)
             memory_mb = max(memory_mb, emulator.memory_bytes() / 2**20)
     return rows, ProcessRow(worker, ready_s, memory_mb)
 
@@ -275,6 +289,14 @@ def _probes(
     return {link: probe.ask for link, probe in opened.items()}
 
 
+@dataclass(frozen=True)
+class _Watched:
+    """The console's address, and how many viewers it gets."""
+
+    address: str
+    viewers: int
+
+
 def _measure_rate(
     probes: Mapping[str, Callable[[str], float | None]],
     names: Sequence[str],
@@ -282,21 +304,18 @@ def _measure_rate(
     rate: float,
     seconds: float,
     rng: random.Random,
-    address: str,
-    viewers: int,
+    watched: _Watched,
 ) -> list[LatencyRow]:
     """Measure the links at one update rate, without viewers and with them in turns."""
-    counts = (0, viewers) if viewers else (0,)
+    counts = (0, watched.viewers) if watched.viewers else (0,)
     taken: dict[int, dict[str, list[float]]] = {count: {link: [] for link in probes} for count in counts}
     lost = {count: dict.fromkeys(probes, 0) for count in counts}
-    turns = PAIRS if viewers else 1
+    turns = PAIRS if watched.viewers else 1
     for _ in range(turns):
         for count in counts:
-            watching = Viewers(address, count)
-            if count:
-                time.sleep(SETTLE_S)
-            _measure_links(probes, names, seconds / turns, rng, taken[count], lost[count])
-            watching.close()
+            with closing(Viewers(watched.address, count)):
+                time.sleep(SETTLE_S if count else 0.0)
+                _measure_links(probes, names, seconds / turns, rng, taken[count], lost[count])
     return [
         _row(link, worker, rate, count, sorted(values), lost[count][link])
         for count in counts

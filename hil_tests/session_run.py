@@ -104,8 +104,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     try:
         with ExitStack() as stack:
             bench = _open_bench(request, script, options, icd, folder, stack)
-            if request.view is not None:
-                show = _shown_on_console(request.view, script, bench, stack, show)
+            show = _shown_on_console(request.view, script, bench, stack, show)
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
     except EmulatorProcessError as error:
         if result is None:
@@ -150,9 +149,11 @@ def _open_bench(
 
 
 def _shown_on_console(
-    view: str, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
+    view: str | None, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
 ) -> Callable[[StepResult], None]:
-    """Return what shows a result on the console too."""
+    """Return what shows a result on the console too, if there is one."""
+    if view is None:
+        return show
     address = console_address(view, bench.emulator)
     unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
     planned = len(script.steps) * (len(bench.links) if script.link == "both" else 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import itertools
 import math
 import sys
 from typing import Annotated, Any, Final, NoReturn
@@ -68,7 +69,7 @@ class FiniteCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, with the values of `OPTIONAL_VALUES` added where they are left out."""
         whole = []
-        for argument, after in zip(args, [*args[1:], "--"], strict=True):
+        for argument, after in itertools.pairwise([*args, "--"]):
             whole.append(argument)
             if argument in OPTIONAL_VALUES and after.startswith("-"):
                 whole.append(OPTIONAL_VALUES[argument])

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.describe import describe, load_bright_stars
-from starhil.emulator.console.history import History, frame_content
+from starhil.emulator.console.history import History, frame_message
 from starhil.emulator.console.obc import HOST_ADDRESS, ConsoleObc, Exchange, ObcClient
 from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.slew import slew_request
@@ -175,10 +175,7 @@ class Console:
         receivers = [viewer for viewer in self.viewers if viewer.frames]
         if not receivers:
             return
-        head = json.dumps(frame_content(measurement, row)).encode()
-        preview = measurement.result.preview
-        jpeg = b"" if preview is None else preview.jpeg
-        data = b"".join((b"F", len(head).to_bytes(4, "little"), head, jpeg))
+        data = frame_message(measurement, row)
         for viewer in receivers:
             viewer.send_frame(data)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -112,27 +113,21 @@ def json_row(row: list[float]) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in map(float, row)]
 
 
-def frame_content(measurement: Measurement, row: list[float]) -> dict[str, Any]:
-    """Return what a page draws over the image of a frame, as JSON data."""
+def frame_message(measurement: Measurement, row: list[float]) -> bytes:
+    """Return a frame as a page receives it: `F`, the sizes of two JSON objects, these, and the JPEG.
+
+    The first object has the frame's numbers, the second what is drawn over the image.
+    """
     preview = measurement.result.preview
-    content: dict[str, Any] = {
-        "row": json_row(row),
-        "reason": measurement.reason,
-        "mode": measurement.mode.value,
-        "late": measurement.late,
-        "rejected": measurement.result.refused,
-        "truth_status": measurement.truth.status.value,
-        "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),
-    }
-    if preview is not None:
-        content |= {
-            "width": preview.width,
-            "height": preview.height,
-            "detections": preview.detections,
-            "hips": preview.hips,
-            "catalogue": preview.catalogue,
-            "false_stars": preview.false_stars,
-            "bodies": [vars(body) for body in preview.bodies],
-            "covered": preview.covered,
+    numbers = json.dumps(
+        {
+            "row": json_row(row),
+            "reason": measurement.reason,
+            "late": measurement.late,
+            "rejected": measurement.result.refused,
+            "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),
         }
-    return content
+    ).encode()
+    overlay, jpeg = (b"{}", b"") if preview is None else (preview.overlay, preview.jpeg)
+    sizes = len(numbers).to_bytes(4, "little") + len(overlay).to_bytes(4, "little")
+    return b"".join((b"F", sizes, numbers, overlay, jpeg))

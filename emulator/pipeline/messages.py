@@ -128,27 +128,6 @@ class FrameRequest:
 
 
 @dataclass(frozen=True)
-class SkyBody:
-    """A body of the sky as a viewer sees it.
-
-    Attributes
-    ----------
-    name
-        `sun`, `moon`, `earth`, or the name of a planet.
-    ra_deg, dec_deg, radius_deg
-        Direction of its centre, ICRS, and its angular radius; 0 for a point.
-    outline_px
-        Outline of its disc as pairs of pixels; None where the lens maps no direction. One pair for a point.
-    """
-
-    name: str
-    ra_deg: float
-    dec_deg: float
-    radius_deg: float
-    outline_px: tuple[tuple[float, float] | None, ...]
-
-
-@dataclass(frozen=True)
 class Preview:
     """An image for display, and what is in it.
 
@@ -156,31 +135,12 @@ class Preview:
     ----------
     jpeg
         The image, 8 bits, faint stars raised.
-    width, height
-        Size of the image, pixels.
-    detections
-        Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first.
-    hips
-        Hipparcos number of each detection; 0 if it was not identified.
-    catalogue
-        Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first.
-    false_stars
-        Positions of the false stars in the image.
-    bodies
-        Sun, Moon, Earth and planets.
-    covered
-        Polygons, pixels, of the areas that something near the lens covers.
+    overlay
+        What is drawn over it: a JSON object, made in the worker so that it costs the links no time.
     """
 
     jpeg: bytes
-    width: int
-    height: int
-    detections: tuple[tuple[float, float, float, float], ...] = ()
-    hips: tuple[int, ...] = ()
-    catalogue: tuple[tuple[int, float, float, float], ...] = ()
-    false_stars: tuple[tuple[float, float], ...] = ()
-    bodies: tuple[SkyBody, ...] = ()
-    covered: tuple[tuple[tuple[float, float], ...], ...] = ()
+    overlay: bytes = b"{}"
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.messages import Preview, SkyBody
+from starhil.emulator.pipeline.messages import Preview
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame
 from starhil.emulator.sky.directions import icrs_vector
@@ -29,6 +31,59 @@ KNEE_SIGMA: Final = 4.0
 OUTLINE_POINTS: Final = 96
 
 
+@dataclass(frozen=True)
+class Body:
+    """A body of the sky as a viewer sees it.
+
+    Attributes
+    ----------
+    name
+        `sun`, `moon`, `earth`, or the name of a planet.
+    ra_deg, dec_deg, radius_deg
+        Direction of its centre, ICRS, and its angular radius; 0 for a point.
+    outline_px
+        Outline of its disc as pairs of pixels; None where the lens maps no direction. One pair for a point.
+    """
+
+    name: str
+    ra_deg: float
+    dec_deg: float
+    radius_deg: float
+    outline_px: list[tuple[float, float] | None]
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """What is drawn over an image.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, pixels.
+    detections
+        Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first.
+    hips
+        Hipparcos number of each detection; 0 if it was not identified.
+    catalogue
+        Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first.
+    false_stars
+        Positions of the false stars in the image.
+    bodies
+        Sun, Moon, Earth and planets.
+    covered
+        Polygons, pixels, of the areas that something near the lens covers.
+    """
+
+    width: int
+    height: int
+    detections: list[tuple[float, float, float, float]]
+    hips: list[int]
+    catalogue: list[tuple[int, float, float, float]]
+    false_stars: list[tuple[float, float]]
+    bodies: list[Body]
+    covered: list[list[tuple[float, float]]]
+
+
 def make_preview(
     frame: Frame,
     camera: Camera,
@@ -44,32 +99,42 @@ def make_preview(
     EmulatorError
         The image cannot be compressed.
     """
-    height, width = frame.image.shape
     background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
     noise = max(1.0, 0.0 if found is None else found.noise)
+    overlay = make_overlay(frame, camera, sensor, sky, found, solution)
+    content = json.dumps(overlay, default=vars, separators=(",", ":")).encode()
+    return Preview(compress(frame.image, background, noise, sensor.bits), content)
+
+
+def make_overlay(
+    frame: Frame,
+    camera: Camera,
+    sensor: SensorModel,
+    sky: SkyObjects,
+    found: Detections | None = None,
+    solution: Solution | None = None,
+) -> Overlay:
+    """Return what is drawn over a frame."""
+    height, width = frame.image.shape
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
     bright &= np.all((stars.xy_px > -0.5) & (stars.xy_px < (width - 0.5, height - 0.5)), axis=1)
-    detections, hips = ((), ()) if found is None else _detections(found, solution, sensor)
-    return Preview(
-        jpeg=compress(frame.image, background, noise, sensor.bits),
+    catalogue = zip(
+        stars.hip[bright].tolist(),
+        *stars.xy_px[bright].round(1).T.tolist(),
+        stars.magnitude[bright].round(2).tolist(),
+        strict=True,
+    )
+    detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
+    return Overlay(
         width=width,
         height=height,
         detections=detections,
         hips=hips,
-        catalogue=tuple(
-            zip(
-                stars.hip[bright].tolist(),
-                *stars.xy_px[bright].round(1).T.tolist(),
-                stars.magnitude[bright].round(2).tolist(),
-                strict=True,
-            )
-        ),
-        false_stars=()
-        if objects is None
-        else tuple((x, y) for x, y in objects.false_xy_px.round(1).tolist()),
-        bodies=tuple(_bodies(sky, camera, frame.attitude)),
-        covered=tuple(_covered(obstruction, width, height) for obstruction in sky.obstructions),
+        catalogue=list(catalogue),
+        false_stars=[] if objects is None else [(x, y) for x, y in objects.false_xy_px.round(1).tolist()],
+        bodies=_bodies(sky, camera, frame.attitude),
+        covered=[_covered(obstruction, width, height) for obstruction in sky.obstructions],
     )
 
 
@@ -97,7 +162,7 @@ def compress(
 
 def _detections(
     found: Detections, solution: Solution | None, sensor: SensorModel
-) -> tuple[tuple[tuple[float, float, float, float], ...], tuple[int, ...]]:
+) -> tuple[list[tuple[float, float, float, float]], list[int]]:
     """Return the detections, and the Hipparcos number of each."""
     zero = sensor.zero_magnitude_e_s * sensor.exposure_s
     magnitude = -2.5 * np.log10(np.maximum(found.flux, 1.0) / zero)
@@ -108,10 +173,10 @@ def _detections(
     rows = zip(
         *found.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
     )
-    return tuple(rows), tuple(hips.tolist())
+    return list(rows), hips.tolist()
 
 
-def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[SkyBody]:
+def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:
     """Return the bodies of a sky, in the image or not."""
     found = []
     if sky.sun is not None:
@@ -130,7 +195,7 @@ def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[SkyBody
 
 def _body(
     name: str, ra_deg: float, dec_deg: float, radius_deg: float, camera: Camera, attitude: Attitude
-) -> SkyBody:
+) -> Body:
     """Return a body with the outline of its disc in the image."""
     centre = icrs_vector(ra_deg, dec_deg)
     across = np.cross(centre, (0.0, 0.0, 1.0) if abs(centre[2]) < 0.9 else (1.0, 0.0, 0.0))
@@ -142,18 +207,18 @@ def _body(
     xy, _ = camera.project(seen)
     limit = 20.0 * max(camera.width, camera.height)
     mapped = np.all(np.abs(np.nan_to_num(xy, nan=np.inf)) < limit, axis=1)
-    outline = tuple(
+    outline = [
         (x, y) if there else None for (x, y), there in zip(xy.round(1).tolist(), mapped.tolist(), strict=True)
-    )
-    return SkyBody(name, ra_deg, dec_deg, radius_deg, outline)
+    ]
+    return Body(name, ra_deg, dec_deg, radius_deg, outline)
 
 
-def _covered(obstruction: Obstruction, width: int, height: int) -> tuple[tuple[float, float], ...]:
+def _covered(obstruction: Obstruction, width: int, height: int) -> list[tuple[float, float]]:
     """Return the polygon, pixels, that an obstruction covers."""
     if obstruction.polygon_px:
-        return obstruction.polygon_px
+        return list(obstruction.polygon_px)
     if obstruction.share <= 0.0:
-        return ()
+        return []
     right, down = width - 0.5, height - 0.5
     corners = ((-0.5, -0.5), (right, -0.5), (right, down), (-0.5, down))
     angle = math.radians(obstruction.angle_deg)
@@ -172,4 +237,4 @@ def _covered(obstruction: Obstruction, width: int, height: int) -> tuple[tuple[f
         if (above >= 0.0) != (other >= 0.0):
             share = above / (above - other)
             polygon.append((ax + share * (bx - ax), ay + share * (by - ay)))
-    return tuple((round(px, 1), round(py, 1)) for px, py in polygon)
+    return [(round(px, 1), round(py, 1)) for px, py in polygon]

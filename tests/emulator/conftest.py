@@ -42,7 +42,7 @@ STARS = (
     MatchedStar(21421, 793.0, 65.7, 0.87, 500.0),
 )
 
-PREVIEW = Preview(b"jpeg of a frame", 937, 937, ((86.0, 824.6, -1.4, 900.0),), (32349,))
+PREVIEW = Preview(b"jpeg of a frame", b'{"width": 937, "height": 937, "hips": [32349]}')
 
 
 @dataclass

@@ -121,3 +121,19 @@ def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         app.main()
     assert caught.value.code == 0
     assert re.fullmatch(r"starhil \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("words", "view"),
+    [
+        ([], "off"),
+        (["--view"], "auto"),
+        (["--view", "--seed", "3"], "auto"),
+        (["--view", "127.0.0.1:8080", "demo"], "127.0.0.1:8080"),
+    ],
+)
+def test_the_address_of_the_console_may_be_left_out(words: list[str], view: str) -> None:
+    command = typer.main.get_command(app.build_app())
+    context = command.make_context("starhil", ["run", *words])
+    run = command.get_command(context, "run")
+    assert run.make_context("run", words, parent=context).params["view"] == view

@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+import socket
 from contextlib import AsyncExitStack
+from dataclasses import replace
 
 import aiohttp
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console.history import COLUMNS, MODES
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.run_feed import RunFeed
@@ -53,8 +56,10 @@ class Page:
         if message.type is aiohttp.WSMsgType.TEXT:
             self.messages.append(json.loads(message.data))
         elif message.data[:1] == b"F":
-            length = int.from_bytes(message.data[1:5], "little")
-            self.frames.append((json.loads(message.data[5 : 5 + length]), message.data[5 + length :]))
+            sizes = [int.from_bytes(message.data[start : start + 4], "little") for start in (1, 5)]
+            middle, end = 9 + sizes[0], 9 + sum(sizes)
+            head = json.loads(message.data[9:middle]) | json.loads(message.data[middle:end])
+            self.frames.append((head, message.data[end:]))
         else:
             self.history = np.frombuffer(message.data[8:]).reshape(-1, len(COLUMNS))
 
@@ -455,3 +460,54 @@ def test_the_candump_log_has_the_frames_of_the_bus(run):
         options=OPTIONS,
         links={"serial": {"port": "off"}, "can": {"channel": "virtual:console-test"}},
     )
+
+
+@pytest.mark.parametrize(
+    ("unit", "link", "outcome"),
+    [
+        ("sagitta", "serial", "ok"),
+        ("st16", "serial", "ok"),
+        ("cubestar-gen2", "can", "ok"),
+        ("oresat", "can", "no_link"),
+    ],
+)
+def test_a_unit_of_any_kind_is_reached_over_the_link_that_it_has(run, unit, link, outcome):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            hello = page.messages[0]
+            assert hello["unit"]["name"] == emulation.icd.name
+            answer = await page.ask(do="read", row=hello["telemetry"][0]["name"])
+            assert answer["outcome"] == outcome
+            assert bool(answer["values"]) == (outcome == "ok")
+
+    wanted = {"serial": {"port": "auto"}, "can": {"channel": "virtual:console-unit"}}
+    off = {"serial": {"port": "off"}, "can": {"channel": "off"}}
+    run(scenario, options=OPTIONS, unit=unit, links={**off, link: wanted[link]})
+
+
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        ("nowhere", "must be auto or HOST:PORT"),
+        ("127.0.0.1:99999", "must be auto or HOST:PORT"),
+        ("no.such.host:1", "cannot listen"),
+    ],
+)
+def test_an_address_that_is_none_ends_the_start_in_one_line(run, where, said):
+    async def nothing(_emulation, _line):
+        return
+
+    with pytest.raises(EmulatorError, match=said):
+        run(nothing, options=replace(OPTIONS, view=where))
+
+
+def test_a_port_in_use_ends_the_start_in_one_line(run):
+    async def nothing(_emulation, _line):
+        return
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(EmulatorError, match="cannot listen"):
+            run(nothing, options=replace(OPTIONS, view=f"127.0.0.1:{other.getsockname()[1]}"))

@@ -1,5 +1,7 @@
 """Previews: the image for display, and what is in it."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -31,6 +33,10 @@ def preview(sky=None, **options):
     return make_preview(frame(**options), CAMERA, SensorModel(), SkyObjects.from_dict(sky or {}))
 
 
+def overlay(sky=None, **options):
+    return json.loads(preview(sky, **options).overlay)
+
+
 def test_the_image_keeps_its_size_and_its_star_is_the_brightest():
     image = cv2.imdecode(np.frombuffer(preview().jpeg, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image.shape == (100, 200)
@@ -48,9 +54,9 @@ def test_brightness_rises_with_the_counts_from_black_to_white():
 
 
 def test_catalogue_stars_are_those_in_the_image_that_a_viewer_may_miss():
-    found = preview(magnitudes=(2.0, 7.0, 3.0), xy=((50.0, 40.0), (60.0, 20.0), (-5.0, 20.0)))
-    assert found.catalogue == ((1, 50.0, 40.0, 2.0),)
-    assert found.false_stars == ((3.0, 4.0),)
+    found = overlay(magnitudes=(2.0, 7.0, 3.0), xy=((50.0, 40.0), (60.0, 20.0), (-5.0, 20.0)))
+    assert found["catalogue"] == [[1, 50.0, 40.0, 2.0]]
+    assert found["false_stars"] == [[3.0, 4.0]]
 
 
 @pytest.mark.parametrize(
@@ -62,22 +68,22 @@ def test_catalogue_stars_are_those_in_the_image_that_a_viewer_may_miss():
     ],
 )
 def test_a_cover_is_a_polygon(obstruction, corners):
-    (polygon,) = preview({"obstructions": [obstruction]}).covered
+    (polygon,) = overlay({"obstructions": [obstruction]})["covered"]
     assert len(polygon) == len(corners)
     assert all(min(abs(x - a) + abs(y - b) for a, b in corners) <= 3.0 for x, y in polygon)
 
 
 def test_bodies_have_their_outline_where_the_lens_shows_it():
-    moon, earth, planet = preview(
+    moon, earth, planet = overlay(
         {
             "moon": {"ra_deg": 80.0, "dec_deg": 10.0, "diameter_deg": 2.0},
             "earth": {"ra_deg": 260.0, "dec_deg": -10.0, "radius_deg": 60.0},
             "planets": [{"ra_deg": 80.0, "dec_deg": 12.0, "magnitude": -2.0, "name": "Jupiter"}],
         }
-    ).bodies
-    radius = [np.hypot(x - 99.5, y - 49.5) for x, y in moon.outline_px]
+    )["bodies"]
+    radius = [np.hypot(x - 99.5, y - 49.5) for x, y in moon["outline_px"]]
     assert np.mean(radius) == pytest.approx(np.tan(np.radians(1.0)) * CAMERA.focal_px[0], rel=0.01)
-    assert earth.outline_px == (None,) * len(earth.outline_px)
-    ((x, y),) = planet.outline_px
-    assert (planet.name, x) == ("Jupiter", pytest.approx(99.5, abs=0.1))
+    assert earth["outline_px"] == [None] * len(earth["outline_px"])
+    ((x, y),) = planet["outline_px"]
+    assert (planet["name"], x) == ("Jupiter", pytest.approx(99.5, abs=0.1))
     assert y < 49.5  # north is up

@@ -54,9 +54,11 @@ export class Link {
     }
     const bytes = new DataView(data);
     if (bytes.getUint8(0) === FRAME) {
-      const length = bytes.getUint32(1, true);
-      const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 5, length)));
-      this.handlers.frame(head, data.byteLength > 5 + length ? new Blob([new Uint8Array(data, 5 + length)], { type: "image/jpeg" }) : null);
+      const [numbers, overlay] = [bytes.getUint32(1, true), bytes.getUint32(5, true)];
+      const parse = (start, length) => JSON.parse(new TextDecoder().decode(new Uint8Array(data, start, length)));
+      const head = { ...parse(9, numbers), ...parse(9 + numbers, overlay) };
+      const image = new Uint8Array(data, 9 + numbers + overlay);
+      this.handlers.frame(head, image.length ? new Blob([image], { type: "image/jpeg" }) : null);
     } else {
       this.handlers.history(new Float64Array(data, 8));
     }
