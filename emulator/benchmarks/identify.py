@@ -56,22 +56,25 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "dense, mirrored sky": SceneSettings(8.0, 0.5, mirrored=True),
     "1000–1500 random points": SceneSettings(5.5, random_points=(1000, 1500)),
     "12°, V ≤ 6, exact": SceneSettings(6.0, 0.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, 1": SceneSettings(6.0, 1.0, magnitude_noise=0.0),
     "12°, V ≤ 6, 2": SceneSettings(6.0, 2.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, 2, 12 stars": SceneSettings(6.0, 2.0, magnitude_noise=0.0, least_stars=12),
     "12°, V ≤ 6, 3": SceneSettings(6.0, 3.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, 3, 12 stars": SceneSettings(6.0, 3.0, magnitude_noise=0.0, least_stars=12),
     "12°, V ≤ 6, 2, 0.3 mag": SceneSettings(6.0, 2.0, magnitude_noise=0.3),
     "8°, V ≤ 7.5, 1, 0.4 mag": SceneSettings(7.5, 1.0, magnitude_noise=0.4),
 }
 """Row of the table → scene: "σ px, false, missing" of stars to V 5.5 in 42° where nothing else is said."""
 
-PAPERS: Final = tuple(ROWS)[-5:]
-"""Scenes of the sensors that the papers of the published algorithms simulate."""
+PAPERS: Final = tuple(ROWS)[-8:]
+"""Scenes of the sensors that the papers of the published algorithms simulate; with 12 stars at least, for the sparse fields' share."""
 
 FIELDS: Final[dict[str, tuple[float, int | None]]] = {
     "8°, V ≤ 7.5, 0.5": (8.0, None),
     "20°, V ≤ 6.5, 0.5": (20.0, None),
     "62°, V ≤ 5, 0.5": (62.0, None),
-    **dict.fromkeys(PAPERS[:4], (12.0, 1024)),
-    PAPERS[4]: (8.0, 512),
+    **dict.fromkeys(PAPERS[:7], (12.0, 1024)),
+    PAPERS[7]: (8.0, 512),
 }
 """Width in degrees, and side in pixels where that differs too, of fields that are not that of the camera given."""
 

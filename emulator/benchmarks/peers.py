@@ -332,7 +332,7 @@ def _cedar_solve(camera: Camera, _: StarCatalog) -> Solver:
 def _solve_field(camera: Camera, _: StarCatalog) -> Solver:
     """Make astrometry.net's program a solver; its time is that of a process for each scene, wall time also counted as processor time."""
     if not astrometry_net.installed():
-        raise UnsuitedError("not installed: apt install astrometry.net astrometry-data-tycho2")
+        raise UnsuitedError("not installed: apt install astrometry.net astrometry-data-tycho2-10-19")
     folder = tempfile.TemporaryDirectory(prefix="starhil-solve-field-")
 
     def solve(scene: Scene) -> Reply:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+
+MOST_DRAWS: Final = 1000
+"""Attitudes drawn at most for one scene."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class SceneSettings:
         Share of the field behind such an edge to which the false stars keep.
     kept : int or None
         Only so many of the brightest stars are seen.
+    least_stars : int
+        Stars that the field has at least; another one is drawn until it has (at most `MOST_DRAWS`).
     mirrored : bool
         The image is mirrored: as dense and clustered as the sky, and nowhere like it.
     """
@@ -57,6 +63,7 @@ class SceneSettings:
     covered: float = 0.0
     cluttered: float = 1.0
     kept: int | None = None
+    least_stars: int = 0
     mirrored: bool = False
 
     @property
@@ -108,15 +115,15 @@ class SceneMaker:
 
     def scene(self, settings: SceneSettings, rng: np.random.Generator) -> Scene:
         """Make one scene; the generator is the only source of randomness."""
-        attitude = random_attitude(rng)
         visible = np.flatnonzero(self.stars.v <= settings.limiting_magnitude)
-        near = visible[
-            self.stars.vectors[visible] @ attitude.boresight > math.cos(self.camera.field_radius_rad)
-        ]
-        xy, inside = self.camera.project(attitude.to_sensor(self.stars.vectors[near]))
+        for _ in range(MOST_DRAWS):
+            attitude = random_attitude(rng)
+            rows, xy = self._field(visible, attitude)
+            if len(rows) >= settings.least_stars:
+                break
+        rows, xy = rows[: settings.kept], xy[: settings.kept]
         if settings.mirrored:
             xy[:, 0] = self.camera.width - 1.0 - xy[:, 0]
-        rows, xy = near[inside][: settings.kept], xy[inside][: settings.kept]
         magnitudes = self.stars.v[rows]
         if settings.random_points is not None:
             count = int(rng.integers(settings.random_points[0], settings.random_points[1] + 1))
@@ -136,6 +143,15 @@ class SceneMaker:
         xy = np.concatenate([xy, self._clutter(false.size, settings.cluttered, rng)])
         star = np.concatenate([rows, np.full(false.size, -1)])
         return self._shuffled(attitude, xy, np.concatenate([magnitudes, false]), star, settings, rng)
+
+    def _field(
+        self, visible: NDArray[np.int64], attitude: Attitude
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Those rows of the catalogue that are in the field, and their positions."""
+        boresight, radius = attitude.boresight, self.camera.field_radius_rad
+        near = visible[self.stars.vectors[visible] @ boresight > math.cos(radius)]
+        xy, inside = self.camera.project(attitude.to_sensor(self.stars.vectors[near]))
+        return near[inside], xy[inside]
 
     def _uniform(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         return rng.random((count, 2)) * [self.camera.width, self.camera.height] - 0.5

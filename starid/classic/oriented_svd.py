@@ -1,6 +1,6 @@
 """OSV, oriented singular values.
 
-D. Wen and others, "Star Identification Algorithm Based on Oriented Singular Value Feature and Reliability Evaluation Method",
+X. Wei, D. Wen and others, "Star Identification Algorithm Based on Oriented Singular Value Feature and Reliability Evaluation Method",
 Transactions of the Japan Society for Aeronautical and Space Sciences 62(5), 265–274, 2019 (97.0 % at a position noise
 of 2 px and a magnitude noise of 0.3).
 

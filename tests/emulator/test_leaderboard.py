@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.benchmarks import identify as bench
+from starhil.emulator.benchmarks import peers
 from starhil.emulator.benchmarks.leaderboard import markdown, ranked, right, write_leaderboard
 from starhil.emulator.benchmarks.peers import ALL, make_solver
 from starhil.emulator.benchmarks.scenes import SceneMaker, SceneSettings
@@ -19,6 +20,7 @@ from starhil.emulator.errors import EmulatorError
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.interface import CLASSICS
+from starid.solution import Reason, Solution
 
 PIXEL = 1.0
 
@@ -122,6 +124,63 @@ def test_every_row_of_the_leaderboard_has_its_field_and_limit() -> None:
     assert sorted(row for rows in fields.values() for row in rows) == sorted(bench.LEADERBOARD)
     assert set(bench.STANDARD) <= set(fields[Camera.from_fov(), bench.PEER_LIMIT_V])
     assert set(CLASSICS) < set(ALL)
+
+
+def test_the_papers_scenes_are_those_of_their_sensors() -> None:
+    cameras = {
+        row: camera
+        for (camera, _), rows in bench._by_field(bench.PAPERS, Camera.from_fov()).items()
+        for row in rows
+    }
+    assert {(round(camera.fov_deg, 6), camera.width) for camera in cameras.values()} == {
+        (12.0, 1024),
+        (8.0, 512),
+    }
+    assert cameras["8°, V ≤ 7.5, 1, 0.4 mag"].width == 512
+
+
+def test_a_field_is_drawn_until_it_has_its_least_number_of_stars() -> None:
+    maker = SceneMaker(Camera.from_fov(12.0), load_catalog().brighter_than(6.0))
+    for least in (0, 12, 25):
+        rng = np.random.default_rng(1)
+        counts = [len(maker.scene(SceneSettings(6.0, least_stars=least), rng).flux) for _ in range(30)]
+        assert least <= min(counts) < least + 12
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_raw_answers_are_not_verified_and_know_the_noise(monkeypatch: pytest.MonkeyPatch, raw: bool) -> None:
+    asked: list[object] = []
+
+    class Classic:
+        database_bytes, build_seconds = 1, 0.1
+
+        def identify(self, *arguments):
+            asked.append(None if arguments[2] is None else float(arguments[2][0]))
+            return Solution.invalid(Reason.NO_MATCH)
+
+    def made(*_, **options):
+        asked.append(options["verify"])
+        return Classic()
+
+    monkeypatch.setattr(peers, "make_identifier", made)
+    bench.run(1, 5, own=["pyramid"], rows=["2"], raw=raw)
+    assert asked[0] is not raw
+    assert asked[-1] == (2.0 if raw else None)
+
+
+@pytest.mark.parametrize(
+    "row", ["dense, mirrored sky", "1000–1500 random points", "tracking, 1 star, 2 false"]
+)
+def test_where_there_is_no_sky_every_answer_is_wrong(oracle, row: str) -> None:
+    (entry,) = bench.run(3, 5, own=[oracle], rows=[row])["rows"]
+    assert (entry["wrong"], entry["sky"], right(entry)) == (3, False, 0.0)
+
+
+def test_a_mirrored_sky_is_dense_and_nobody_answers_it() -> None:
+    (entry,) = bench.run(3, 5, rows=["dense, mirrored sky"])["rows"]
+    assert (entry["valid_pct"], entry["wrong"], right(entry)) == (0.0, 0, 100.0)
+    maker = SceneMaker(Camera.from_fov(), load_catalog().brighter_than(8.0))
+    assert len(maker.scene(bench.ROWS["dense, mirrored sky"], np.random.default_rng(1)).flux) >= 1000
 
 
 def test_scenes_keep_only_the_brightest_and_dense_ones_hold_a_thousand() -> None:
