@@ -48,8 +48,8 @@ def test_list_tells_every_row_and_parameter() -> None:
             "starhil: /proc/does/not/exist/icd.html: its folder cannot be created",
         ),
         (
-            ("icd", "export", "html", "--icd", "/does/not/exist"),
-            "starhil: /does/not/exist: cannot read the interface",
+            ("icd", "export", "html", "--unit", "/does/not/exist"),
+            "starhil: unit /does/not/exist: neither a folder nor a unit that ships",
         ),
         (("hub", "--host", "203.0.113.1", "--port", "1"), "starhil: CAN hub: cannot listen at 203.0.113.1:1"),
     ],
