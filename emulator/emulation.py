@@ -341,6 +341,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped",
+        dark_frames=profile.device.dark_frames,
     )
 
 

@@ -27,6 +27,8 @@ LATEST_UNIX_S: Final = 4_102_444_800.0
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
 
+Milliamperes = Annotated[float, Field(ge=0.0, le=10_000.0)]
+ParticleRate = Annotated[float, Field(ge=0.0, le=1e6)]
 FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
 PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
 DistortionTerm = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -99,6 +101,51 @@ class DeviceConfig(Strict):
     """Minimum time in boot mode."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames for the body rate, if the star identifier does not estimate it."""
+    dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
+    """Frames averaged on the ground into the dark frame that the unit subtracts from each image; 0: none."""
+
+
+class PowerConfig(Strict):
+    """What the unit draws in each phase of a frame: the first CubeStar's published currents."""
+
+    voltage_v: Annotated[float, Field(ge=0.1, le=100.0)] = 3.3
+    """Supply voltage."""
+    idle_ma: Milliamperes = 71.0
+    """Current while idle, and in modes without frames."""
+    imager_on_ma: Milliamperes = 121.0
+    """Current from switching on the imager to the exposure."""
+    exposure_ma: Milliamperes = 177.0
+    """Current during exposure, read-out and processing."""
+    transfer_ma: Milliamperes = 82.0
+    """Current while the result is transferred."""
+    imager_on_s: FrameSeconds = 0.068
+    """Time by which the imager is on before an exposure."""
+    transfer_s: FrameSeconds = 0.404
+    """Duration of the transfer."""
+
+
+class ThermalConfig(Strict):
+    """Temperature of the unit: its mounting's, and what its own power adds."""
+
+    mounting_c: Annotated[float, Field(ge=-100.0, le=150.0)] = 20.0
+    """Mean temperature of the mounting, degrees Celsius."""
+    swing_c: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    """Amplitude of its variation over an orbit, degrees."""
+    period_s: Annotated[float, Field(ge=1.0, le=1e6)] = 5700.0
+    """Period of that variation."""
+    heating_c_w: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    """Rise of detector and lens above the mounting for each watt of mean power, in the end."""
+    time_constant_s: Annotated[float, Field(ge=0.1, le=1e6)] = 600.0
+    """Time constant of that rise."""
+
+
+class RadiationConfig(Strict):
+    """Energetic particles that hit the detector, in addition to `sky.cosmic_rays_s`."""
+
+    quiet_s: ParticleRate = 0.0
+    """Particles per second outside the South Atlantic Anomaly."""
+    anomaly_s: ParticleRate = 0.0
+    """Particles per second in addition in its centre at an altitude of 500 km; needs a truth with a position."""
 
 
 class TimingConfig(Strict):
@@ -185,6 +232,12 @@ class Profile(Strict):
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
     """Modelled processing times."""
+    power: PowerConfig = PowerConfig()
+    """Currents by phase."""
+    thermal: ThermalConfig = ThermalConfig()
+    """Temperature."""
+    radiation: RadiationConfig = RadiationConfig()
+    """Particles along the orbit."""
     links: LinksConfig = LinksConfig()
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)

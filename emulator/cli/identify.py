@@ -51,6 +51,10 @@ def command(
             help="Convert a colour image to grey, or reject it; default: reject, but convert with --fov.",
         ),
     ] = None,
+    dark: Annotated[
+        Path | None,
+        typer.Option(help="Image of the same camera, exposure and temperature without light, to subtract."),
+    ] = None,
     annotate: Annotated[
         Path | None,
         typer.Option(
@@ -71,7 +75,12 @@ def command(
     if annotate is not None:
         image_suffix(annotate)
         prepare_output(annotate, "-o")
-    pixels = read_image(image, allow_colour=fov is not None if allow_colour is None else allow_colour)
+    colour = fov is not None if allow_colour is None else allow_colour
+    pixels = read_image(image, allow_colour=colour)
+    if dark is not None:
+        from starid.imaging.dark_frame import dark_excess, without_dark
+
+        pixels = without_dark(pixels, dark_excess(read_image(dark, allow_colour=colour)))
     catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)
     result = _solve(pixels, catalog, profile, fov, fov_tolerance, model)
     report = _report(image, result, _advice(result, fov, model))

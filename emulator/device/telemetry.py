@@ -241,6 +241,25 @@ def device_status(device: Device) -> Values:
     }
 
 
+def health(device: Device) -> Values:
+    """164: phase, power and temperature now, and flags of the last exposure."""
+    now_ns, timing, power = device.clock.now_ns(), device.cycle.timing, device.power
+    phase = power.phase(timing, now_ns)
+    last = device.fresh
+    in_field = () if last is None else last.result.in_field
+    return {
+        "phase": phase.value,
+        **{f"{body}_in_field": body in in_field for body in ("sun", "moon", "earth")},
+        "rate_too_high": last is not None and last.reason == "rate_too_high",
+        "voltage": device.profile.power.voltage_v,
+        "current": 1000.0 * power.current_a(phase),
+        "power": power.power_w(phase),
+        "mean_power": power.mean_power_w(timing),
+        "mounting_temperature": device.thermal.mounting_c(now_ns),
+        "detector_temperature": device.thermal.temperature_c(now_ns),
+    }
+
+
 def parameter(device: Device) -> Values:
     """162: the selected parameter with its limits."""
     selected = device.icd.parameters_by_id[device.selected_parameter]
@@ -324,6 +343,7 @@ TELEMETRY: Final[dict[str, Callable[[Device], Values]]] = {
     "precise_attitude": precise_attitude,
     "device_status": device_status,
     "parameter": parameter,
+    "health": health,
     "identified_stars": identified_stars,
     "star_magnitudes": star_magnitudes,
     "star_performance_1": star_performance_1,

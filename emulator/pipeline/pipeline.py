@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
 from starhil.emulator.pipeline.binning import mean_over_squares
+from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
 from starhil.emulator.pipeline.messages import (
     IDENTITY,
     ZERO,
@@ -29,6 +30,7 @@ from starhil.emulator.pipeline.messages import (
 )
 from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
+from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame, Renderer
 from starhil.emulator.sky.objects import SkyObjects
@@ -89,6 +91,7 @@ class Pipeline:
         )
         self._sky = SkyObjects.from_dict(setup.sky)
         self._last: Frame | None = None
+        self._dark: DarkMap | None = None
 
     def warm_up(self) -> None:
         """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
@@ -142,21 +145,47 @@ class Pipeline:
         if sensor.gain != self._renderer.sensor.gain:
             self._renderer = self._renderer.with_sensor(sensor)
         attitude = Attitude(np.array(request.attitude_xyzw))
-        sky = SkyObjects.from_dict({**self._setup.sky, **request.faults}) if request.faults else self._sky
+        sky = self._sky_of(request)
         frame = self._renderer.render(
-            attitude, request.rate_rad_s, request.index, exposure_s=request.exposure_s, objects=sky
+            attitude,
+            request.rate_rad_s,
+            request.index,
+            exposure_s=request.exposure_s,
+            temperature_c=request.temperature_c,
+            objects=sky,
         )
         self._last = frame
         rendered = time.perf_counter()
         if not request.solve:
             return FrameResult(request.index, solved=False, render_s=rendered - begin)
-        found = detect(frame.image, detection_settings(sensor, request.settings))
+        image = self._without_dark(frame.image, request)
+        found = detect(image, detection_settings(sensor, request.settings))
         detected = time.perf_counter()
-        identifier, current = self._identifiers.get(self._identifier_setup(request.settings))
+        identifier, current = self._identifiers.get(self._identifier_setup(request))
         solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
         result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        result = with_bodies(result, bodies_in_field(sky, attitude, self.camera))
         return result if current else replace(result, index_pending=True)
+
+    def _sky_of(self, request: FrameRequest) -> SkyObjects:
+        """Return the sky of a frame: that of the profile, with faults and the particles of its place."""
+        sky = SkyObjects.from_dict({**self._setup.sky, **request.faults}) if request.faults else self._sky
+        if request.particles_s > 0.0:
+            return replace(sky, cosmic_rays_s=sky.cosmic_rays_s + request.particles_s)
+        return sky
+
+    def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
+        """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""
+        if self._setup.dark_frames == 0:
+            return image
+        if self._dark is None:
+            camera, setup = self.camera, self._setup
+            self._dark = measure_dark_map(
+                self._sensor, camera.height, camera.width, setup.dark_frames, setup.seed
+            )
+        temperature = self._sensor.temperature_c if request.temperature_c is None else request.temperature_c
+        return self._dark.subtracted(image, request.exposure_s, request.gain, temperature)
 
     def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
         settings = request.settings
@@ -175,16 +204,18 @@ class Pipeline:
             return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
         return solution
 
-    def _identifier_setup(self, settings: SolverSettings) -> StarIdentifierSetup:
+    def _identifier_setup(self, request: FrameRequest) -> StarIdentifierSetup:
         """Return the setup of the star identifier for these parameters and the calibrated camera."""
-        setup = self._setup
+        setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
         camera = calibrated_camera(self.camera, settings)
         margin = settings.error_margin / 100.0
-        return StarIdentifierSetup(setup.algorithm, camera, margin, tuple(sorted(options.items())))
+        return StarIdentifierSetup(
+            setup.algorithm, camera, margin, tuple(sorted(options.items())), request.upsets
+        )
 
     def _frame_result(
         self,
