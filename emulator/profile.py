@@ -11,18 +11,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError, field_validator
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import read_toml
-from starhil.emulator.truth.config import FixedConfig, Strict, TruthConfig
+from starhil.emulator.truth.config import (
+    LATEST_UNIX_S,
+    FixedConfig,
+    OrbitConfig,
+    Strict,
+    TruthConfig,
+    unix_time,
+)
 from starhil.emulator.validation_messages import explain
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_EXTENDS_DEPTH: Final = 8
-
-LATEST_UNIX_S: Final = 4_102_444_800.0
-"""2100-01-01; the 32-bit seconds of telemetry wrap six years later."""
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
@@ -228,6 +232,8 @@ class Profile(Strict):
     """Options of the star identification algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
     """True attitude of the sensor."""
+    orbit: OrbitConfig | None = None
+    """True orbit of the spacecraft; none: the sensor is at the Earth's centre, and the Earth is not in its sky."""
     device: DeviceConfig = DeviceConfig()
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
@@ -246,6 +252,16 @@ class Profile(Strict):
     """Defaults of device parameters, named as in the interface definition."""
 
     _source: Path | None = PrivateAttr(default=None)
+
+    @field_validator("sky")
+    @classmethod
+    def _check_date(cls, sky: dict[str, Any]) -> dict[str, Any]:
+        return {**sky, "date": unix_time(sky["date"])} if "date" in sky else sky
+
+    @property
+    def start_unix_s(self) -> float:
+        """Date of the sky, the orbit and the bodies at the start of the run, as Unix time."""
+        return float(self.sky.get("date", self.run.start_unix_s))
 
     @property
     def source(self) -> str:

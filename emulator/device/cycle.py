@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.modes import Mode
@@ -24,6 +25,7 @@ from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.scheduler import Event, Scheduler
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.imager import Imager, PipelineReply
 from starhil.emulator.pipeline.messages import (
     ZERO,
@@ -36,6 +38,8 @@ from starhil.emulator.pipeline.messages import (
     Triple,
 )
 from starhil.emulator.profile import TimingConfig
+from starhil.emulator.sky.radiation import particle_rate
+from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
 
@@ -162,6 +166,10 @@ class FrameCycle:
         self._failure = ""
         """Error text of the last request if the pipeline failed, so that it is logged once."""
         self.truth: TruthSource = FixedTruth(Attitude.identity())
+        self.orbit: Orbit | None = None
+        """True orbit, for truth sources that bring none."""
+        self.start_unix_s = 0.0
+        """True date at simulation time zero, Unix time."""
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
         self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
         self.conditions: Callable[[TruthState], Conditions] = lambda _truth: Conditions()
@@ -268,7 +276,7 @@ class FrameCycle:
         self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
     ) -> None:
         """End an exposure and request its result from the pipeline."""
-        truth = self.truth.state(mid_ns / NANOSECONDS)
+        truth = self.true_state(mid_ns)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
         request = self.request(truth, exposure_s, predicted)
@@ -290,6 +298,17 @@ class FrameCycle:
             then, self.after_exposure = self.after_exposure, None
             then()
 
+    def true_state(self, at_ns: int) -> TruthState:
+        """Return the truth, with date and orbit, at a simulation time in nanoseconds."""
+        t_s = at_ns / NANOSECONDS
+        state, unix_s = self.truth.state(t_s), self.start_unix_s + t_s
+        try:
+            return state.completed(unix_s, self.orbit)
+        except EmulatorError as error:
+            log.warning("%s; the run goes on without an orbit", error)
+            self.orbit = None
+            return state.completed(unix_s, None)
+
     def request(
         self, truth: TruthState, exposure_s: float, predicted: Attitude | None, *, solve: bool = True
     ) -> FrameRequest:
@@ -299,12 +318,11 @@ class FrameCycle:
         parameters = self._parameters
         chosen: dict[str, Any] = {name: parameters[name] for name in _SETTINGS}
         settings = SolverSettings(**chosen)
-        x, y, z = truth.rate_rad_s.tolist()
         conditions = self.conditions(truth)
         return FrameRequest(
             index=index,
             attitude_xyzw=as_quaternion(truth.attitude),
-            rate_rad_s=(x, y, z),
+            rate_rad_s=as_triple(truth.rate_rad_s),
             exposure_s=exposure_s,
             gain=float(parameters["analog_gain"]),
             solve=solve,
@@ -314,6 +332,9 @@ class FrameCycle:
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,
             upsets=self.upsets,
+            unix_s=truth.unix_s,
+            position_m=None if truth.orbit is None else as_triple(truth.orbit.position_m),
+            velocity_m_s=None if truth.orbit is None else as_triple(truth.orbit.velocity_m_s),
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:
@@ -416,3 +437,9 @@ def as_quaternion(attitude: Attitude) -> Quaternion:
     """Return the quaternion of an attitude as Python floats, scalar last."""
     x, y, z, w = attitude.quaternion_xyzw.tolist()
     return (x, y, z, w)
+
+
+def as_triple(vector: NDArray[np.float64]) -> Triple:
+    """Return a vector (3,) as Python floats."""
+    x, y, z = vector.tolist()
+    return (x, y, z)

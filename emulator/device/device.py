@@ -21,6 +21,8 @@ from starhil.emulator.guard import call_guarded, log_internal_error, one_line
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import FrameRequest
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
+from starhil.emulator.sky.radiation import particle_rate
+from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import TruthSource, TruthState
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
@@ -122,6 +124,8 @@ class Device:
         self.cycle.conditions = self._conditions
         self.power = PowerModel(profile.power)
         self.thermal = ThermalModel(profile.thermal)
+        self.cycle.start_unix_s = profile.start_unix_s
+        self.cycle.orbit = orbit_of(profile)
         self.cycle.mode = lambda: self.modes.mode
         self.images = ImageStore(
             self.scheduler,
@@ -285,7 +289,7 @@ class Device:
         return last if age_ns <= limit_s * NANOSECONDS else None
 
     def _request_single_frame(self, mid_ns: int) -> FrameRequest:
-        truth = self.cycle.truth.state(mid_ns / NANOSECONDS)
+        truth = self.cycle.true_state(mid_ns)
         exposure_s = float(self.parameters["exposure"]) / 1000.0
         return self.cycle.request(truth, exposure_s, None, solve=False)
 
@@ -331,10 +335,28 @@ class Device:
     def _power_changed(self) -> None:
         self.thermal.set_power(self.clock.now_ns(), self.power.mean_power_w(self.cycle.timing))
 
-    def _conditions(self, truth: TruthState) -> Conditions:  # noqa: ARG002 (position: with an orbit)
+    def _conditions(self, truth: TruthState) -> Conditions:
         """Return what the surroundings do to the detector now."""
         radiation = self.profile.radiation
-        return Conditions(self.thermal.temperature_c(self.clock.now_ns()), radiation.quiet_s)
+        position_m = None if truth.orbit is None else truth.orbit.position_m
+        particles_s = particle_rate(radiation.quiet_s, radiation.anomaly_s, position_m, truth.unix_s)
+        return Conditions(self.thermal.temperature_c(self.clock.now_ns()), particles_s)
+
+
+def orbit_of(profile: Profile) -> Orbit | None:
+    """Return the true orbit of a profile, or None.
+
+    Raises
+    ------
+    EmulatorError
+        Its values are not those of an orbit.
+    """
+    if profile.orbit is None:
+        return None
+    try:
+        return profile.orbit.build(profile.start_unix_s)
+    except EmulatorError as error:
+        raise EmulatorError(f"profile {profile.source}: {error}") from None
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:

@@ -129,6 +129,13 @@ class FrameRequest:
         Particles per second that hit the detector, in addition to those of the sky.
     upsets
         Bits that radiation has flipped in the unit's star catalogue.
+    unix_s
+        True date of mid-exposure, Unix time; None leaves the sky undated.
+    position_m, velocity_m_s
+        True position and velocity of the sensor relative to the Earth's centre, GCRS; None: at the centre.
+    observer_velocity
+        Velocity of the sensor relative to the barycentre as the device believes it, ICRS, m/s, to correct
+        aberration; None: no correction.
     """
 
     index: int
@@ -143,6 +150,10 @@ class FrameRequest:
     temperature_c: float | None = None
     particles_s: float = 0.0
     upsets: tuple[CatalogUpset, ...] = ()
+    unix_s: float | None = None
+    position_m: Triple | None = None
+    velocity_m_s: Triple | None = None
+    observer_velocity: Triple | None = None
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,9 @@ def particle_rate(quiet_s: float, anomaly_s: float, position_m: npt.ArrayLike | 
         Particles per second in addition, in the centre of the anomaly at 500 km.
     position_m : array (3,), optional
         Position in GCRS, metres; without it only `quiet_s` counts.
-    unix_s : float
-        Time.
+    unix_s : float, optional
+        Time; without it only `quiet_s` counts.
     """
-    if position_m is None or anomaly_s == 0.0:
+    if position_m is None or unix_s is None or anomaly_s == 0.0:
         return quiet_s
     return quiet_s + anomaly_s * anomaly_share(*sub_satellite_point(position_m, unix_s))

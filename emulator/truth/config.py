@@ -1,16 +1,24 @@
-"""Configuration of truth sources in a profile, a scenario or on the control channel."""
+"""Configuration of truth sources and orbits in a profile, a scenario or on the control channel."""
 
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.orbit import (
+    LARGEST_ECCENTRICITY,
+    KeplerOrbit,
+    Orbit,
+    OrbitState,
+    TleOrbit,
+)
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
     FixedTruth,
@@ -32,6 +40,35 @@ Turn: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
 """Right ascension or roll, degrees."""
 
 SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
+
+
+LATEST_UNIX_S: Final = 4_102_444_800.0
+"""2100-01-01; the 32-bit seconds of telemetry wrap six years later."""
+
+
+def unix_time(value: object) -> float:
+    """Return the Unix time of a date: a TOML date-time, ISO 8601 text, or Unix time; UTC unless it has an offset.
+
+    Raises
+    ------
+    ValueError
+        It is not a date from 1970 to 2100.
+    """
+    number = value
+    if isinstance(value, str):
+        try:
+            number = datetime.fromisoformat(value)
+        except ValueError:
+            number = None
+    if isinstance(number, datetime):
+        number = (number if number.tzinfo else number.replace(tzinfo=UTC)).timestamp()
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= LATEST_UNIX_S:
+        raise ValueError("must be a date from 1970 to 2100, e.g. 2026-03-20T12:00:00Z")
+    return float(number)
+
+
+Date: TypeAlias = Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S), BeforeValidator(unix_time)]
+"""A date in UTC, held as Unix time."""
 
 
 class Strict(BaseModel):
@@ -220,3 +257,88 @@ class LiveConfig(Strict):
 TruthConfig: TypeAlias = Annotated[
     FixedConfig | RateConfig | SlewConfig | FileConfig | LiveConfig, Field(discriminator="kind")
 ]
+
+
+OrbitAngle: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
+Metres: TypeAlias = Annotated[float, Field(ge=-1e9, le=1e9)]
+MetresPerSecond: TypeAlias = Annotated[float, Field(ge=-2e4, le=2e4)]
+
+
+class _Propagated(Strict):
+    """Keys of orbits that start from elements or a state."""
+
+    epoch: Date | None = None
+    """Date of these values; default: the date at which the run starts."""
+    j2: bool = True
+    """Let node and perigee drift at the secular rates of the Earth's oblateness."""
+
+    def _epoch_s(self, start_unix_s: float) -> float:
+        return start_unix_s if self.epoch is None else self.epoch
+
+
+class KeplerConfig(_Propagated):
+    """Keplerian elements, relative to the GCRS equator and equinox."""
+
+    kind: Literal["kepler"]
+    """How the orbit is given."""
+    semi_major_axis_km: Annotated[float, Field(ge=6378.137, le=1e6)]
+    """Half the length of the ellipse; 6878 for an altitude of 500 km."""
+    eccentricity: Annotated[float, Field(ge=0.0, le=LARGEST_ECCENTRICITY)] = 0.0
+    """Shape of the ellipse."""
+    inclination_deg: Annotated[float, Field(ge=0.0, le=180.0)]
+    """Angle between orbit and equator."""
+    raan_deg: OrbitAngle = 0.0
+    """Right ascension of the ascending node."""
+    argument_of_perigee_deg: OrbitAngle = 0.0
+    """Angle from the ascending node to the perigee."""
+    mean_anomaly_deg: OrbitAngle = 0.0
+    """Mean anomaly at the epoch."""
+
+    def build(self, start_unix_s: float) -> Orbit:
+        """Make the orbit of a run that starts at a Unix time."""
+        return KeplerOrbit(
+            self._epoch_s(start_unix_s),
+            1e3 * self.semi_major_axis_km,
+            self.eccentricity,
+            math.radians(self.inclination_deg),
+            math.radians(self.raan_deg),
+            math.radians(self.argument_of_perigee_deg),
+            math.radians(self.mean_anomaly_deg),
+            self.j2,
+        )
+
+
+class StateConfig(_Propagated):
+    """Position and velocity at one time, relative to the Earth's centre, GCRS."""
+
+    kind: Literal["state"]
+    """How the orbit is given."""
+    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)]
+    """Position."""
+    velocity_m_s: Annotated[list[MetresPerSecond], Field(min_length=3, max_length=3)]
+    """Velocity."""
+
+    def build(self, start_unix_s: float) -> Orbit:
+        """Make the orbit of a run that starts at a Unix time."""
+        state = OrbitState(np.array(self.position_m), np.array(self.velocity_m_s))
+        return KeplerOrbit.from_state(self._epoch_s(start_unix_s), state, j2=self.j2)
+
+
+class TleConfig(Strict):
+    """A two-line element set, propagated by SGP4."""
+
+    kind: Literal["tle"]
+    """How the orbit is given."""
+    line1: str
+    """First line, 69 characters."""
+    line2: str
+    """Second line, 69 characters."""
+
+    def build(self, start_unix_s: float) -> Orbit:
+        """Make the orbit; it must be possible to propagate it to the start of the run."""
+        orbit = TleOrbit(self.line1, self.line2)
+        orbit.state(start_unix_s)
+        return orbit
+
+
+OrbitConfig: TypeAlias = Annotated[KeplerConfig | StateConfig | TleConfig, Field(discriminator="kind")]

@@ -5,7 +5,9 @@ The file is CSV with one header line. Columns, in any order:
 - ``t``: simulation time in seconds, increasing from row to row;
 - either ``qx, qy, qz, qw`` (quaternion ICRS→sensor, scalar last) or ``ra_deg, dec_deg, roll_deg``;
 - optional ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them the rate between
-  two rows is the constant rate that leads from one to the next.
+  two rows is the constant rate that leads from one to the next;
+- optional ``x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s``: position and velocity relative to the Earth's centre,
+  GCRS, interpolated by cubics.
 
 A truth log (`starhil run --truth-log`) is accepted too, so that a run can be replayed: its columns
 ``run_time_s``, ``true_qx`` … ``true_qw`` and ``true_wx_deg_s`` … are used, the others ignored.
@@ -24,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.orbit import OrbitState, interpolate_orbit
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
 from starid.attitude import Attitude, interpolate, rate_between
 from starid.files import MEGABYTE, read_number, read_text
@@ -31,6 +34,9 @@ from starid.files import MEGABYTE, read_number, read_text
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
 ANGLE_COLUMNS: Final = ("ra_deg", "dec_deg", "roll_deg")
 RATE_COLUMNS: Final = ("wx_deg_s", "wy_deg_s", "wz_deg_s")
+POSITION_COLUMNS: Final = ("x_m", "y_m", "z_m")
+VELOCITY_COLUMNS: Final = ("vx_m_s", "vy_m_s", "vz_m_s")
+ORBIT_COLUMNS: Final = (*POSITION_COLUMNS, *VELOCITY_COLUMNS)
 
 LOG_COLUMNS: Final = {
     "run_time_s": "t",
@@ -51,6 +57,8 @@ BOUNDS: Final = {
     "dec_deg": 90.0,
     "roll_deg": 1e6,
     **dict.fromkeys(RATE_COLUMNS, MAX_RATE_DEG_S),
+    **dict.fromkeys(POSITION_COLUMNS, 1e12),
+    **dict.fromkeys(VELOCITY_COLUMNS, 1e5),
 }
 """Largest absolute value in each column; right ascension and roll may exceed a full turn."""
 
@@ -70,6 +78,8 @@ class FileTruth:
         Simulation time of the file's time zero.
     repeat
         Restart after the last row.
+    orbit
+        Position and velocity of each row; None if the file has none.
     """
 
     kind: Final = "file"
@@ -82,6 +92,7 @@ class FileTruth:
         *,
         start_s: float = 0.0,
         repeat: bool = False,
+        orbit: list[OrbitState] | None = None,
     ) -> None:
         if not attitudes:
             raise EmulatorError("truth: a truth file needs at least one row")
@@ -90,6 +101,7 @@ class FileTruth:
         self.rates_rad_s = rates_rad_s
         self.start_s = start_s
         self.repeat = repeat
+        self.orbit = orbit
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
@@ -98,13 +110,15 @@ class FileTruth:
         if self.repeat and t > last > first:
             t = first + (t - first) % (last - first)
         if t < first:
-            return TruthState(self.attitudes[0], ZERO_RATE, TruthStatus.BEFORE_START)
+            return TruthState(self.attitudes[0], ZERO_RATE, TruthStatus.BEFORE_START, self._orbit_of_row(0))
         if t > last:
-            return TruthState(self.attitudes[-1], ZERO_RATE, TruthStatus.AFTER_END)
+            return TruthState(self.attitudes[-1], ZERO_RATE, TruthStatus.AFTER_END, self._orbit_of_row(-1))
         upper = int(np.searchsorted(self.times_s, t, side="right"))
         if upper == len(self.attitudes):
             if upper == 1:
-                return TruthState(self.attitudes[0], self._rate_of_row(0, ZERO_RATE))
+                return TruthState(
+                    self.attitudes[0], self._rate_of_row(0, ZERO_RATE), orbit=self._orbit_of_row(0)
+                )
             upper -= 1
         low = upper - 1
         span = float(self.times_s[upper] - self.times_s[low])
@@ -114,7 +128,13 @@ class FileTruth:
             rate = rate_between(before, after, span)
         else:
             rate = (1.0 - fraction) * self.rates_rad_s[low] + fraction * self.rates_rad_s[upper]
-        return TruthState(interpolate(before, after, fraction), rate)
+        orbit = None
+        if self.orbit is not None:
+            orbit = interpolate_orbit(self.orbit[low], self.orbit[upper], fraction, span)
+        return TruthState(interpolate(before, after, fraction), rate, orbit=orbit)
+
+    def _orbit_of_row(self, row: int) -> OrbitState | None:
+        return None if self.orbit is None else self.orbit[row]
 
     def _rate_of_row(self, row: int, default: Vector) -> Vector:
         return default if self.rates_rad_s is None else self.rates_rad_s[row]
@@ -147,10 +167,11 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     if "run_time_s" in columns and "true_qx" in columns:
         columns = [LOG_COLUMNS.get(name, "") for name in columns]
     needed = _attitude_columns(f"truth file {path} line {lines[0][0]}", columns)
-    has_rates = all(name in columns for name in RATE_COLUMNS)
+    has_rates, has_orbit = RATE_COLUMNS[0] in columns, POSITION_COLUMNS[0] in columns
     times: list[float] = []
     attitudes: list[Attitude] = []
     rates: list[list[float]] = []
+    orbit: list[OrbitState] = []
     for number, line in lines[1:]:
         where = f"truth file {path} line {number}"
         row = _parse_row(where, columns, line)
@@ -158,6 +179,11 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
             raise EmulatorError(f"{where}: t is not later than in the row before")
         times.append(row["t"])
         attitudes.append(_attitude(where, needed, row))
+        if has_orbit:
+            position, velocity = (
+                [row[name] for name in names] for names in (POSITION_COLUMNS, VELOCITY_COLUMNS)
+            )
+            orbit.append(OrbitState(np.array(position), np.array(velocity)))
         if has_rates:
             rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
         elif len(times) > 1:
@@ -170,7 +196,14 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
     if not times:
         raise EmulatorError(f"truth file {path}: no rows after the header; add at least one")
     rate_array = np.array(rates) if has_rates else None
-    return FileTruth(np.array(times), attitudes, rate_array, start_s=start_s, repeat=repeat)
+    return FileTruth(
+        np.array(times),
+        attitudes,
+        rate_array,
+        start_s=start_s,
+        repeat=repeat,
+        orbit=orbit if has_orbit else None,
+    )
 
 
 def _cells(where: str, line: str) -> list[str]:
@@ -181,7 +214,7 @@ def _cells(where: str, line: str) -> list[str]:
 
 
 def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
-    known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS}
+    known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS, *ORBIT_COLUMNS}
     unknown = [name for name in columns if name not in known | {""}]
     if unknown:
         number = columns.index(unknown[0]) + 1
@@ -189,11 +222,10 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     twice = [name for name in columns if name and columns.count(name) > 1]
     if twice:
         raise EmulatorError(f"{where}: column {twice[0]} appears twice; leave one out")
-    missing = [name for name in RATE_COLUMNS if name not in columns]
-    if 0 < len(missing) < len(RATE_COLUMNS):
-        raise EmulatorError(
-            f"{where}: column {missing[0]} is missing; give {', '.join(RATE_COLUMNS)} or none"
-        )
+    for group in (RATE_COLUMNS, ORBIT_COLUMNS):
+        missing = [name for name in group if name not in columns]
+        if 0 < len(missing) < len(group):
+            raise EmulatorError(f"{where}: column {missing[0]} is missing; give {', '.join(group)} or none")
     both = [[name for name in names if name in columns] for names in (QUATERNION_COLUMNS, ANGLE_COLUMNS)]
     if all(both):
         raise EmulatorError(

@@ -1,10 +1,12 @@
 """Truth sources: the true attitude and body rate of the sensor at any simulation time.
 
-A source has neither clock nor socket; `state(t)` depends only on the time and the data received.
+A source has neither clock nor socket; `state(t)` depends only on the time and the data received. Some
+sources bring date and orbit too; otherwise `TruthState.completed` adds those of the run.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.orbit import Orbit, OrbitState
 from starid.attitude import Attitude, propagate
 
 Vector: TypeAlias = NDArray[np.float64]
@@ -47,7 +50,7 @@ class TruthStatus(StrEnum):
 
 @dataclass(frozen=True)
 class TruthState:
-    """Attitude and rate at one time.
+    """Attitude and rate at one time, with the date and the place in orbit where they are known.
 
     Attributes
     ----------
@@ -57,11 +60,31 @@ class TruthState:
         Body rate (3,), rad/s, sensor frame.
     status
         Whether the state is known, extrapolated or stale.
+    orbit
+        Position and velocity relative to the Earth's centre, GCRS.
+    unix_s
+        Date as Unix time (UTC), seconds.
     """
 
     attitude: Attitude
     rate_rad_s: Vector
     status: TruthStatus = TruthStatus.OK
+    orbit: OrbitState | None = None
+    unix_s: float | None = None
+
+    def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
+        """Return the state with the date and orbit of the run where the source has brought none.
+
+        Raises
+        ------
+        EmulatorError
+            The orbit cannot be propagated to this date.
+        """
+        date = unix_s if self.unix_s is None else self.unix_s
+        place = self.orbit
+        if place is None and orbit is not None:
+            place = orbit.state(date)
+        return dataclasses.replace(self, orbit=place, unix_s=date)
 
 
 class TruthSource(Protocol):

@@ -99,3 +99,21 @@ def test_a_rate_above_the_limit_is_flagged(make_bench):
     bench.command("set_parameter", parameter=bench.icd.parameters["max_rate"].id, value=2.0)
     bench.step(2.0)
     assert not bench.read("health")["rate_too_high"]
+
+
+def test_particles_come_with_the_south_atlantic_anomaly(make_bench):
+    orbit = {"kind": "kepler", "semi_major_axis_km": 6871.0, "inclination_deg": 97.4}
+    profile = Profile.model_validate(
+        {
+            "orbit": orbit,
+            "radiation": {"quiet_s": 1.0, "anomaly_s": 200.0},
+            "parameters": {"update_rate": 0.02},
+        }
+    )
+    bench = make_bench(profile).start()
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(86_400.0)
+    rates = [request.particles_s for request in bench.pipeline.frames]
+    assert min(rates) == pytest.approx(1.0, abs=1e-3)
+    assert 50.0 < max(rates) <= 201.0
+    assert 0.01 < sum(rate > 20.0 for rate in rates) / len(rates) < 0.2

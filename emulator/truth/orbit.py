@@ -1,0 +1,258 @@
+"""Orbits: position and velocity of the spacecraft in GCRS, from elements, a state vector or a TLE.
+
+Elements refer to the GCRS equator and equinox. Two-body motion has the secular rates of J2 (Vallado 2013,
+sect. 9.4); a TLE is propagated by SGP4 and turned from TEME to GCRS by precession and nutation (IAU 2000B).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.errors import EmulatorError
+from starid.earth import DAY_S, UNIX_EPOCH_JD, terrestrial_time
+
+Vector: TypeAlias = NDArray[np.float64]
+
+EARTH_GM_M3_S2: Final = 3.986_004_418e14
+EARTH_RADIUS_M: Final = 6_378_137.0
+EARTH_J2: Final = 1.082_626_68e-3
+
+LARGEST_ECCENTRICITY: Final = 0.99
+TLE_LENGTH: Final = 69
+_KEPLER_STEPS: Final = 60
+
+
+@dataclass(frozen=True)
+class OrbitState:
+    """Position (3,), m, and velocity (3,), m/s, relative to the Earth's centre, GCRS."""
+
+    position_m: Vector
+    velocity_m_s: Vector
+
+
+class Orbit(Protocol):
+    """Position and velocity of the spacecraft at any time."""
+
+    def state(self, unix_s: float) -> OrbitState:
+        """Return position and velocity at a Unix time.
+
+        Raises
+        ------
+        EmulatorError
+            The orbit cannot be propagated to this time.
+        """
+
+
+@dataclass(frozen=True)
+class KeplerOrbit:
+    """An elliptic orbit about the Earth.
+
+    Attributes
+    ----------
+    epoch_unix_s
+        Unix time of the elements.
+    semi_major_axis_m, eccentricity
+        Size and shape.
+    inclination_rad, raan_rad, argument_of_perigee_rad, mean_anomaly_rad
+        Angles at the epoch, radians.
+    j2
+        Let node, perigee and mean anomaly drift at the secular rates of the Earth's oblateness.
+
+    Raises
+    ------
+    EmulatorError
+        The orbit is not an ellipse, or its perigee lies below the Earth's surface.
+    """
+
+    epoch_unix_s: float
+    semi_major_axis_m: float
+    eccentricity: float = 0.0
+    inclination_rad: float = 0.0
+    raan_rad: float = 0.0
+    argument_of_perigee_rad: float = 0.0
+    mean_anomaly_rad: float = 0.0
+    j2: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.eccentricity <= LARGEST_ECCENTRICITY:
+            raise EmulatorError(
+                f"orbit: eccentricity {self.eccentricity:g} given, 0…{LARGEST_ECCENTRICITY} needed"
+            )
+        perigee_m = self.semi_major_axis_m * (1.0 - self.eccentricity)
+        if not EARTH_RADIUS_M <= perigee_m < math.inf:
+            raise EmulatorError(
+                f"orbit: perigee {1e-3 * perigee_m:g} km from the Earth's centre, "
+                f"at least {1e-3 * EARTH_RADIUS_M:g} km needed"
+            )
+
+    @classmethod
+    def from_state(cls, epoch_unix_s: float, state: OrbitState, *, j2: bool = True) -> Self:
+        """Return the orbit through a position and velocity (osculating elements).
+
+        Raises
+        ------
+        EmulatorError
+            The state is not on an elliptic orbit above the Earth's surface.
+        """
+        r, v = state.position_m, state.velocity_m_s
+        distance, speed2 = float(np.linalg.norm(r)), float(v @ v)
+        momentum = np.cross(r, v)
+        area = float(np.linalg.norm(momentum))
+        if not (distance > 0.0 and area > 0.0 and 2.0 / distance > speed2 / EARTH_GM_M3_S2):
+            raise EmulatorError(
+                "orbit: position and velocity are not on an ellipse about the Earth; give metres and m/s, GCRS"
+            )
+        a = 1.0 / (2.0 / distance - speed2 / EARTH_GM_M3_S2)
+        h = momentum / area
+        raan = math.atan2(h[0], -h[1]) if math.hypot(h[0], h[1]) > 1e-12 else 0.0
+        node = np.array([math.cos(raan), math.sin(raan), 0.0])
+        towards = np.cross(v, momentum) / EARTH_GM_M3_S2 - r / distance
+        e = float(np.linalg.norm(towards))
+        perigee = _angle_about(h, node, towards) if e > 1e-9 else 0.0
+        true = _angle_about(h, node, r) - perigee
+        eccentric = 2.0 * math.atan2(
+            math.sqrt(1.0 - min(e, 1.0)) * math.sin(0.5 * true), math.sqrt(1.0 + e) * math.cos(0.5 * true)
+        )
+        return cls(
+            epoch_unix_s,
+            a,
+            e,
+            math.acos(max(-1.0, min(1.0, float(h[2])))),
+            raan,
+            perigee,
+            eccentric - e * math.sin(eccentric),
+            j2,
+        )
+
+    def state(self, unix_s: float) -> OrbitState:
+        """Return position and velocity at a Unix time."""
+        a, e = self.semi_major_axis_m, self.eccentricity
+        elapsed_s = unix_s - self.epoch_unix_s
+        motion = math.sqrt(EARTH_GM_M3_S2 / a**3)
+        root = math.sqrt(1.0 - e * e)
+        node_rate = perigee_rate = anomaly_rate = 0.0
+        if self.j2:
+            factor = 1.5 * EARTH_J2 * motion * (EARTH_RADIUS_M / (a * (1.0 - e * e))) ** 2
+            cosine2 = math.cos(self.inclination_rad) ** 2
+            node_rate = -factor * math.cos(self.inclination_rad)
+            perigee_rate = 0.5 * factor * (5.0 * cosine2 - 1.0)
+            anomaly_rate = 0.5 * factor * root * (3.0 * cosine2 - 1.0)
+        mean = self.mean_anomaly_rad + (motion + anomaly_rate) * elapsed_s
+        eccentric = _eccentric_anomaly(mean, e)
+        cosine, sine = math.cos(eccentric), math.sin(eccentric)
+        speed = motion * a / (1.0 - e * cosine)
+        in_plane = _orbit_axes(
+            self.raan_rad + node_rate * elapsed_s,
+            self.inclination_rad,
+            self.argument_of_perigee_rad + perigee_rate * elapsed_s,
+        )
+        return OrbitState(
+            np.array([a * (cosine - e), a * root * sine]) @ in_plane,
+            np.array([-speed * sine, speed * root * cosine]) @ in_plane,
+        )
+
+
+class TleOrbit:
+    """An orbit from a two-line element set, propagated by SGP4.
+
+    Parameters
+    ----------
+    line1, line2
+        The two lines.
+
+    Raises
+    ------
+    EmulatorError
+        The lines are not a valid element set.
+    """
+
+    def __init__(self, line1: str, line2: str) -> None:
+        from sgp4.api import Satrec
+        from sgp4.io import verify_checksum
+
+        for number, line in (("1", line1), ("2", line2)):
+            if len(line) != TLE_LENGTH or line[:2] != f"{number} ":
+                raise EmulatorError(
+                    f"orbit: line {number} of the TLE is not one; it begins with {number} and has {TLE_LENGTH} characters"
+                )
+        try:
+            verify_checksum(line1, line2)
+            self._satellite: Any = Satrec.twoline2rv(line1, line2)
+        except (ValueError, IndexError) as error:
+            why = str(error).partition("\n")[0].rstrip(": ")
+            raise EmulatorError(f"orbit: TLE: {why}; copy both lines again") from None
+        if self._satellite.error:
+            raise EmulatorError(f"orbit: TLE: {_sgp4_error(self._satellite.error)}; give a current one")
+
+    def state(self, unix_s: float) -> OrbitState:
+        """Return position and velocity at a Unix time.
+
+        Raises
+        ------
+        EmulatorError
+            SGP4 fails, for example because the satellite has decayed.
+        """
+        import erfa
+
+        days, seconds = divmod(unix_s, DAY_S)
+        error, position_km, velocity_km_s = self._satellite.sgp4(UNIX_EPOCH_JD + days, seconds / DAY_S)
+        if error:
+            raise EmulatorError(f"orbit: TLE: {_sgp4_error(error)}; give one of a date nearer to the run's")
+        tt = terrestrial_time(unix_s)
+        equinoxes = float(erfa.ee00b(*tt))
+        c, s = math.cos(equinoxes), math.sin(equinoxes)
+        to_gcrs = erfa.pnm00b(*tt).T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return OrbitState(to_gcrs @ (1e3 * np.array(position_km)), to_gcrs @ (1e3 * np.array(velocity_km_s)))
+
+
+def interpolate_orbit(before: OrbitState, after: OrbitState, fraction: float, span_s: float) -> OrbitState:
+    """Return the state a fraction of the way between two that are `span_s` seconds apart (cubic Hermite)."""
+    f, g = fraction, 1.0 - fraction
+    gap = after.position_m - before.position_m
+    start, end = before.velocity_m_s * span_s, after.velocity_m_s * span_s
+    position = before.position_m + f * f * (3.0 - 2.0 * f) * gap + f * g * (g * start - f * end)
+    if span_s <= 0.0:
+        return after
+    slope = 6.0 * f * g * gap + g * (1.0 - 3.0 * f) * start + f * (3.0 * f - 2.0) * end
+    return OrbitState(position, slope / span_s)
+
+
+def _eccentric_anomaly(mean: float, e: float) -> float:
+    """Solve Kepler's equation M = E − e sin E by Newton's method from E = M, or from π for large e."""
+    mean = math.remainder(mean, 2.0 * math.pi)
+    eccentric = mean if e < 0.8 else math.copysign(math.pi, mean)
+    for _ in range(_KEPLER_STEPS):
+        step = (eccentric - e * math.sin(eccentric) - mean) / (1.0 - e * math.cos(eccentric))
+        eccentric -= step
+        if abs(step) < 1e-14:
+            break
+    return eccentric
+
+
+def _orbit_axes(raan: float, inclination: float, perigee: float) -> Vector:
+    """Unit vectors (2, 3) in the plane of the orbit: to the perigee, and 90° ahead of it."""
+    co, so = math.cos(raan), math.sin(raan)
+    ci, si = math.cos(inclination), math.sin(inclination)
+    cw, sw = math.cos(perigee), math.sin(perigee)
+    return np.array(
+        [
+            [co * cw - so * sw * ci, so * cw + co * sw * ci, sw * si],
+            [-co * sw - so * cw * ci, -so * sw + co * cw * ci, cw * si],
+        ]
+    )
+
+
+def _angle_about(axis: Vector, origin: Vector, direction: Vector) -> float:
+    """Angle from one direction to another about an axis perpendicular to both, radians."""
+    return math.atan2(float(axis @ np.cross(origin, direction)), float(origin @ direction))
+
+
+def _sgp4_error(code: int) -> str:
+    from sgp4.api import SGP4_ERRORS
+
+    return str(SGP4_ERRORS.get(code, f"error {code}"))

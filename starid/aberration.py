@@ -1,0 +1,69 @@
+"""Stellar aberration: the directions of stars as a moving observer sees them.
+
+The observer's velocity v relative to the barycentre of the solar system turns every direction towards v, by
+up to 20.5″ for the Earth and 5.2″ more for a low orbit. With β = v/c and γ = 1/√(1 − β²), the direction p of
+a star is seen as
+
+    p' = [p/γ + (1 + (p·β)/(1 + 1/γ)) β] / (1 + p·β)
+
+(Urban & Seidelmann 2013, eq. 7.40; the inverse has −β). The deflection of light by the Sun, 4 mas at 90° from it, is
+left out.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starid.errors import StaridError
+
+SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
+
+FASTEST_M_S: Final = 1e6
+"""Largest observer velocity accepted, m/s: 13 times that of a low orbit about the Earth at perihelion."""
+
+REST: Final[NDArray[np.float64]] = np.zeros(3)
+"""β of an observer at rest."""
+REST.flags.writeable = False
+
+
+def checked_beta(velocity_m_s: ArrayLike | None) -> NDArray[np.float64]:
+    """β = v/c (3,) of an observer; zeros for None.
+
+    Raises
+    ------
+    StaridError
+        The velocity is not three finite numbers of at most `FASTEST_M_S`.
+    """
+    if velocity_m_s is None:
+        return REST
+    try:
+        velocity = np.asarray(velocity_m_s, dtype=np.float64)
+    except (TypeError, ValueError):
+        velocity = np.empty(0)
+    if velocity.shape != (3,) or not float(np.linalg.norm(velocity)) <= FASTEST_M_S:
+        raise StaridError(
+            f"observer_velocity: {velocity_m_s!r} given, three numbers in m/s (ICRS) of at most {FASTEST_M_S:g} needed"
+        )
+    return velocity / SPEED_OF_LIGHT_M_S
+
+
+def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> NDArray[np.float64]:
+    """Directions (…, 3) as an observer sees them who moves relative to the barycentre.
+
+    Parameters
+    ----------
+    directions : array (…, 3)
+        Unit vectors for an observer at rest, ICRS.
+    velocity_m_s : array (3,)
+        Velocity of the observer, ICRS, m/s; its negative inverts the transformation.
+    """
+    p, beta = np.asarray(directions, dtype=np.float64), checked_beta(velocity_m_s)
+    inverse_gamma = math.sqrt(1.0 - float(beta @ beta))
+    along = (p @ beta)[..., None]
+    seen = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
+    unit: NDArray[np.float64] = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
+    return unit

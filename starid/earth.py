@@ -1,0 +1,61 @@
+"""Terrestrial time, and the Earth's position and velocity, by the routines of the IAU's SOFA (`erfa`).
+
+No file is downloaded: the series are part of the library, and so are the leap seconds known at its release.
+"""
+
+from __future__ import annotations
+
+import bisect
+from datetime import UTC, datetime
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+ASTRONOMICAL_UNIT_M: Final = 149_597_870_700.0
+DAY_S: Final = 86_400.0
+
+UNIX_EPOCH_JD: Final = 2_440_587.5
+"""Julian date of 1970-01-01."""
+
+_TT_MINUS_TAI_S: Final = 32.184
+
+
+@lru_cache(maxsize=1)
+def _leap_seconds() -> tuple[list[float], list[float]]:
+    """Unix times at which TAI − UTC changes, and its values from then on, seconds."""
+    import erfa
+
+    table = [row for row in erfa.leap_seconds.get().tolist() if row[0] >= 1972]
+    starts = [datetime(year, month, 1, tzinfo=UTC).timestamp() for year, month, _ in table]
+    return starts, [float(row[2]) for row in table]
+
+
+def terrestrial_time(unix_s: float) -> tuple[float, float]:
+    """Julian date of terrestrial time in two parts: whole days plus a half, and the rest.
+
+    Barycentric dynamical time differs by less than 2 ms. Before 1972, TAI − UTC is taken as 10 s.
+    """
+    starts, offsets = _leap_seconds()
+    offset_s = offsets[max(bisect.bisect_right(starts, unix_s) - 1, 0)]
+    days, seconds = divmod(unix_s + offset_s + _TT_MINUS_TAI_S, DAY_S)
+    return UNIX_EPOCH_JD + days, seconds / DAY_S
+
+
+def earth_state(unix_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Barycentric position (3,), m, and velocity (3,), m/s, of the Earth's centre, ICRS (`erfa.epv00`)."""
+    import erfa
+
+    _, barycentric = erfa.epv00(*terrestrial_time(unix_s))
+    return in_metres(barycentric)
+
+
+def earth_velocity(unix_s: float) -> NDArray[np.float64]:
+    """Barycentric velocity (3,) of the Earth's centre, ICRS, m/s."""
+    return earth_state(unix_s)[1]
+
+
+def in_metres(pv: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Position, m, and velocity, m/s, of a position-velocity record of `erfa` (au, au/d)."""
+    return pv["p"] * ASTRONOMICAL_UNIT_M, pv["v"] * (ASTRONOMICAL_UNIT_M / DAY_S)
