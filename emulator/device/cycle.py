@@ -38,7 +38,6 @@ from starhil.emulator.pipeline.messages import (
     Triple,
 )
 from starhil.emulator.profile import TimingConfig
-from starhil.emulator.sky.radiation import particle_rate
 from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate

@@ -53,7 +53,9 @@ def anomaly_share(latitude_deg: float, longitude_deg: float, altitude_km: float)
     return math.exp(-0.5 * (north * north + east * east) + above / _SCALE_HEIGHT_KM)
 
 
-def particle_rate(quiet_s: float, anomaly_s: float, position_m: npt.ArrayLike | None, unix_s: float) -> float:
+def particle_rate(
+    quiet_s: float, anomaly_s: float, position_m: npt.ArrayLike | None, unix_s: float | None
+) -> float:
     """Return the mean number of particles per second that hit the detector.
 
     Parameters
