@@ -33,7 +33,7 @@ from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveFeed, LiveTruth
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.values import Value
 
 log = logging.getLogger("starhil.run")
@@ -54,6 +54,8 @@ class Emulation:
 
     Attributes
     ----------
+    icd
+        Interface definition of the profile's unit.
     ready_fields
         Fields of the ready line: which port, bus or address was opened for what.
     """
@@ -64,6 +66,7 @@ class Emulation:
         worker: WorkerProcess | None = None,
     ) -> None:
         self.profile = profile
+        self.icd = load_unit(profile.unit_source)
         self.clock: Clock = make_clock(profile.run.clock)
         self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
         self._requests: Requests | None = None
@@ -127,7 +130,7 @@ class Emulation:
         truth = await self.open_truth(self.profile.truth)
         stepped = isinstance(self.clock, SteppedClock)
         background = run_at_once if stepped else self._in_background()
-        device = Device(self.profile, load_icd(), self.clock, self.imager, store, truth, background)
+        device = Device(self.profile, self.icd, self.clock, self.imager, store, truth, background)
         self._requests = Requests(device)
         device.on_frame.append(_log_frame)
         device.power_on()

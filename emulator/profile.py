@@ -24,6 +24,7 @@ from starhil.emulator.truth.config import (
     unix_time,
 )
 from starhil.emulator.validation_messages import explain
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_EXTENDS_DEPTH: Final = 8
@@ -218,6 +219,8 @@ class Profile(Strict):
 
     name: str = DEFAULT_PROFILE
     """Name in messages and on the control channel."""
+    unit: str = DEFAULT_UNIT
+    """Interface definition: the name of a unit that ships with starhil, or a folder relative to the profile."""
     run: RunConfig = RunConfig()
     """Seed, clock, algorithm, files."""
     catalog: CatalogConfig = CatalogConfig()
@@ -267,6 +270,12 @@ class Profile(Strict):
     def source(self) -> str:
         """The profile's file, or its name if it has none, for messages."""
         return self.name if self._source is None else str(self._source)
+
+    @property
+    def unit_source(self) -> str:
+        """The unit for `load_unit`: a folder beside the profile's file, else its name or path as given."""
+        beside = self.folder / Path(self.unit).expanduser()
+        return str(beside) if "/" in self.unit or beside.is_dir() else self.unit
 
     @property
     def folder(self) -> Path:

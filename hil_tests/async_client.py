@@ -14,7 +14,7 @@ from starhil.hil_tests.images import Image, download_by_bursts, download_by_fram
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import Value
 
@@ -35,8 +35,8 @@ class AsyncObcClient:
     ----------
     link : HostLink
         A serial line or a CAN bus.
-    icd : InterfaceDefinition, optional
-        Names and layouts; default: the one of the package.
+    icd : InterfaceDefinition
+        Names and layouts of the unit.
     timeout_s : float
         Default time-out of a reply, s.
     retries : int
@@ -46,13 +46,13 @@ class AsyncObcClient:
     def __init__(
         self,
         link: HostLink[Any],
-        icd: InterfaceDefinition | None = None,
+        icd: InterfaceDefinition,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         retries: int = 0,
     ) -> None:
         self.link = link
-        self.icd = load_icd() if icd is None else icd
+        self.icd = icd
         self.timeout_s = timeout_s
         self.retries = retries
         self.transactions: deque[Transaction] = deque(maxlen=HISTORY_LENGTH)

@@ -92,7 +92,7 @@ class Bench:
     def _open(self, link: str) -> ObcClient:
         options = self.options
         spec = self._spec(link)
-        common = {"icd": self.icd, "timeout_s": options.timeout_s, "retries": options.retries}
+        common = {"unit": self.icd, "timeout_s": options.timeout_s, "retries": options.retries}
         log = self._log(link)
         if link == "serial":
             return ObcClient.open(serial=spec, dialect=options.dialect, baud=options.baud, log=log, **common)  # type: ignore[arg-type]

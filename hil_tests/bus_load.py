@@ -26,7 +26,7 @@ from starhil.protocol.can_framing import (
     encode_request_frames,
 )
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.transports import open_can
 
@@ -191,12 +191,20 @@ def _is_right(icd: InterfaceDefinition, reply: Reply, identifier: int) -> bool:
 
 
 async def load_can(
-    spec: str, seconds: float, rate: float, *, device: int = DEVICE, realtime: bool = False
+    icd: InterfaceDefinition,
+    spec: str,
+    seconds: float,
+    rate: float,
+    *,
+    device: int = DEVICE,
+    realtime: bool = False,
 ) -> CanLoad:
     """Ask a device for telemetry while other nodes fill the bus.
 
     Parameters
     ----------
+    icd
+        Interface definition of the CubeStar.
     spec
         The bus, as `open_can` takes it.
     seconds
@@ -208,7 +216,6 @@ async def load_can(
     realtime
         Give the process of the other traffic real-time priority.
     """
-    icd = load_icd()
     transport = open_can(spec)
     asker, echo = _CanAsker(device, transport.send), _CanAsker(ECHO, transport.send)
 

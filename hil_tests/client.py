@@ -22,9 +22,10 @@ from starhil.hil_tests.links import (
 from starhil.hil_tests.loop_thread import LoopThread
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
 from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import Value
 
 T = TypeVar("T")
@@ -45,7 +46,7 @@ class ObcClient:
     def __init__(
         self,
         make_link: Callable[[], HostLink[Any]],
-        icd: InterfaceDefinition | None = None,
+        icd: InterfaceDefinition,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         retries: int = 0,
@@ -60,7 +61,7 @@ class ObcClient:
     @staticmethod
     async def _open(
         make_link: Callable[[], HostLink[Any]],
-        icd: InterfaceDefinition | None,
+        icd: InterfaceDefinition,
         timeout_s: float,
         retries: int,
     ) -> AsyncObcClient:
@@ -78,12 +79,15 @@ class ObcClient:
         baud: int = DEFAULT_BAUD,
         host_address: int = DEFAULT_HOST_ADDRESS,
         device_address: int = DEFAULT_DEVICE_ADDRESS,
-        icd: InterfaceDefinition | None = None,
+        unit: str | InterfaceDefinition = DEFAULT_UNIT,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         retries: int = 0,
         log: WireLog | None = None,
     ) -> Self:
-        """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel."""
+        """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel.
+
+        `unit` is the name of a unit that ships with starhil, a folder, or a definition.
+        """
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
 
@@ -92,6 +96,7 @@ class ObcClient:
                 return SerialHostLink(serial, dialect=Dialect(dialect), baud=baud, log=log)
             return CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
 
+        icd = load_unit(unit) if isinstance(unit, str) else unit
         return cls(make_link, icd, timeout_s=timeout_s, retries=retries)
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:

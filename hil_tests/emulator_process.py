@@ -28,6 +28,7 @@ SHOWN_LINES: Final = 5
 def emulator_command(
     *,
     profile: str | None = None,
+    unit: str | None = None,
     serial: str = "auto",
     can: str = "off",
     seed: int | None = None,
@@ -40,6 +41,8 @@ def emulator_command(
     command = [*_starhil_command(), "run"]
     if profile is not None:
         command.append(profile)
+    if unit is not None:
+        command += ["--unit", unit]
     command += ["--serial", serial, "--can", can]
     if seed is not None:
         command += ["--seed", str(seed)]

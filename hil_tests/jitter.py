@@ -14,7 +14,7 @@ from typing import Final
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import Jitter, Spread
 from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame, CanHostReceiver, encode_request_frames
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.transports import CanTransport, open_can
 
@@ -65,9 +65,10 @@ class _Arrivals:
         return Jitter(what, round(1e3 * mean, 3), len(times), Spread.of(deviations))
 
 
-async def unsolicited_jitter(spec: str, seconds: float, rate_hz: float, *, device: int) -> Jitter:
+async def unsolicited_jitter(
+    icd: InterfaceDefinition, spec: str, seconds: float, rate_hz: float, *, device: int
+) -> Jitter:
     """Let a device send its clock unsolicited at a rate, and measure the intervals."""
-    icd = load_icd()
     row = icd.telemetry["unix_time"]
     receiver = CanHostReceiver(HOST, device)
     answers: asyncio.Queue[Reply] = asyncio.Queue()

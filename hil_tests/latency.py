@@ -23,7 +23,7 @@ from typing import Final
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanFrame, encode_request_frames
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_framing import encode_request
 
@@ -69,7 +69,8 @@ class ProcessRow:
 class SerialRequester:
     """A minimal OBC on a serial line."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, icd: InterfaceDefinition) -> None:
+        self._icd = icd
         self._path = path
         self.open()
 
@@ -86,7 +87,7 @@ class SerialRequester:
 
         Return the time until the last byte of the reply, s, or None without a reply.
         """
-        row = load_icd().telemetry[name]
+        row = self._icd.telemetry[name]
         begin = time.perf_counter()
         os.write(self._fd, encode_request(Request.of(row.id)))
         data = b""
@@ -104,7 +105,8 @@ class SerialRequester:
 class HubRequester:
     """A minimal OBC on the TCP hub for CAN."""
 
-    def __init__(self, spec: str) -> None:
+    def __init__(self, spec: str, icd: InterfaceDefinition) -> None:
+        self._icd = icd
         host, port, bus = spec.removeprefix("socketcand:").replace("/", ":").split(":")
         self._socket = socket.create_connection((host, int(port)), REPLY_WITHIN_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -120,7 +122,7 @@ class HubRequester:
 
         Return the time until the last frame of the reply, s, or None without a reply.
         """
-        row = load_icd().telemetry[name]
+        row = self._icd.telemetry[name]
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
         for frame in encode_request_frames(Request.of(row.id), 1, 4):
@@ -148,7 +150,8 @@ class HubRequester:
 class EchoRequester:
     """A process that echoes requests over a pty, for the latency of the machine."""
 
-    def __init__(self) -> None:
+    def __init__(self, icd: InterfaceDefinition) -> None:
+        self._icd = icd
         self._fd, other = os.openpty()
         tty.setraw(other)
         self._process = subprocess.Popen([sys.executable, "-c", ECHO, str(other)], pass_fds=[other])  # noqa: S603
@@ -158,7 +161,7 @@ class EchoRequester:
 
     def ask(self, name: str) -> float | None:
         """Send the bytes of a request; return the time until their echo, s, or None without one."""
-        request = encode_request(Request.of(load_icd().telemetry[name].id))
+        request = encode_request(Request.of(self._icd.telemetry[name].id))
         begin = time.perf_counter()
         os.write(self._fd, request)
         if not self._poll.poll(REPLY_WITHIN_S * 1000.0):
@@ -174,12 +177,18 @@ class EchoRequester:
 
 
 def measure(
-    rates_hz: list[float], seconds: float, worker: str, report: Callable[[str], None] = lambda _text: None
+    icd: InterfaceDefinition,
+    rates_hz: list[float],
+    seconds: float,
+    worker: str,
+    report: Callable[[str], None] = lambda _text: None,
 ) -> tuple[list[LatencyRow], ProcessRow]:
     """Measure the latency of the links at rest and at each update rate.
 
     Parameters
     ----------
+    icd
+        Interface definition of the CubeStar.
     rates_hz
         Update rates, Hz; 0 is standby.
     seconds
@@ -208,7 +217,11 @@ def measure(
         ready, ready_s = emulator.ready, time.perf_counter() - begin
         with ObcClient.open(serial=ready["serial"], dialect="b", baud=BAUD) as client:
             client.command("set_mode", mode="standby")
-        serial, hub, echo = SerialRequester(ready["serial"]), HubRequester(ready["can"]), EchoRequester()
+        serial, hub, echo = (
+            SerialRequester(ready["serial"], icd),
+            HubRequester(ready["can"], icd),
+            EchoRequester(icd),
+        )
         for probe in (serial, hub, echo):
             stack.callback(probe.close)
         probes = {"serial": serial.ask, "can": hub.ask, "echo": echo.ask}

@@ -35,6 +35,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--starhil-dialect", default="b", metavar="a|b|c", help="form of serial replies (default b)"
     )
+    group.addoption(
+        "--starhil-unit",
+        default="cubestar",
+        metavar="UNIT",
+        help="name or folder of the unit's definition (default cubestar)",
+    )
     group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator")
     group.addoption(
         "--starhil-seed", default=1, type=int, metavar="N", help="seed of the emulator (default 1)"
@@ -60,6 +66,7 @@ def starhil_emulator(
     with PrivateCanBus() as channel:
         command = emulator_command(
             profile=request.config.getoption("--starhil-profile"),
+            unit=request.config.getoption("--starhil-unit"),
             serial="auto",
             can=channel,
             seed=request.config.getoption("--starhil-seed"),
@@ -78,11 +85,10 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
         spec = emulator.ready[link]
     timeout_s = request.config.getoption("--starhil-timeout")
+    common = {"unit": request.config.getoption("--starhil-unit"), "timeout_s": timeout_s}
     if link == "can":
-        return ObcClient.open(can=spec, timeout_s=timeout_s)
-    return ObcClient.open(
-        serial=spec, dialect=request.config.getoption("--starhil-dialect"), timeout_s=timeout_s
-    )
+        return ObcClient.open(can=spec, **common)
+    return ObcClient.open(serial=spec, dialect=request.config.getoption("--starhil-dialect"), **common)
 
 
 @pytest.fixture

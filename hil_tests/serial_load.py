@@ -11,7 +11,7 @@ from collections import deque
 from typing import Final
 
 from starhil.hil_tests.load_figures import SerialLoad
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.image_transfer import MAP_PART_SIZE
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
@@ -100,11 +100,15 @@ class _SerialPipeline:
             self._receiver.expect(*self._under_way[0])
 
 
-async def load_serial(spec: str, seconds: float, baud: int, dialect: Dialect) -> SerialLoad:
+async def load_serial(
+    icd: InterfaceDefinition, spec: str, seconds: float, baud: int, dialect: Dialect
+) -> SerialLoad:
     """Keep a serial line busy in both directions and check every reply.
 
     Parameters
     ----------
+    icd
+        Interface definition of the CubeStar.
     spec
         The port, as `open_serial` takes it.
     seconds
@@ -112,7 +116,6 @@ async def load_serial(spec: str, seconds: float, baud: int, dialect: Dialect) ->
     baud, dialect
         As the device has them.
     """
-    icd = load_icd()
     pipeline = _SerialPipeline(icd, dialect)
     transport = open_serial(spec, baud)
     await transport.start(pipeline.take)

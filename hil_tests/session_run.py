@@ -30,8 +30,9 @@ from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 SCRIPT_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "sessions"
 DEFAULT_FOLDER: Final = Path("out") / "session"
@@ -44,6 +45,7 @@ class SessionRequest:
 
     script: Path
     options: LinkOptions
+    unit: str = DEFAULT_UNIT
     start: bool = False
     profile: str | None = None
     folder: Path | None = None
@@ -79,7 +81,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     BenchError
         The script is invalid, a port is not available, or the emulator does not start.
     """
-    icd = load_icd()
+    icd = load_unit(request.unit)
     path = find_script(request.script)
     script = load_script(path, icd)
     if request.keep_going:
@@ -156,6 +158,7 @@ def _emulator(
     return EmulatorProcess(
         emulator_command(
             profile=request.profile or wanted.profile,
+            unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
             seed=wanted.seed,

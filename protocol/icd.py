@@ -1,4 +1,4 @@
-"""The interface definition: loaded from `configs/icd/*.toml`, validated, indexed by name and id."""
+"""The interface definition of a unit: the TOML files of its folder, validated, indexed by name and id."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Final, TypeVar
@@ -25,10 +25,18 @@ from starhil.protocol.icd_schema import (
     SectionModel,
 )
 from starhil.protocol.messages import FIRST_TELEMETRY_ID
+from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
-__all__ = ["IcdError", "InterfaceDefinition", "Names", "UnknownNameError", "default_icd_path", "load_icd"]
+__all__ = [
+    "CanopenTable",
+    "IcdError",
+    "InterfaceDefinition",
+    "Names",
+    "UnknownNameError",
+    "load_unit",
+]
 
 _Item = TypeVar("_Item")
 
@@ -75,6 +83,14 @@ class Names(dict[str, _Item]):
 
 
 @dataclass(frozen=True)
+class CanopenTable:
+    """The table `[canopen]` of a definition, as `starhil.protocol.canopen.layout` reads it."""
+
+    file: Path
+    document: Mapping[str, object]
+
+
+@dataclass(frozen=True)
 class InterfaceDefinition:
     """The interface between a device and its OBC: rows, enumerations and parameters."""
 
@@ -87,6 +103,8 @@ class InterfaceDefinition:
     parameters: Names[Parameter]
     sections: tuple[Section, ...] = ()
     """Documentation that accompanies the rows, such as conventions."""
+    canopen: CanopenTable | None = None
+    """Layout of the rows in the object dictionary, if the unit has CANopen."""
 
     @cached_property
     def telecommands_by_id(self) -> Mapping[int, Row]:
@@ -117,24 +135,18 @@ class InterfaceDefinition:
         )
 
 
-def default_icd_path() -> Path:
-    """Return the folder of the interface definition that ships with the package."""
-    package = Path(__file__).resolve().parent.parent
-    return package / "configs" / "icd"
+def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
+    """Read the interface definition of a unit: a name that ships with the package, a folder of TOML files, or one file.
 
-
-def load_icd(path: Path | str | None = None) -> InterfaceDefinition:
-    """Read an interface definition: a folder of TOML files, or one file.
-
-    Without a path, return the definition that ships with the package, which is read once. Raises IcdError, whose text
-    names file, row and field.
+    A unit that ships is read once. Raises IcdError, whose text names file, row and field.
     """
-    return _load_default() if path is None else _load(Path(path))
+    path = find_unit(name_or_folder)
+    return _load_shipped(path) if path.parent == UNITS_FOLDER else _load(path)
 
 
-@lru_cache(maxsize=1)
-def _load_default() -> InterfaceDefinition:
-    return _load(default_icd_path())
+@cache
+def _load_shipped(path: Path) -> InterfaceDefinition:
+    return _load(path)
 
 
 def _load(path: Path) -> InterfaceDefinition:
@@ -188,6 +200,7 @@ class _Builder:
         self._row_models: dict[RowKind, list[tuple[Path, RowModel]]] = {"telecommand": [], "telemetry": []}
         self._parameter_models: list[tuple[Path, ParameterModel]] = []
         self._sections: list[Section] = []
+        self._canopen: CanopenTable | None = None
 
     def add(self, file: Path, model: FileModel) -> None:
         if model.definition is not None:
@@ -198,6 +211,10 @@ class _Builder:
             self._add_enum(file, enum)
         for section in model.section:
             self._add_section(file, section)
+        if model.canopen is not None:
+            if self._canopen is not None:
+                raise IcdError(f"{file}: a second [canopen]; keep one of them")
+            self._canopen = CanopenTable(file, model.canopen)
         self._row_models["telecommand"] += [(file, row) for row in model.telecommand]
         self._row_models["telemetry"] += [(file, row) for row in model.telemetry]
         self._parameter_models += [(file, parameter) for parameter in model.parameter]
@@ -220,6 +237,7 @@ class _Builder:
             enums=Names("enumeration", self._enums.items()),
             parameters=Names("parameter", self._parameters.items()),
             sections=tuple(self._sections),
+            canopen=self._canopen,
         )
 
     def _add_section(self, file: Path, model: SectionModel) -> None:

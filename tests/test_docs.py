@@ -26,7 +26,7 @@ from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen import build_dictionary
 from starhil.protocol.export import export
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 
 DOCS = Path(__file__).parents[1] / "docs"
 PATIENCE_S = 20.0
@@ -80,7 +80,7 @@ def numbers(text: str) -> list[float]:
 
 def test_icd_is_the_present_export():
     remedy = "docs/icd.md is out of date; run: starhil icd export markdown -o docs/icd.md"
-    assert (DOCS / "icd.md").read_text(encoding="utf-8") == export(load_icd(), "markdown"), remedy
+    assert (DOCS / "icd.md").read_text(encoding="utf-8") == export(load_unit(), "markdown"), remedy
 
 
 def table_after(name: str, heading: str) -> list[list[str]]:
@@ -104,14 +104,14 @@ def sensor_defaults() -> dict[str, object]:
         "power": profile.power.model_dump(),
         "radiation": profile.radiation.model_dump(),
         "catalog": profile.catalog.model_dump(),
-        "parameters": {name: item.default for name, item in load_icd().parameters.items()}
+        "parameters": {name: item.default for name, item in load_unit().parameters.items()}
         | profile.parameters,
     }
     return {f"{name}.{key}": value for name, part in sections.items() for key, value in part.items()}
 
 
 def test_sensor_gives_the_defaults_of_the_default_profile():
-    defaults, icd = sensor_defaults(), load_icd()
+    defaults, icd = sensor_defaults(), load_unit()
     checked = 0
     for heading in ("Optics", "Detector", "Temperature, power, radiation", "Timing"):
         for row in table_after("sensor.md", heading):
@@ -140,9 +140,9 @@ def test_sensor_gives_the_modelled_latency_and_the_highest_rates():
     pairs = re.findall(r"^\| (\d+) ms \| (\d+) Hz \|$", text, re.MULTILINE)
     assert len(pairs) == 4
     for exposure_ms, rate_hz in pairs:
-        Parameters(load_icd(), {"exposure": int(exposure_ms), "update_rate": float(rate_hz)})
+        Parameters(load_unit(), {"exposure": int(exposure_ms), "update_rate": float(rate_hz)})
         with pytest.raises(EmulatorError, match="or less"):
-            Parameters(load_icd(), {"exposure": int(exposure_ms) + 1, "update_rate": float(rate_hz)})
+            Parameters(load_unit(), {"exposure": int(exposure_ms) + 1, "update_rate": float(rate_hz)})
 
 
 def test_every_link_between_documents_leads_somewhere():
@@ -187,11 +187,11 @@ def test_canopen_names_every_object_of_the_device():
         for place in places.split(", "):
             first, _, last = place.replace("h", "").partition("–")
             named |= set(range(int(first, 16), int(last or first, 16) + 1))
-    assert named == {index for index in build_dictionary().od.indices if index >= 0x2000}
+    assert named == {index for index in build_dictionary(load_unit()).od.indices if index >= 0x2000}
 
 
 def test_canopen_shows_the_pdos_as_they_are():
-    od = build_dictionary().od
+    od = build_dictionary(load_unit()).od
     for title, identifier, content in table_after("canopen.md", "Attitude by PDO")[:4]:
         number = int(title.split()[0]) - 1
         mapping = od[0x1A00 + number]
@@ -262,7 +262,7 @@ def program_under(heading: str) -> tuple[Block, str]:
 def check_program(heading: str, ready: dict[str, str], folder: Path) -> None:
     """Run a program of the walk-through as a process, and compare the words that it prints."""
     block, shown = program_under(heading)
-    (folder / "starhil.eds").write_text(export(load_icd(), "eds"), encoding="ascii")
+    (folder / "starhil.eds").write_text(export(load_unit(), "eds"), encoding="ascii")
     done = subprocess.run(
         [sys.executable, "-c", here(block.text, ready)],
         cwd=folder,

@@ -18,7 +18,7 @@ from starhil.emulator.profile import load_profile
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.script import load_script
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -83,7 +83,7 @@ def keys_accepted(folder: Path, script: str) -> set[str]:
     path = folder / "script.toml"
     path.write_text(script, encoding="utf-8")
     with pytest.raises(ScriptError, match="unknown key 'no_such_key'") as rejection:
-        load_script(path, load_icd())
+        load_script(path, load_unit())
     return set(re.search(r"\(known here: (.*)\)", str(rejection.value))[1].split(", "))
 
 
@@ -125,7 +125,7 @@ def test_sessions_has_every_action(tmp_path):
     path = tmp_path / "script.toml"
     path.write_text('[[step]]\nname = "nothing"', encoding="utf-8")
     with pytest.raises(ScriptError) as rejection:
-        load_script(path, load_icd())
+        load_script(path, load_unit())
     actions = set(re.search(r"exactly one action of (.*);", str(rejection.value))[1].split(", "))
     shown = [re.match(r"`(\w+) =", row[0]) for row in rows_under("Actions")]
     assert {match[1] for match in shown if match} == actions == set(WHOLE_ACTIONS)
@@ -147,7 +147,7 @@ def test_sessions_has_the_keys_of_each_action(action, tmp_path):
 def test_sessions_gives_the_defaults_of_a_step(tmp_path):
     path = tmp_path / "script.toml"
     path.write_text('[[step]]\nread = "quaternion"', encoding="utf-8")
-    script = load_script(path, load_icd())
+    script = load_script(path, load_unit())
     shown = {row[0].strip("`"): row[1] for row in rows_under("Keys of every step")}
     for key in ("every_s", "repeat", "retries"):
         assert float(shown[key]) == getattr(script.steps[0], key)

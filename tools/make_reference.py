@@ -327,9 +327,9 @@ def accepted_options(algorithm: str) -> list[str]:
 def faults() -> str:
     """Keys of the tables of a `fault` request, but for the optical ones, which are those of `[sky]`."""
     from starhil.emulator.control.faults import DeviceFault, WireFault
-    from starhil.protocol.icd import load_icd
+    from starhil.protocol.icd import load_unit
 
-    enums = load_icd().enums
+    enums = load_unit().enums
     rows = []
     for row in model_rows(DeviceFault):
         enum = enums.get({"`error`": "device_error", "`reset`": "reset_cause"}.get(row[0], ""))

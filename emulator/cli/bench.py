@@ -82,12 +82,13 @@ def latency(
 ) -> None:
     """Measure reply latency on both links while frames are solved, and the start-up of the emulator."""
     from starhil.hil_tests.latency import measure
+    from starhil.protocol.icd import load_unit
 
     chosen = [one_of("--worker", worker, ("process", "thread")) for worker in workers or ["process"]]
     report = _progress()
     rows, processes = [], []
     for worker in chosen:
-        links, process = measure(rates or [0.0, 1.0, 10.0], seconds, worker, report)
+        links, process = measure(load_unit(), rates or [0.0, 1.0, 10.0], seconds, worker, report)
         rows += links
         processes.append(process)
     if as_json:
@@ -200,6 +201,7 @@ def bus(
 
     from starhil.emulator.cli.bench_bus import Target, measure, print_figures, started_device
     from starhil.hil_tests.realtime import set_realtime_priority
+    from starhil.protocol.icd import load_unit
     from starhil.protocol.serial_framing import Dialect
 
     one_of("--dialect", dialect, DIALECTS)
@@ -209,7 +211,7 @@ def bus(
     with started_device(baud, realtime, report) if start else nullcontext(running) as target:
         if realtime and not start:
             set_realtime_priority()
-        figures = measure(target, seconds, rate, report, realtime=realtime)
+        figures = measure(load_unit(), target, seconds, rate, report, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if as_json:
         print(json.dumps({**figures.as_dict(), "good": good}))

@@ -17,6 +17,7 @@ from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_
 from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.serial_load import load_serial
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial_framing import Dialect
 
 UPDATE_RATE_HZ = 10.0
@@ -92,29 +93,39 @@ def started_device(baud: int, realtime: bool, report: Callable[[str], None]) -> 
 
 
 def measure(
-    target: Target, seconds: float, rate: float, report: Callable[[str], None], *, realtime: bool = False
+    icd: InterfaceDefinition,
+    target: Target,
+    seconds: float,
+    rate: float,
+    report: Callable[[str], None],
+    *,
+    realtime: bool = False,
 ) -> BusFigures:
     """Measure each link of the target in turn."""
     figures = BusFigures()
     if target.can is not None:
         report(f"CAN: {rate:g} frames/s for {seconds:g} s")
         with count_solved_frames(target, "can", figures):
-            load = load_can(target.can, seconds, rate, device=target.device, realtime=realtime)
+            load = load_can(icd, target.can, seconds, rate, device=target.device, realtime=realtime)
             figures.can = asyncio.run(load)
     if target.serial is not None:
         report(f"serial: {target.baud} Bd both ways for {seconds:g} s")
         with count_solved_frames(target, "serial", figures):
-            figures.serial = asyncio.run(load_serial(target.serial, seconds, target.baud, target.dialect))
+            figures.serial = asyncio.run(
+                load_serial(icd, target.serial, seconds, target.baud, target.dialect)
+            )
     if target.can is not None:
         jitter_s = max(min(seconds / 3.0, 20.0), 2.0)
         report(f"jitter: {jitter_s:g} s each")
-        figures.jitter += measure_jitter(target.can, jitter_s, device=target.device, node=target.canopen)
+        figures.jitter += measure_jitter(icd, target.can, jitter_s, device=target.device, node=target.canopen)
     return figures
 
 
-def measure_jitter(can: str, seconds: float, *, device: int, node: int | None) -> list[Jitter]:
+def measure_jitter(
+    icd: InterfaceDefinition, can: str, seconds: float, *, device: int, node: int | None
+) -> list[Jitter]:
     """Measure the jitter of periodic telemetry and, with a CANopen node, of its periodic messages."""
-    measurements = [unsolicited_jitter(can, seconds, UNSOLICITED_HZ, device=device)]
+    measurements = [unsolicited_jitter(icd, can, seconds, UNSOLICITED_HZ, device=device)]
     if node is not None:
         measurements += [
             heartbeat_jitter(can, seconds, HEARTBEAT_MS, node=node),

@@ -19,9 +19,11 @@ from starhil.emulator.cli.options import (
     JunitFile,
     SerialDialect,
     SerialPort,
+    Unit,
     one_of,
 )
 from starhil.emulator.cli.output import output_help
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 
 def command(
@@ -29,6 +31,7 @@ def command(
         list[str] | None,
         typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'; default: all."),
     ] = None,
+    unit: Unit = DEFAULT_UNIT,
     serial: SerialPort = None,
     can: CanChannel = None,
     canopen: CanopenNode = None,
@@ -85,7 +88,7 @@ def command(
     from starhil.hil_tests.errors import BenchError
     from starhil.hil_tests.interruption import interruptible
     from starhil.hil_tests.results import prepare_report
-    from starhil.protocol.icd import load_icd
+    from starhil.protocol.icd import load_unit
 
     one_of("--dialect", dialect, DIALECTS)
     if (start or list_only) and serial is None and can is None:
@@ -95,6 +98,7 @@ def command(
     if not start and not list_only and serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")
     request = ConformanceRequest(
+        unit=unit,
         serial=serial,
         can=can,
         canopen_node=canopen,
@@ -112,7 +116,7 @@ def command(
     )
     console = Console(highlight=False, quiet=as_json)
     if list_only:
-        for item in all_cases(request, load_icd()):
+        for item in all_cases(request, load_unit(unit)):
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
         return

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
+from starhil.emulator.cli.options import AsJson, Unit
 from starhil.emulator.cli.output import output_help, prepare_output, print_text
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 group = typer.Typer(help="List or export the interface definition.", no_args_is_help=True)
 
@@ -34,7 +35,7 @@ def export(
         Path | None,
         typer.Option("--output", "-o", help=output_help("File to write; default: stdout.")),
     ] = None,
-    icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
+    unit: Unit = DEFAULT_UNIT,
 ) -> None:
     """Export the interface definition in another format.
 
@@ -42,9 +43,9 @@ def export(
     cosmos for ground software.
     """
     from starhil.protocol.export import export as render
-    from starhil.protocol.icd import load_icd
+    from starhil.protocol.icd import load_unit
 
-    text = render(load_icd(icd), format_.value)
+    text = render(load_unit(unit), format_.value)
     if output is None:
         print_text(text)
     else:
@@ -67,15 +68,15 @@ def _write(path: Path, text: str) -> None:
 
 @group.command("list")
 def list_rows(
-    icd: Annotated[Path | None, typer.Option(help="Folder or file of another interface definition.")] = None,
+    unit: Unit = DEFAULT_UNIT,
     as_json: AsJson = False,
 ) -> None:
     """List telecommands, telemetry and parameters, one per line."""
     import json
 
-    from starhil.protocol.icd import load_icd
+    from starhil.protocol.icd import load_unit
 
-    definition = load_icd(icd)
+    definition = load_unit(unit)
     if as_json:
         print(
             json.dumps(

@@ -31,6 +31,20 @@ CanopenNode: TypeAlias = Annotated[
     int | None,
     typer.Option("--canopen", min=1, max=127, help="Node ID of the CANopen slave on the CAN channel."),
 ]
+Unit: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--unit",
+        help="Interface definition: the name of a unit that ships with starhil, or a folder of TOML files.",
+    ),
+]
+UnitChoice: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--unit",
+        help="Interface definition instead of the profile's: the name of a unit that ships with starhil, or a folder.",
+    ),
+]
 JunitFile: TypeAlias = Annotated[
     Path | None, typer.Option("--junit", help=output_help("Write a JUnit XML file."))
 ]

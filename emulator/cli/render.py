@@ -130,9 +130,10 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
         from starhil.emulator.device.parameters import Parameters
         from starhil.emulator.emulation import pipeline_setup
         from starhil.emulator.profile import load_profile
-        from starhil.protocol.icd import load_icd
+        from starhil.protocol.icd import load_unit
 
-        loaded, icd = load_profile(profile), load_icd()
+        loaded = load_profile(profile)
+        icd = load_unit(loaded.unit_source)
         parameters = Parameters(icd, profile_defaults(loaded, icd))
         setup = pipeline_setup(loaded)
         sensor = SensorModel().with_(**setup.sensor)

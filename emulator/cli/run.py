@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import UnitChoice
 from starhil.emulator.cli.output import output_help, prepare_output
 
 
@@ -14,6 +15,7 @@ def command(
     profile: Annotated[
         str, typer.Argument(help="Name of a device profile, or path of a profile file.")
     ] = "cubestar",
+    unit: UnitChoice = None,
     serial: Annotated[
         str | None, typer.Option(help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off.")
     ] = None,
@@ -101,6 +103,7 @@ def command(
         raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
     overrides = list(settings or ())
     values = {
+        "unit": None if unit is None else _absolute_folder(unit),
         "links.serial.port": serial,
         "links.serial.dialect": dialect,
         "links.can.channel": can,
@@ -155,6 +158,11 @@ def command(
             await emulator.close()
 
     asyncio.run(run())
+
+
+def _absolute_folder(unit: str) -> str:
+    """Return a folder given on the command line as an absolute path: in a profile it is relative to the profile."""
+    return str(Path(unit).expanduser().absolute()) if Path(unit).expanduser().exists() else unit
 
 
 def _quoted(text: str) -> str:

@@ -17,13 +17,16 @@ from starhil.emulator.cli.options import (
     JunitFile,
     SerialDialect,
     SerialPort,
+    Unit,
 )
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 
 def command(
     script: Annotated[
         Path, typer.Argument(help="Session script (TOML), or the name of one that ships with starhil.")
     ],
+    unit: Unit = DEFAULT_UNIT,
     serial: SerialPort = None,
     can: CanChannel = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,
@@ -64,6 +67,7 @@ def command(
     )
     request = SessionRequest(
         script=script,
+        unit=unit,
         options=options,
         start=start,
         profile=profile,

@@ -35,7 +35,7 @@ UNSOLICITED: Final = CaseArea[CanProbe](
     "unsolicited", "types 10 to 12 (libCubeObc); their use: R20, docs/rules.md", intrusive=True
 )
 ERRORS: Final = CaseArea[CanProbe](
-    "errors", "configs/icd: communication_status 144, flag can_telecommand_error", intrusive=True
+    "errors", "configs/units/cubestar: communication_status 144, flag can_telecommand_error", intrusive=True
 )
 TIMING: Final = CaseArea[CanProbe]("timing", rule(10))
 

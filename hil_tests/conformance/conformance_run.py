@@ -21,7 +21,8 @@ from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.results import FAILED
 from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 DEFAULT_BAUD: Final = 115200
 
@@ -30,6 +31,7 @@ DEFAULT_BAUD: Final = 115200
 class ConformanceRequest:
     """Options of the user; see `starhil conformance --help`."""
 
+    unit: str = DEFAULT_UNIT
     serial: str | None = None
     can: str | None = None
     canopen_node: int | None = None
@@ -88,7 +90,7 @@ def run_conformance(
     BenchError, ProtocolError
         A port, a bus or the emulator is not available.
     """
-    icd = load_icd()
+    icd = load_unit(request.unit)
     cases = all_cases(request, icd)
     outcomes: list[Outcome] = []
     complete = False
@@ -143,7 +145,7 @@ def _run_on_links(
             run_cases(can_probe, mine, on_outcome, port=f"{can} at address {request.device_address}")
         mine = [item for item in cases if item.id.startswith("canopen.")]
         if mine and can is not None:
-            _run_canopen(request, can, mine, on_outcome)
+            _run_canopen(request, icd, can, mine, on_outcome)
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:
@@ -177,6 +179,7 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
         extra += ["--clock", f"scaled:{request.speed:g}"]
     command = emulator_command(
         profile=request.profile,
+        unit=request.unit,
         serial="off" if request.serial is None else request.serial,
         can=channel,
         seed=1,
@@ -189,7 +192,11 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> tuple[str | None, s
 
 
 def _run_canopen(
-    request: ConformanceRequest, can: str, cases: Sequence[Case[Any]], on_outcome: Callable[[Outcome], None]
+    request: ConformanceRequest,
+    icd: InterfaceDefinition,
+    can: str,
+    cases: Sequence[Case[Any]],
+    on_outcome: Callable[[Outcome], None],
 ) -> None:
     """Run the CANopen cases with the EDS of the request, else that of the product."""
     import canopen
@@ -198,7 +205,7 @@ def _run_canopen(
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
     node = int(request.canopen_node or 0)
-    text = _eds_text(request.eds)
+    text = _eds_text(request.eds, icd)
     with temporary_folder("starhil-eds-") as folder:
         path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
@@ -211,11 +218,11 @@ def _run_canopen(
         run_cases(probe, cases, on_outcome, port=f"{can} at node {node}")
 
 
-def _eds_text(path: Path | None) -> str:
+def _eds_text(path: Path | None, icd: InterfaceDefinition) -> str:
     if path is None:
         from starhil.protocol.canopen import build_dictionary, build_eds
 
-        return build_eds(build_dictionary())
+        return build_eds(build_dictionary(icd))
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:

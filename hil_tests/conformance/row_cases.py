@@ -41,7 +41,7 @@ IDENTIFIERS: Final = CaseArea[LinkProbe](
 
 def clause_of(row: Row) -> str:
     """Where a row is written."""
-    return f"configs/icd {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
+    return f"configs/units/cubestar {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
 
 
 def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
@@ -178,7 +178,7 @@ def _bad_field_case(row: Row, name: str, index: int, why: str, data: bytes) -> C
 
 
 def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
-    clause = f"configs/icd parameter {parameter.name}; {rule(19)}"
+    clause = f"configs/units/cubestar parameter {parameter.name}; {rule(19)}"
 
     def limits(probe: LinkProbe) -> None:
         seen = probe.parameter(parameter.name)

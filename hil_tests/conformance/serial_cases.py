@@ -36,7 +36,7 @@ STUFFING: Final = CaseArea[SerialProbe](
 )
 ERRORS: Final = CaseArea[SerialProbe](
     "errors",
-    "configs/icd: communication_status 144, errors of the link are flagged and passed over",
+    "configs/units/cubestar: communication_status 144, errors of the link are flagged and passed over",
     intrusive=True,
 )
 TIMING: Final = CaseArea[SerialProbe]("timing", "8N1: ten bits a byte")

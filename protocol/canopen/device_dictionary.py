@@ -20,9 +20,9 @@ from starhil.protocol.canopen.communication import (
     variable,
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from starhil.protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, load_layout
+from starhil.protocol.canopen.layout import CanopenModel, PackedField, PdoModel, PlacedObject, read_layout
 from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.icd import InterfaceDefinition, load_icd
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, Value, to_f32
 
 DATA_TYPES: Final[dict[str, int]] = {
@@ -367,19 +367,16 @@ def identity_of(layout: CanopenModel) -> Identity:
 
 
 def build_dictionary(
-    icd: InterfaceDefinition | None = None,
+    icd: InterfaceDefinition,
     layout: CanopenModel | None = None,
     *,
     serial_number: int = 1,
     software_version: str = "1",
 ) -> DeviceDictionary:
-    """Build the object dictionary of the device .
-
-    By default from the definition that ships with the package.
-    """
-    layout = load_layout() if layout is None else layout
+    """Build the object dictionary of the device that serves a definition, by default with the definition's layout."""
+    layout = read_layout(icd) if layout is None else layout
     identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
-    return DeviceDictionary(load_icd() if icd is None else icd, layout, identity)
+    return DeviceDictionary(icd, layout, identity)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

@@ -1,21 +1,16 @@
-"""The layout of the interface definition in the object dictionary: `configs/icd/canopen.toml`."""
+"""The layout of the interface definition in the object dictionary: its table `[canopen]`."""
 
 from __future__ import annotations
 
-import tomllib
-from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from starhil.protocol.icd import default_icd_path
-from starhil.protocol.user_file import read_user_text
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import IcdError
 
 Index = Annotated[int, Field(ge=0x2000, le=0xFFFF)]
 PackedType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u48"]
-FILE_NAME = "canopen.toml"
 
 
 class _Model(BaseModel):
@@ -92,43 +87,20 @@ class CanopenModel(_Model):
     rpdo: list[PdoModel] = []
 
 
-class _FileModel(_Model):
-    canopen: CanopenModel
-
-
-def load_layout(path: Path | str | None = None) -> CanopenModel:
-    """Read the layout of the interface definition in the object dictionary.
-
-    Parameters
-    ----------
-    path
-        The file or its folder; by default the file that ships with the package, read once.
+def read_layout(icd: InterfaceDefinition) -> CanopenModel:
+    """Return the layout of the interface definition in the object dictionary.
 
     Raises
     ------
     IcdError
-        The text names file and key.
+        The definition has none, or it is invalid; the text names file and key.
     """
-    if path is None:
-        return _load_default()
-    path = Path(path)
-    return _load(path / FILE_NAME if path.is_dir() else path)
-
-
-@lru_cache(maxsize=1)
-def _load_default() -> CanopenModel:
-    return _load(default_icd_path() / FILE_NAME)
-
-
-def _load(path: Path) -> CanopenModel:
+    table = icd.canopen
+    if table is None:
+        raise IcdError(f"unit {icd.name}: has no CANopen: its definition lacks the table [canopen]")
     try:
-        document = tomllib.loads(read_user_text(path))
-        return _FileModel.model_validate(document).canopen
-    except OSError as error:
-        raise IcdError(f"{path}: cannot read the CANopen layout: {error.strerror}") from None
+        return CanopenModel.model_validate(table.document)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(step) for step in first["loc"])
-        raise IcdError(f"{path}: {key}: {first['msg']}") from None
-    except (ValueError, RecursionError) as error:
-        raise IcdError(f"{path}: not valid TOML: {error}") from None
+        key = ".".join(str(step) for step in ("canopen", *first["loc"]))
+        raise IcdError(f"{table.file}: {key}: {first['msg']}") from None

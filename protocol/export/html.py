@@ -38,7 +38,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         + "".join(_link(section) for section in icd.sections)
         + '<a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>'
         '<a href="#parameters">Parameters</a><a href="#enumerations">Enumerations</a>'
-        + "".join(_link(section) for section in wire.sections())
+        + "".join(_link(section) for section in wire.sections(icd))
         + "</nav>"
     )
     for section in icd.sections:
@@ -70,7 +70,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         ("Name", "Numbers", "Meaning"),
         (("confirmed", (enum.name, describe.enum_text(enum), enum.doc)) for enum in icd.enums.values()),
     )
-    for section in wire.sections():
+    for section in wire.sections(icd):
         yield from _section(section)
     yield "</body></html>"
 

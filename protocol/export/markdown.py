@@ -49,7 +49,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         ("Name", "Numbers", "Meaning"),
         ((enum.name, describe.enum_text(enum), enum.doc) for enum in icd.enums.values()),
     )
-    for section in wire.sections():
+    for section in wire.sections(icd):
         yield from _section(section)
 
 
@@ -64,7 +64,7 @@ def _section(section: Section) -> Iterator[str]:
 def _contents(icd: InterfaceDefinition) -> Iterator[str]:
     headings = [section.heading for section in icd.sections]
     headings += ["Telecommands", "Telemetry", "Parameters", "Enumerations"]
-    for heading in [*headings, *(section.heading for section in wire.sections())]:
+    for heading in [*headings, *(section.heading for section in wire.sections(icd))]:
         yield f"- [{heading}](#{heading.lower().replace(' ', '-')})"
 
 

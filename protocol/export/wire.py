@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
-from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, load_layout
+from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, read_layout
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
 from starhil.protocol.values import Section
@@ -22,9 +23,11 @@ _PLACEHOLDERS: Final = {
 """Placeholder names for bytes of the example messages."""
 
 
-def sections() -> tuple[Section, ...]:
+def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     """Return the sections on the links."""
-    layout = load_layout()
+    if icd.canopen is None:
+        return (_serial(), _can())
+    layout = read_layout(icd)
     return (_serial(), _can(), _objects(layout), _pdos(layout))
 
 

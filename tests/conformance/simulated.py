@@ -22,7 +22,7 @@ from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import PacedWriter
@@ -188,7 +188,7 @@ class SimulatedUnit:
         self.loop.run_until_complete(self._start())
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
-        icd = load_icd()
+        icd = load_unit()
         self.probe = (
             SerialProbe(port, icd, dialect=self.dialect, baud=BAUD, times=times)
             if self.kind == "serial"
@@ -204,7 +204,7 @@ class SimulatedUnit:
         profile = Profile.model_validate({"links": links})
         self.store = MemoryStore()
         self.device = Device(
-            profile, load_icd(), LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
+            profile, load_unit(), LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
         )
         self.requests = Requests(self.device)
         self.transport = MemoryTransport(self.loop, paced=self.kind == "serial")

@@ -6,10 +6,10 @@ import pytest
 
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from tests.conformance.simulated import SimulatedUnit
 
-ICD = load_icd()
+ICD = load_unit()
 SUITES = {"serial": serial_suite(ICD), "can": can_suite(ICD)}
 
 

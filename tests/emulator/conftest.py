@@ -27,7 +27,7 @@ from starhil.emulator.pipeline.messages import (
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth, TruthSource
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager, FakeImager
@@ -100,7 +100,7 @@ class Bench:
     ) -> None:
         self.clock = SteppedClock()
         self.pipeline = FakePipeline()
-        self.icd = load_icd()
+        self.icd = load_unit()
         self.store = store or MemoryStore()
         self.later: list[Reply] = []
         """Answers that came when a telecommand was done."""

@@ -10,7 +10,7 @@ from starhil.emulator.emulation import camera_constants, pipeline_setup
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady, SolverSettings
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.profile import load_profile
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starid.attitude import Attitude, random_attitude
 
 DATA_SHEET_ARCSEC = 55.44
@@ -34,7 +34,7 @@ def errors_arcsec(pipeline, parameters) -> list[float]:
 
 
 def test_a_calibration_that_is_a_little_wrong_costs_what_a_data_sheet_allows():
-    profile, icd = load_profile("real_lens", ["run.clock=stepped"]), load_icd()
+    profile, icd = load_profile("real_lens", ["run.clock=stepped"]), load_unit()
     pipeline = Pipeline(pipeline_setup(profile))
     constants = camera_constants(PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), 0.0))
     parameters = Parameters(icd, profile_defaults(profile, icd))

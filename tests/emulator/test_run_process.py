@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
 from starid.attitude import Attitude
@@ -26,7 +26,7 @@ READY_WITHIN_S = 300.0
 """A first start compiles."""
 REPLY_WITHIN_S = 30.0
 ACCURACY_ARCSEC = 20.0
-ICD = load_icd()
+ICD = load_unit()
 
 
 def log_lines(errors: str) -> list[str]:

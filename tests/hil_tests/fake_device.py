@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import block_checksum
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
 from starhil.protocol.transports import open_can, open_serial
 
-ICD = load_icd()
+ICD = load_unit()
 EDGE = 64
 
 

@@ -15,12 +15,12 @@ from starhil.hil_tests.load_figures import CanLoad, SerialLoad, Spread
 from starhil.hil_tests.serial_load import load_serial
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
 from starhil.protocol.hub import CanHub
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
 from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
 
-ICD = load_icd()
+ICD = load_unit()
 RATE = 300.0
 SECONDS = 0.6
 BAUD = 460_800
@@ -88,7 +88,7 @@ async def can_device(answer: Answer) -> AsyncIterator[str]:
 def measure_can(answer: Answer) -> CanLoad:
     async def main() -> CanLoad:
         async with can_device(answer) as spec:
-            return await load_can(spec, SECONDS, RATE)
+            return await load_can(ICD, spec, SECONDS, RATE)
 
     return asyncio.run(main())
 
@@ -134,7 +134,7 @@ def measure_serial(answer: Answer, dialect: Dialect) -> SerialLoad:
                     number += 1
 
         await transport.start(take)
-        load = await load_serial(transport.description, SECONDS, BAUD, dialect)
+        load = await load_serial(ICD, transport.description, SECONDS, BAUD, dialect)
         await transport.close()
         return load
 
@@ -161,13 +161,13 @@ def test_a_device_that_sends_nothing_unasked_is_told() -> None:
     async def main() -> None:
         async with can_device(good) as spec:
             with pytest.raises(BenchError, match="only 0 messages came"):
-                await unsolicited_jitter(spec, 0.1, 20.0, device=DEVICE)
+                await unsolicited_jitter(ICD, spec, 0.1, 20.0, device=DEVICE)
         async with can_device(silent) as spec:
             with pytest.raises(BenchError, match="does not answer"):
-                await unsolicited_jitter(spec, 0.1, 20.0, device=DEVICE)
+                await unsolicited_jitter(ICD, spec, 0.1, 20.0, device=DEVICE)
         async with can_device(refusing) as spec:
             with pytest.raises(BenchError, match="refuses set_unsolicited with code 6"):
-                await unsolicited_jitter(spec, 0.1, 20.0, device=DEVICE)
+                await unsolicited_jitter(ICD, spec, 0.1, 20.0, device=DEVICE)
 
     asyncio.run(main())
 

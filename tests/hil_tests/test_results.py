@@ -14,7 +14,7 @@ from starhil.hil_tests.conformance.report import write_html_report, write_junit_
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.results import prepare_report, write_junit, write_report
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"
@@ -27,7 +27,7 @@ def emulator(text: str) -> EmulatorProcess:
 
 
 def bench(text: str) -> Bench:
-    return Bench(LinkOptions(serial="auto"), load_icd(), emulator=emulator(text))
+    return Bench(LinkOptions(serial="auto"), load_unit(), emulator=emulator(text))
 
 
 def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -> None:

@@ -12,9 +12,9 @@ from starhil.hil_tests.expect import Expectation, Variable
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Command, Read, Sample, Send
 from starhil.hil_tests.session_run import SCRIPT_FOLDER, find_script
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 
-ICD = load_icd()
+ICD = load_unit()
 
 
 @pytest.fixture

@@ -19,11 +19,11 @@ from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.session_run import _printer
 from starhil.protocol.candump import read_candump
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from tests.hil_tests.fake_device import FakeDevice
 
-ICD = load_icd()
+ICD = load_unit()
 
 
 @pytest.fixture

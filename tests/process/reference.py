@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.values import MessageError
 
-ICD = load_icd()
+ICD = load_unit()
 MAX_MESSAGE = 512
 OK_OR_STATE = frozenset({0, 6, 7})
 """Codes of a well-formed telecommand: done, busy, or not in this state."""

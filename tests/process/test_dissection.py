@@ -10,6 +10,7 @@ import pytest
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.protocol.candump import read_candump
 from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.icd import load_unit
 from tests.process.test_sessions import starhil
 from tests.protocol.dissection import dissect
 
@@ -46,7 +47,7 @@ def talk_canopen(hub: str, folder) -> None:
     """Drive the node as a master does: heartbeat, PDOs by event and by SYNC, a block upload, an abort."""
     host, _, port = hub.removeprefix("socketcand:").partition("/")[0].rpartition(":")
     eds = folder / "unit.eds"
-    eds.write_text(build_eds(build_dictionary()), encoding="ascii")
+    eds.write_text(build_eds(build_dictionary(load_unit())), encoding="ascii")
     network = canopen.Network()
     network.connect(interface="socketcand", host=host, port=int(port), channel="vcan0")
     try:

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from starhil.protocol.candump import read_candump
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 
 STARHIL = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()"]
 
@@ -33,7 +33,7 @@ def test_export_writes_stdout_or_a_whole_file(tmp_path: Path) -> None:
 
 def test_list_tells_every_row_and_parameter() -> None:
     done = json.loads(starhil("icd", "list", "--json").stdout)
-    icd = load_icd()
+    icd = load_unit()
     assert [(row["id"], row["name"], row["size"]) for row in done["rows"]] == [
         (r.id, r.name, r.size) for r in icd.rows
     ]

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starhil.protocol.export import export
-from starhil.protocol.icd import IcdError, load_icd
+from starhil.protocol.icd import IcdError, load_unit
 from starhil.protocol.values import Section
 from starid.attitude import Attitude
 
-ICD = load_icd()
+ICD = load_unit()
 SECTIONS = {section.heading: section for section in ICD.sections}
 DIGITS = 0.6e-7
 
@@ -128,4 +128,4 @@ def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
         '[[section]]\nheading = "Frames"\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
     )
     with pytest.raises(IcdError, match="section Frames: row 2 has 1 cells, must have 2"):
-        load_icd(tmp_path)
+        load_unit(tmp_path)

@@ -23,11 +23,11 @@ from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames,
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FORMATS, export
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.values import Value, to_f32
 
-ICD = load_icd()
+ICD = load_unit()
 TELEMETRY = [row for row in ICD.rows if row.kind == "telemetry"]
 TELECOMMANDS = [row for row in ICD.rows if row.kind == "telecommand"]
 OBC, DEVICE = 1, 4
@@ -386,13 +386,13 @@ def test_an_unknown_format_is_told() -> None:
 
 
 def test_a_changed_row_changes_every_export(tmp_path: Path) -> None:
-    from starhil.protocol.icd import default_icd_path
+    from starhil.protocol.unit_folders import find_unit
 
-    for file in default_icd_path().glob("*.toml"):
+    for file in find_unit("cubestar").glob("*.toml"):
         (tmp_path / file.name).write_text(
             file.read_text().replace('name = "sample_period"', 'name = "frame_interval"')
         )
-    changed = load_icd(tmp_path)
+    changed = load_unit(tmp_path)
     for name in FORMATS:
         if name != "eds":  # the object dictionary places rows of the definition by its own file
             assert "frame_interval" in export(changed, name).lower()

@@ -22,7 +22,7 @@ from starhil.protocol.can_framing import (
 )
 from starhil.protocol.candump import format_candump, parse_candump
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import (
@@ -37,7 +37,7 @@ from starhil.protocol.socketcand import CommandSplitter, format_frame, format_se
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "100000"))
 SEED = 20260103
 MAX_SIZE = 80
-ICD = load_icd()
+ICD = load_unit()
 
 SPECIAL = bytes((0x1F, 0x7F, 0xFF, 0x07, 0x0F, 0x2F, 0x4F, 0x00, 0x77, 0x3C, 0x3E, 0x20))
 

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import UnknownNameError, default_icd_path, load_icd
+from starhil.protocol.icd import UnknownNameError, load_unit
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
 
-ICD = load_icd()
+ICD = load_unit()
 ROWS = list(ICD.rows)
 
 # identifier -> bytes of data, as public flight software has them
@@ -329,7 +330,7 @@ fields = [{ name = "n", FIELD }]
     size = "4" if "f32" in field else "2"
     (tmp_path / "a.toml").write_text(text.replace("FIELD", field).replace("SIZE", size))
     with pytest.raises(IcdError, match=said):
-        load_icd(tmp_path)
+        load_unit(tmp_path)
 
 
 def test_telemetry_saturates_as_the_unit_does() -> None:
@@ -455,22 +456,22 @@ def test_a_bad_definition_is_refused_by_file_and_row(tmp_path: Path, text: str, 
     file = tmp_path / "bad.toml"
     file.write_text(text)
     with pytest.raises(IcdError, match=message) as caught:
-        load_icd(file)
+        load_unit(file)
     assert str(caught.value).startswith(str(file))
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_or_empty_definition_is_told(tmp_path: Path) -> None:
-    with pytest.raises(IcdError, match="cannot read"):
-        load_icd(tmp_path / "none.toml")
+    with pytest.raises(IcdError, match="neither a folder nor a unit"):
+        load_unit(tmp_path / "none.toml")
     with pytest.raises(IcdError, match=r"no \.toml file"):
-        load_icd(tmp_path)
+        load_unit(tmp_path)
 
 
 def test_the_definition_may_be_a_folder_or_one_file(tmp_path: Path) -> None:
-    text = "".join(file.read_text() for file in sorted(default_icd_path().glob("*.toml")))
+    text = "".join(file.read_text() for file in sorted(find_unit("cubestar").glob("*.toml")))
     file = tmp_path / "all.toml"
     file.write_text(text)
-    assert [(row.id, row.name, row.size) for row in load_icd(file).rows] == [
+    assert [(row.id, row.name, row.size) for row in load_unit(file).rows] == [
         (row.id, row.name, row.size) for row in ROWS
     ]

@@ -13,10 +13,9 @@ from starhil.emulator.truth.file import read_truth_file
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.truth_log import TruthLogReader
-from starhil.protocol.canopen.layout import load_layout
 from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.user_file import UnsuitableFileError, read_user_file, read_user_text
 
 READERS = {
@@ -24,9 +23,8 @@ READERS = {
     "truth of a session": lambda path: TruthLogReader(path).at(0.0),
     "profile": lambda path: load_profile(str(path)),
     "scenario": lambda path: load_scenario(str(path)),
-    "session script": lambda path: load_script(path, load_icd()),
-    "interface definition": load_icd,
-    "CANopen layout": load_layout,
+    "session script": lambda path: load_script(path, load_unit()),
+    "interface definition": load_unit,
     "CANopen storage": lambda path: FileStorage(path).load("communication"),
 }
 

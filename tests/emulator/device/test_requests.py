@@ -6,19 +6,19 @@ from starhil.emulator.device.requests import missing_handlers
 from starhil.emulator.device.telecommands import TELECOMMANDS
 from starhil.emulator.device.telemetry import TELEMETRY
 from starhil.emulator.profile import Profile
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 
 def test_every_row_of_the_definition_is_served():
-    icd = load_icd()
+    icd = load_unit()
     assert missing_handlers(icd) == []
     assert set(TELEMETRY) == set(icd.telemetry)
     assert set(TELECOMMANDS) == set(icd.telecommands)
 
 
 @pytest.mark.parametrize("mode", ["standby", "lost_in_space"])
-@pytest.mark.parametrize("name", load_icd().telemetry)
+@pytest.mark.parametrize("name", load_unit().telemetry)
 def test_every_telemetry_row_answers_in_every_state(make_bench, name, mode):
     bench = make_bench().start()
     bench.command("set_mode", mode=mode)

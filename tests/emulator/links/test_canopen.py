@@ -22,7 +22,7 @@ from starhil.emulator.links.canopen import (
 )
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import FileStorage, MemoryStorage, NmtState
-from starhil.protocol.icd import load_icd
+from starhil.protocol.icd import load_unit
 from starhil.protocol.transports.base import Transport
 
 NODE = 44
@@ -368,7 +368,7 @@ def test_heartbeats_go_on_whatever_their_deadlines_add_up_to(linked, period_ms):
 
 
 def test_rows_that_make_events_exist():
-    icd = load_icd()
+    icd = load_unit()
     assert {*FRAME_ROWS, STATUS_ROW} <= set(icd.telemetry)
 
 

@@ -26,6 +26,7 @@ from starhil.protocol.canopen import (
     build_dictionary,
 )
 from starhil.protocol.canopen.storage import ParameterStorage
+from starhil.protocol.icd import load_unit
 
 NODE = 0x2C
 
@@ -34,7 +35,7 @@ class Bench:
     """One slave, a manual clock, and the frames and events of the slave."""
 
     def __init__(self, node_id: int = NODE, storage: ParameterStorage | None = None, **options) -> None:
-        self.dictionary: DeviceDictionary = build_dictionary()
+        self.dictionary: DeviceDictionary = build_dictionary(load_unit())
         self.application = StandInApplication(self.dictionary.icd)
         self.dictionary.application = self.application
         self.storage = storage
@@ -193,7 +194,7 @@ def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
 
 def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
     """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
-    dictionary = package.build_dictionary()
+    dictionary = package.build_dictionary(load_unit())
 
     class RestlessApplication(package.StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""

@@ -9,6 +9,7 @@ import pytest
 
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.icd import load_unit
 
 NODE = 0x2C
 
@@ -78,7 +79,7 @@ LIBRARY_FAULTS = {
 
 @pytest.fixture(scope="module")
 def library_outcomes(run_conformance, read_eds):
-    eds = build_eds(build_dictionary())
+    eds = build_eds(build_dictionary(load_unit()))
     return run_conformance(LibraryNodeBus(read_eds(eds)), eds)
 
 

@@ -11,15 +11,15 @@ from starhil.protocol.canopen import (
     build_dictionary,
     check_status,
 )
-from starhil.protocol.canopen.layout import CanopenModel, load_layout
-from starhil.protocol.icd import load_icd
+from starhil.protocol.canopen.layout import CanopenModel, read_layout
+from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError
 
-ICD = load_icd()
+ICD = load_unit()
 
 
 def test_every_row_stands_at_its_identifier():
-    entries = build_dictionary().entries
+    entries = build_dictionary(load_unit()).entries
     assert {subindex for index, subindex in entries if index == 0x2000} == {0, *(row.id for row in ICD.rows)}
 
 
@@ -45,7 +45,7 @@ def test_telemetry_rows_are_those_of_the_other_links(bench, row):
     "index", [0x6001, 0x6002, 0x6003, 0x6010, 0x6030, 0x6031, 0x6032, 0x6033, 0x6041, 0x6050]
 )
 def test_fields_of_a_record_are_the_rows_bytes(bench, index):
-    name = next(item.telemetry for item in load_layout().object if item.index == index)
+    name = next(item.telemetry for item in read_layout(ICD).object if item.index == index)
     row = ICD.telemetry[name]
     bench.application.rows[name] = row.example()
     data = row.encode(row.example())
@@ -113,7 +113,7 @@ def test_status_ok_passes():
 
 
 def layout(**changes) -> CanopenModel:
-    document = load_layout().model_dump(by_alias=True)
+    document = read_layout(ICD).model_dump(by_alias=True)
     return CanopenModel.model_validate(document | changes)
 
 
@@ -153,26 +153,22 @@ def test_layouts_that_do_not_fit_the_definition(changes, text):
         DeviceDictionary(ICD, layout(**changes))
 
 
+UNIT_HEAD = '[definition]\nname = "x"\nversion = "1"\ndoc = "x"\n'
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("[canopen\n", "not valid TOML"),
-        ("[canopen]\n", "device_type"),
-        ("[canopen]\ndevice_type = 'x'\n", "device_type"),
+        ("", "has no CANopen"),
+        ("[canopen]\n", "canopen.device_type"),
+        ("[canopen]\ndevice_type = 'x'\n", "canopen.device_type"),
     ],
 )
-def test_layout_files_that_cannot_be_read(tmp_path, text, reason):
-    path = tmp_path / "canopen.toml"
-    path.write_text(text, encoding="ascii")
+def test_layouts_that_cannot_be_read(tmp_path, text, reason):
+    path = tmp_path / "unit.toml"
+    path.write_text(UNIT_HEAD + text, encoding="ascii")
     with pytest.raises(IcdError, match=reason):
-        load_layout(path)
-    with pytest.raises(IcdError, match=reason):
-        load_layout(tmp_path)
-
-
-def test_layout_file_that_is_not_there(tmp_path):
-    with pytest.raises(IcdError, match="No such file"):
-        load_layout(tmp_path / "other.toml")
+        read_layout(load_unit(path))
 
 
 def test_object_of_two_kinds():

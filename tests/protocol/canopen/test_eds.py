@@ -15,12 +15,13 @@ import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.icd import load_unit
 
 
 @pytest.fixture(scope="module")
 def eds(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("eds") / "star-sensor.eds"
-    path.write_text(build_eds(build_dictionary()), encoding="ascii")
+    path.write_text(build_eds(build_dictionary(load_unit())), encoding="ascii")
     return path
 
 
@@ -60,12 +61,12 @@ def test_lely_sees_the_default_mappings(eds):
 
 
 def test_same_dictionary_gives_the_same_text(eds):
-    assert build_eds(build_dictionary()) == eds.read_text(encoding="ascii")
+    assert build_eds(build_dictionary(load_unit())) == eds.read_text(encoding="ascii")
 
 
 def test_data_sheet_and_dictionary_have_the_same_objects(od):
     listed = {(item.index, item.subindex) for item in variables(od) if item.index >= 0x1000}
-    assert listed == set(build_dictionary().entries)
+    assert listed == set(build_dictionary(load_unit()).entries)
 
 
 def test_data_sheet_describes_what_is_served(bench, od):
@@ -111,7 +112,7 @@ def test_lists_cover_every_object_once(eds):
     for section in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
         count = parser.getint(section, "SupportedObjects")
         listed += [int(parser.get(section, str(number)), 0) for number in range(1, count + 1)]
-    assert sorted(listed) == sorted({index for index, _ in build_dictionary().entries})
+    assert sorted(listed) == sorted({index for index, _ in build_dictionary(load_unit()).entries})
 
 
 def test_data_sheet_is_served_by_the_node(bench, eds):

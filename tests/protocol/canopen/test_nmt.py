@@ -6,6 +6,7 @@ import pytest
 
 from starhil.protocol.canopen import CanopenSlave, NmtState, build_dictionary
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_unit
 
 HEARTBEAT_LOST = bytes.fromhex("3081 11")
 
@@ -71,7 +72,7 @@ def test_reset_communication_restores_communication_only(bench):
 @pytest.mark.parametrize("node_id", [0, 128, 254, -1, 300])
 def test_node_id_that_is_none(node_id):
     with pytest.raises(ProtocolError, match="node-ID"):
-        CanopenSlave(build_dictionary(), node_id)
+        CanopenSlave(build_dictionary(load_unit()), node_id)
 
 
 # Heartbeat producer
