@@ -345,6 +345,7 @@ def pipeline_setup(profile: Profile) -> PipelineSetup:
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped",
         dark_frames=profile.device.dark_frames,
+        images=profile.images.resolved(profile.folder),
     )
 
 

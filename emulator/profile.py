@@ -9,9 +9,9 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, PrivateAttr, ValidationError, field_validator
+from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import read_toml
@@ -153,6 +153,34 @@ class RadiationConfig(Strict):
     """Particles per second in addition in its centre at an altitude of 500 km; needs a truth with a position."""
 
 
+class ImagesConfig(Strict):
+    """Images from elsewhere in place of rendered ones; `[camera]` is then the camera that takes them."""
+
+    folder: str = ""
+    """Folder of PNG, TIFF or JPEG images, taken in the order of their names; relative to the profile's folder."""
+    capture: Annotated[int, Field(ge=0, le=99)] | str = ""
+    """Number of a camera (0 is the first), or a video file, as OpenCV's `VideoCapture` opens it."""
+    repeat: bool = True
+    """Begin the folder again after its last image."""
+    dark: str = ""
+    """Image of the same camera and exposure without light, to subtract from each."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.folder and self.capture != "":
+            raise ValueError("folder and capture exclude each other; give one of them")
+        return self
+
+    def resolved(self, relative_to: Path) -> dict[str, Any]:
+        """Return the keys, with paths relative to a folder resolved."""
+        files = {
+            key: str(relative_to / Path(value).expanduser())
+            for key, value in (("folder", self.folder), ("dark", self.dark))
+            if value
+        }
+        return {**self.model_dump(), "capture": str(self.capture), **files}
+
+
 class TimingConfig(Strict):
     """Processing times of the emulated unit: reported in telemetry, and elapsed before a result is published."""
 
@@ -237,6 +265,8 @@ class Profile(Strict):
     """True attitude of the sensor."""
     orbit: OrbitConfig | None = None
     """True orbit of the spacecraft; none: the sensor is at the Earth's centre, and the Earth is not in its sky."""
+    images: ImagesConfig = ImagesConfig()
+    """Images from elsewhere."""
     device: DeviceConfig = DeviceConfig()
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()

@@ -41,6 +41,8 @@ class PipelineSetup:
         that a run on the stepped clock is reproducible byte for byte.
     dark_frames
         Frames averaged into the dark frame that is subtracted from each image; 0: none.
+    images
+        Images from elsewhere in place of rendered ones: keys of a profile's `[images]`.
     """
 
     camera: dict[str, Any]
@@ -53,6 +55,7 @@ class PipelineSetup:
     seed: int
     build_in_background: bool = False
     dark_frames: int = 0
+    images: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
 from starhil.emulator.pipeline.binning import mean_over_squares
 from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
+from starhil.emulator.pipeline.image_source import ImageSource, open_images, used_bits
 from starhil.emulator.pipeline.messages import (
     IDENTITY,
     ZERO,
@@ -32,7 +33,7 @@ from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_he
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
-from starhil.emulator.sensor.renderer import Frame, Renderer
+from starhil.emulator.sensor.renderer import Renderer
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -68,13 +69,27 @@ def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Fail
     begin = time.perf_counter()
     try:
         pipeline = Pipeline(setup)
+        images = open_images(setup.images, pipeline.camera)
+        if images is not None:
+            images.image(0)  # one of another size fails before the long start
         pipeline.warm_up()
+        pipeline.images = images
     except (EmulatorError, StaridError) as error:
         return Failure(str(error))
     except Exception as error:  # noqa: BLE001 (reported in one line instead of the worker's traceback)
         return Failure(f"pipeline: internal error: {one_line(error)}")
     warm = PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), time.perf_counter() - begin)
     return pipeline, warm
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    """An image, the number of bits it uses, the number of its exposure, and the bodies in its field."""
+
+    image: NDArray[Any]
+    bits: int
+    index: int
+    in_field: tuple[str, ...] = ()
 
 
 class Pipeline:
@@ -90,7 +105,9 @@ class Pipeline:
             lambda wanted: wanted.make(self.catalog), in_background=setup.build_in_background
         )
         self._sky = SkyObjects.from_dict(setup.sky)
-        self._last: Frame | None = None
+        self._last: _Exposure | None = None
+        self.images: ImageSource | None = None
+        """Where images come from; None: they are rendered."""
         self._dark: DarkMap | None = None
 
     def warm_up(self) -> None:
@@ -122,7 +139,7 @@ class Pipeline:
         if helper is not None:
             for rate in _WARM_UP_RATES_RAD_S:
                 frame = self._renderer.render(Attitude.identity(), rate)
-                detect(frame.image, detection_settings(self._sensor, settings))
+                detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
             helper.wait()  # kernels it compiled are loaded below; any others are compiled there
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
             self._process_frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
@@ -144,8 +161,29 @@ class Pipeline:
         sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
         if sensor.gain != self._renderer.sensor.gain:
             self._renderer = self._renderer.with_sensor(sensor)
-        attitude = Attitude(np.array(request.attitude_xyzw))
-        sky = self._sky_of(request)
+        exposure = self._last = self._expose(request)
+        rendered = time.perf_counter()
+        if not request.solve:
+            return FrameResult(request.index, solved=False, render_s=rendered - begin)
+        if self.images is None:
+            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
+        else:
+            image, known = exposure.image, DetectionSettings()
+        found = detect(image, detection_settings(known, request.settings))
+        detected = time.perf_counter()
+        identifier, current = self._identifiers.get(self._identifier_setup(request))
+        solution = self._solve(identifier, found, request)
+        solved = time.perf_counter()
+        result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        result = with_bodies(result, exposure.in_field)
+        return result if current else replace(result, index_pending=True)
+
+    def _expose(self, request: FrameRequest) -> _Exposure:
+        """Take the next image: from elsewhere, or rendered."""
+        if self.images is not None:
+            image = self.images.image(request.index)
+            return _Exposure(image, used_bits(image), request.index)
+        attitude, sky = Attitude(np.array(request.attitude_xyzw)), self._sky_of(request)
         frame = self._renderer.render(
             attitude,
             request.rate_rad_s,
@@ -154,19 +192,8 @@ class Pipeline:
             temperature_c=request.temperature_c,
             objects=sky,
         )
-        self._last = frame
-        rendered = time.perf_counter()
-        if not request.solve:
-            return FrameResult(request.index, solved=False, render_s=rendered - begin)
-        image = self._without_dark(frame.image, request)
-        found = detect(image, detection_settings(sensor, request.settings))
-        detected = time.perf_counter()
-        identifier, current = self._identifiers.get(self._identifier_setup(request))
-        solution = self._solve(identifier, found, request)
-        solved = time.perf_counter()
-        result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
-        result = with_bodies(result, bodies_in_field(sky, attitude, self.camera))
-        return result if current else replace(result, index_pending=True)
+        in_field = bodies_in_field(sky, attitude, self.camera)
+        return _Exposure(frame.image, self._sensor.bits, frame.frame_index, in_field)
 
     def _sky_of(self, request: FrameRequest) -> SkyObjects:
         """Return the sky of a frame: that of the profile, with faults and the particles of its place."""
@@ -270,7 +297,7 @@ class Pipeline:
     def _scaled_image(self, request: ImageRequest) -> ImageResult:
         if self._last is None:
             return ImageResult(0, 0, -1, b"")
-        image, bits, frame = self._last.image, self._sensor.bits, self._last.frame_index
+        image, bits, frame = self._last.image, self._last.bits, self._last.index
         if request.edge == 0:
             height, width = image.shape
             return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
@@ -287,9 +314,10 @@ def _within_margin(
     return int(np.count_nonzero(offset_px <= settings.validation_margin))
 
 
-def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
-    """Return the detection settings for the device's parameters."""
-    return sensor.detection_settings(
+def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:
+    """Return what is known of the image, with the thresholds of the device's parameters."""
+    return replace(
+        known,
         threshold_sigma=settings.detection_threshold,
         pixel_sigma=settings.star_threshold,
         min_star_pixels=settings.min_star_pixels,
