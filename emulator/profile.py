@@ -258,7 +258,7 @@ class Profile(Strict):
     sensor: dict[str, Any] = Field(default_factory=dict)
     """Fields of `starhil.emulator.sensor.model.SensorModel`, except those that are device parameters."""
     sky: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `starhil.emulator.sky.objects.SkyObjects`: Moon, Sun, Earth, planets, false stars …"""
+    """Date and bodies (`starhil.emulator.sky.view.Sky`), and fields of `starhil.emulator.sky.objects.SkyObjects`."""
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the star identification algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")

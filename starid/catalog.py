@@ -14,6 +14,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starid.aberration import aberrated
 from starid.cache import cached_tables
 from starid.errors import StaridError
 from starid.hipparcos import EPOCH, default_path, read_hip2
@@ -126,6 +127,15 @@ class StarCatalog:
     def brighter_than(self, limit: float, band: Band = "v") -> StarCatalog:
         """Return the stars with magnitude ≤ limit."""
         return self.within(faintest=limit, band=band)
+
+    def aberrated(self, velocity_m_s: ArrayLike | None) -> StarCatalog:
+        """Return the stars where a moving observer sees them (`starid.aberration.aberrated`); None: unchanged."""
+        if velocity_m_s is None:
+            return self
+        vectors = aberrated(self.vectors, velocity_m_s)
+        ra = np.arctan2(vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi)
+        dec = np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1]))
+        return dataclasses.replace(self, vectors=vectors, ra_rad=ra, dec_rad=dec)
 
     def in_cone(self, direction: ArrayLike, radius_rad: float) -> NDArray[np.intp]:
         """Return the indices, ascending, of the stars within an angle of a direction.

@@ -43,12 +43,26 @@ def terrestrial_time(unix_s: float) -> tuple[float, float]:
     return UNIX_EPOCH_JD + days, seconds / DAY_S
 
 
+def julian_year(unix_s: float) -> float:
+    """Julian year of a Unix time, as epochs of star positions are given."""
+    first, rest = terrestrial_time(unix_s)
+    return 2000.0 + ((first - 2_451_545.0) + rest) / 365.25
+
+
 def earth_state(unix_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Barycentric position (3,), m, and velocity (3,), m/s, of the Earth's centre, ICRS (`erfa.epv00`)."""
     import erfa
 
     _, barycentric = erfa.epv00(*terrestrial_time(unix_s))
     return in_metres(barycentric)
+
+
+def sun_position(unix_s: float) -> NDArray[np.float64]:
+    """Barycentric position (3,) of the Sun's centre, ICRS, m."""
+    import erfa
+
+    heliocentric, barycentric = erfa.epv00(*terrestrial_time(unix_s))
+    return in_metres(barycentric)[0] - in_metres(heliocentric)[0]
 
 
 def earth_velocity(unix_s: float) -> NDArray[np.float64]:

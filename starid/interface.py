@@ -6,7 +6,7 @@ import importlib
 from typing import Any, Final, Protocol, cast, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -60,6 +60,8 @@ class StarIdentifier(Protocol):
         xy_px: NDArray[np.float64],
         flux: NDArray[np.float64],
         xy_sigma_px: NDArray[np.float64] | None = None,
+        *,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Find the attitude without any prior knowledge (lost in space).
 
@@ -72,6 +74,10 @@ class StarIdentifier(Protocol):
         xy_sigma_px : array (n,) or (n, 2), optional
             One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
             the residuals by default.
+        observer_velocity : array (3,), optional
+            Velocity of the camera relative to the barycentre of the solar system, ICRS, m/s: the attitude is
+            then free of aberration (`starid.aberration`). By default the directions of the stars are taken as
+            those of the catalogue.
         """
         ...
 
@@ -83,12 +89,13 @@ class StarIdentifier(Protocol):
         xy_sigma_px: NDArray[np.float64] | None = None,
         *,
         window_px: float | None = None,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `identify`.
         predicted : Attitude or array (4,)
             Predicted attitude at the time of the exposure, or its scalar-last quaternion.

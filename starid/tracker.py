@@ -75,12 +75,13 @@ class Tracker:
         xy_sigma_px: NDArray[np.float64] | None = None,
         *,
         rate_hint_rad_s: ArrayLike | None = None,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Identify the detections of one image.
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `StarIdentifier.identify`.
         time_s : float
             Time of the exposure, seconds on any monotonic clock.
@@ -98,10 +99,17 @@ class Tracker:
         predicted = self.predict(time_s)
         solution: Solution | None = None
         if predicted is not None:
-            solution = self.identifier.track(xy_px, flux, predicted, xy_sigma_px, window_px=self._window_px)
+            solution = self.identifier.track(
+                xy_px,
+                flux,
+                predicted,
+                xy_sigma_px,
+                window_px=self._window_px,
+                observer_velocity=observer_velocity,
+            )
         if solution is None or not solution.valid:
             spent = 0.0 if solution is None else solution.elapsed
-            solution = self.identifier.identify(xy_px, flux, xy_sigma_px)
+            solution = self.identifier.identify(xy_px, flux, xy_sigma_px, observer_velocity=observer_velocity)
             solution = dataclasses.replace(solution, elapsed=solution.elapsed + spent)
         if solution.valid:
             gap = time_s - self._time_s

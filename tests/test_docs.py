@@ -17,9 +17,11 @@ import can
 import pytest
 
 from starhil.emulator.device.parameters import Parameters
+from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sky.view import Sky
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import PrivateCanBus
 from starhil.hil_tests.raw_traffic import format_frame
@@ -76,6 +78,18 @@ def without_numbers(text: str) -> str:
 
 def numbers(text: str) -> list[float]:
     return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
+
+
+def test_the_examples_of_the_sky_are_valid_and_run(tmp_path):
+    found = blocks("sky.md")
+    for block in found:
+        if block.language == "toml":
+            path = tmp_path / "profile.toml"
+            path.write_text(block.text, encoding="utf-8")
+            sky = Sky(pipeline_setup(load_profile(str(path))).sky)
+            assert sky.by_date
+    (program,) = (block for block in found if block.language == "python")
+    run(program, {})
 
 
 def test_icd_is_the_present_export():

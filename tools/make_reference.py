@@ -43,7 +43,16 @@ UNITS: Final = {
 }
 """Units of keys whose names do not end in one."""
 
-SUFFIXES: Final = {"_deg_s2": "°/s²", "_deg_s": "°/s", "_deg": "°", "_px": "px", "_s": "s"}
+SUFFIXES: Final = {
+    "_deg_s2": "°/s²",
+    "_deg_s": "°/s",
+    "_m_s": "m/s",
+    "_km": "km",
+    "_m": "m",
+    "_deg": "°",
+    "_px": "px",
+    "_s": "s",
+}
 """End of a key → unit, longest first."""
 
 OF_PARAMETERS: Final = ("exposure_s", "gain")
@@ -230,6 +239,16 @@ def truth() -> str:
         f"### An attitude\n\n{plain_text(AttitudeConfig.__doc__ or '')}\n\n{table(model_rows(AttitudeConfig))}"
     )
     return "\n\n".join(parts)
+
+
+def orbit() -> str:
+    """The ways to give an orbit."""
+    from starhil.emulator.truth.config import OrbitConfig
+
+    return "\n\n".join(
+        f'### `kind = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
+        for model in models_in(OrbitConfig)
+    )
 
 
 def kind_of(model: type[BaseModel]) -> str:
@@ -419,6 +438,7 @@ TABLES: Final[dict[str, Callable[[], str]]] = {
     "commands": commands,
     "faults": faults,
     "identifier": identifier,
+    "orbit": orbit,
     "profile": profile,
     "scenario": scenario,
     "sensor": sensor,

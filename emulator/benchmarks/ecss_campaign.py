@@ -11,7 +11,7 @@ import hashlib
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,8 +19,9 @@ import numpy as np
 
 from starhil.emulator.benchmarks.campaign import WRONG_DEG, open_store
 from starhil.emulator.benchmarks.hard_sky import direction_around
-from starhil.emulator.device.cycle import as_quaternion
-from starhil.emulator.device.device import profile_defaults
+from starhil.emulator.device.cycle import as_quaternion, as_triple
+from starhil.emulator.device.device import orbit_of, profile_defaults
+from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.emulation import camera_constants, pipeline_setup
@@ -45,6 +46,8 @@ _RATE_DIGITS: Final = 9
 REST: Final = "rest"
 STATIC: Final = "static"
 THERMAL: Final = "thermal"
+DATED: Final = "dated"
+YEAR_S: Final = 365.25 * 86_400.0
 INFLUENCES: Final = {
     "rate": ("body rate", "°/s", RATES_DEG_S),
     "sun": ("Sun from the boresight", "°", SUN_DEG),
@@ -72,6 +75,8 @@ class EcssPlan:
         Directions of the sky, sub-pixel positions in each, and frames at each position, for the kinds of error.
     thermal_fields, thermal_points
         Directions, and points of the orbit at which each is seen, for the thermo-elastic error.
+    dated_fields, dates, dated_repeats
+        Directions, dates over a year at which each is seen, and frames at each, for the aberration residual.
     rest_frames
         Frames at random attitudes and points of the orbit, at rest.
     frames
@@ -88,6 +93,9 @@ class EcssPlan:
     repeats: int = 4
     thermal_fields: int = 24
     thermal_points: int = 12
+    dated_fields: int = 40
+    dates: int = 6
+    dated_repeats: int = 2
     rest_frames: int = 2000
     frames: int = 100
     chunk: int = 50
@@ -96,13 +104,14 @@ class EcssPlan:
         """Return all conditions of the campaign."""
         static = Condition(STATIC, STATIC, 0.0, self.fields * self.positions * self.repeats)
         thermal = Condition(THERMAL, THERMAL, 0.0, self.thermal_fields * self.thermal_points)
+        dated = Condition(DATED, DATED, 0.0, self.dated_fields * self.dates * self.dated_repeats)
         rest = Condition(REST, REST, 0.0, self.rest_frames)
         varied = [
             Condition(f"{name}-{value:g}", name, value, self.frames)
             for name, (_, _, values) in INFLUENCES.items()
             for value in values
         ]
-        return [static, thermal, rest, *varied]
+        return [static, thermal, dated, rest, *varied]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +139,7 @@ class _Shot:
     """Point of the orbit, as a share of it; None: at the mean temperature."""
     sky: dict[str, Any] = field(default_factory=dict)
     particles_s: float = 0.0
+    unix_s: float | None = None
     field_number: int = 0
     condition_number: int = 0
 
@@ -141,8 +151,12 @@ class EcssDevice:
         self.plan = plan
         profile = load_profile(plan.profile, [*plan.overrides, "run.clock=stepped", f"run.seed={plan.seed}"])
         icd = load_unit(profile.unit_source)
-        self.pipeline = Pipeline(pipeline_setup(profile))
-        parameters = Parameters(icd, profile_defaults(profile, icd))
+        setup = pipeline_setup(profile)
+        # without a date in its request a frame has no aberration, and bodies only where a condition puts them
+        sky = {**setup.sky, "bodies": "typed", "aberration": True}
+        self.pipeline = Pipeline(replace(setup, sky=sky))
+        self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
+        parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))
         ready = PipelineReady(self.pipeline.camera.to_dict(), len(self.pipeline.catalog), 0.0)
         constants = camera_constants(ready)
         parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
@@ -152,7 +166,7 @@ class EcssDevice:
         self.exposure_s = float(parameters["exposure"]) / 1000.0
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])
-        self.sky = dict(profile.sky)
+        self.sky = dict(setup.sky)
         timing, thermal = profile.timing, profile.thermal
         busy_s = self.exposure_s + timing.readout_s + timing.detect_s + timing.identify_tracking_s
         period_s = max(1.0 / float(parameters["update_rate"]), exposure_period_s(parameters))
@@ -168,11 +182,10 @@ class EcssDevice:
         temperature_c = self.mean_c
         if shot.point is not None:
             temperature_c += self.swing_c * math.sin(2.0 * math.pi * shot.point)
-        x, y, z = shot.rate_rad_s.tolist()
         request = FrameRequest(
             index=condition.stream * 1_000_000 + number,
             attitude_xyzw=as_quaternion(shot.attitude),
-            rate_rad_s=(x, y, z),
+            rate_rad_s=as_triple(shot.rate_rad_s),
             exposure_s=self.exposure_s,
             gain=self.gain,
             settings=self.settings,
@@ -180,10 +193,24 @@ class EcssDevice:
             temperature_c=temperature_c,
             particles_s=shot.particles_s,
         )
+        if shot.unix_s is not None:
+            request = self._dated(request, shot.unix_s)
         result = self.pipeline.handle(request)
         if not isinstance(result, FrameResult):
             raise EmulatorError(f"campaign: profile {self.plan.profile}: {getattr(result, 'text', result)}")
         return shot, result
+
+    def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
+        """Return the request of a frame at a date, with the orbit and the device's own velocity."""
+        state = None if self.orbit is None else self.orbit.state(unix_s)
+        own = observer_velocity(self.parameters, unix_s)
+        return replace(
+            request,
+            unix_s=unix_s,
+            position_m=None if state is None else as_triple(state.position_m),
+            velocity_m_s=None if state is None else as_triple(state.velocity_m_s),
+            observer_velocity=None if own is None else as_triple(own),
+        )
 
     def field_attitude(self, condition: Condition, number: int) -> Attitude:
         """Return the attitude of a numbered field, the same for all frames of it."""
@@ -202,13 +229,24 @@ def _static(device: EcssDevice, condition: Condition, number: int, _rng: np.rand
     chosen = np.random.default_rng((plan.seed, condition.stream, position, 2))
     shift = chosen.uniform(-0.5, 0.5, 2) * device.pipeline.camera.pixel_scale_rad
     attitude = device.field_attitude(condition, field_number).rotated((*shift, 0.0))
-    return _Shot(attitude, np.zeros(3), None, {}, 0.0, field_number, condition_number)
+    return _Shot(attitude, np.zeros(3), None, {}, 0.0, None, field_number, condition_number)
 
 
 def _thermal(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
     field_number, point = divmod(number, device.plan.thermal_points)
     attitude = device.field_attitude(condition, field_number)
-    return _Shot(attitude, np.zeros(3), point / device.plan.thermal_points, {}, 0.0, field_number, point)
+    return _Shot(
+        attitude, np.zeros(3), point / device.plan.thermal_points, {}, 0.0, None, field_number, point
+    )
+
+
+def _on_a_date(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+    plan = device.plan
+    seen, _ = divmod(number, plan.dated_repeats)
+    field_number, date = divmod(seen, plan.dates)
+    attitude = device.field_attitude(condition, field_number)
+    unix_s = device.start_unix_s + YEAR_S * date / plan.dates
+    return _Shot(attitude, np.zeros(3), None, {}, 0.0, unix_s, field_number, date)
 
 
 def _turning(_device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator) -> _Shot:
@@ -251,6 +289,7 @@ def _particles(device: EcssDevice, condition: Condition, number: int, rng: np.ra
 _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generator], _Shot]]] = {
     STATIC: _static,
     THERMAL: _thermal,
+    DATED: _on_a_date,
     REST: _at_rest,
     "rate": _turning,
     "sun": _near("sun"),

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.ecss_campaign import INFLUENCES, REST, STATIC, THERMAL, EcssPlan
+from starhil.emulator.benchmarks.ecss_campaign import DATED, INFLUENCES, REST, STATIC, THERMAL, EcssPlan
 from starhil.emulator.benchmarks.ecss_errors import (
     ErrorLine,
     ErrorSeries,
@@ -135,13 +135,13 @@ def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confi
             *static_errors(static, confidence)[:1],
             thermo_elastic_error(_series(joined[THERMAL]), confidence),
             *static_errors(static, confidence)[1:],
-            aberration_residual(None, static, confidence),
+            aberration_residual(_series(joined[DATED]), static, confidence),
         ),
         measured,
         tuple(
             _outcomes(condition.influence, condition.value, joined[condition.name])
             for condition in plan.conditions()
-            if condition.influence not in (STATIC, THERMAL)
+            if condition.influence not in (STATIC, THERMAL, DATED)
         ),
         float(np.median(rest["labels"][:, 2])),
     )
@@ -195,7 +195,7 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
         "",
         (
             f"From {plan.fields} fields of the sky at {plan.positions} sub-pixel positions with {plan.repeats} frames each, and "
-            f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit. An error that does not stand out from the noise "
+            f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit and {plan.dated_fields} on {plan.dates} dates of a year. An error that does not stand out from the noise "
             "is given as below the smallest that would have. The total is the sum of bias and thermo-elastic error and the root of the "
             f"sum of the squares of the others; the last line is the quantile of {plan.rest_frames} frames at random attitudes."
         ),

@@ -12,6 +12,9 @@ from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from starid.camera import Camera, Model
     from starid.catalog import StarCatalog
     from starid.photograph.solver import ImageSolution
@@ -44,6 +47,22 @@ def command(
     ] = None,
     model: Annotated[str, typer.Option(help="With --fov: pinhole or equidistant.")] = "pinhole",
     epoch: Annotated[float | None, typer.Option(help="Julian year of the image; default 2026.")] = None,
+    date: Annotated[
+        str | None,
+        typer.Option(
+            metavar="UTC",
+            help="Date of the image, e.g. 2026-03-20T21:30: correct the aberration of the Earth's orbit, 20″, and "
+            "take the stars' places of that year.",
+        ),
+    ] = None,
+    observer_velocity: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Velocity of the camera in m/s, ICRS: relative to the Earth's centre with --date, else to the "
+            "barycentre of the solar system.",
+        ),
+    ] = None,
     allow_colour: Annotated[
         bool | None,
         typer.Option(
@@ -70,6 +89,7 @@ def command(
     view and distortion are estimated. Exit status 1 if the stars cannot be identified.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
+    from starid.earth import julian_year
     from starid.imaging.image_io import image_suffix, read_image, write_image
 
     if annotate is not None:
@@ -81,8 +101,12 @@ def command(
         from starid.imaging.dark_frame import dark_excess, without_dark
 
         pixels = without_dark(pixels, dark_excess(read_image(dark, allow_colour=colour)))
-    catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)
-    result = _solve(pixels, catalog, profile, fov, fov_tolerance, model)
+    unix_s = None if date is None else _unix_time(date)
+    if epoch is None:
+        epoch = DEFAULT_EPOCH if unix_s is None else float(round(julian_year(unix_s)))
+    catalog = load_catalog(epoch=epoch)
+    velocity = _velocity(unix_s, observer_velocity)
+    result = _solve(pixels, catalog, profile, fov, fov_tolerance, model, velocity)
     report = _report(image, result, _advice(result, fov, model))
     if annotate is not None:
         write_image(annotate, _marked(pixels, result))
@@ -101,6 +125,7 @@ def _solve(
     fov: str | None,
     fov_tolerance: float | None,
     model: str,
+    observer_velocity: NDArray[np.float64] | None,
 ) -> ImageSolution:
     """Solve an image with the camera that the options select."""
     from starhil.emulator.errors import EmulatorError
@@ -110,7 +135,7 @@ def _solve(
     from starid.photograph.solver import solve_image
 
     if fov is None:
-        return solve_image(pixels, _camera(profile), catalog)
+        return solve_image(pixels, _camera(profile), catalog, observer_velocity=observer_velocity)
     if profile is not None:
         raise EmulatorError("identify: --profile and --fov exclude each other; give one of them")
     if model not in _MODELS:
@@ -120,15 +145,51 @@ def _solve(
             raise EmulatorError(
                 "identify: --fov-tolerance has no effect with --fov auto; leave it out, or give --fov in degrees"
             )
-        return solve_any_field(pixels, catalog, model=_MODELS[model])
+        return solve_any_field(pixels, catalog, model=_MODELS[model], observer_velocity=observer_velocity)
     try:
         width_deg = read_number(fov)
     except ValueError:
         raise EmulatorError(f"identify --fov: {fov!r} given, degrees or {_ANY_FIELD} needed") from None
     camera = Camera.from_fov(width_deg, pixels.shape[1], pixels.shape[0], _MODELS[model])
     return solve_image(
-        pixels, camera, catalog, fov_tolerance=_TOLERANCE if fov_tolerance is None else fov_tolerance
+        pixels,
+        camera,
+        catalog,
+        fov_tolerance=_TOLERANCE if fov_tolerance is None else fov_tolerance,
+        observer_velocity=observer_velocity,
     )
+
+
+def _unix_time(date: str) -> float:
+    """Return the Unix time of `--date`."""
+    from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.truth.config import unix_time
+
+    try:
+        return unix_time(date)
+    except ValueError as error:
+        raise EmulatorError(f"identify --date: {error} (given: {date!r})") from None
+
+
+def _velocity(unix_s: float | None, given: str | None) -> NDArray[np.float64] | None:
+    """Return the barycentric velocity of the camera, m/s; None if neither date nor velocity is given."""
+    import numpy as np
+
+    from starhil.emulator.errors import EmulatorError
+    from starid.earth import earth_velocity
+    from starid.files import read_number
+
+    velocity: NDArray[np.float64] | None = None if unix_s is None else earth_velocity(unix_s)
+    if given is None:
+        return velocity
+    try:
+        x, y, z = (read_number(part) for part in given.split(","))
+    except ValueError:
+        raise EmulatorError(
+            f"identify --observer-velocity: {given!r} given, three numbers in m/s as X,Y,Z needed"
+        ) from None
+    own = np.array([x, y, z])
+    return own if velocity is None else velocity + own
 
 
 def _camera(profile: str | None) -> Camera:

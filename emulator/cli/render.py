@@ -16,7 +16,7 @@ from starhil.emulator.errors import EmulatorError
 if TYPE_CHECKING:
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sensor.renderer import Frame
-    from starhil.emulator.sky.objects import SkyObjects
+    from starhil.emulator.sky.view import SkyView
     from starid.camera import Camera
 
 _NUMBERED_TO_MAGNITUDE = 3.6
@@ -92,8 +92,12 @@ def command(
     }
     sensor = scene.sensor.with_(**{name: value for name, value in changes.items() if value is not None})
     catalog = load_catalog(scene.catalog_path or None, scene.epoch)
-    renderer = Renderer(camera, catalog, sensor, seed, scene.objects)
-    frame = renderer.render(Attitude.from_radec_roll(ra, dec, roll), [math.radians(value) for value in rate])
+    renderer = Renderer(camera, catalog, sensor, seed, scene.sky.objects)
+    frame = renderer.render(
+        Attitude.from_radec_roll(ra, dec, roll),
+        [math.radians(value) for value in rate],
+        observer=scene.sky.observer,
+    )
     write_image(output, _marked(frame) if as_annotated else frame.image)
     if as_json:
         text = json.dumps(_truth(frame, camera, sensor, output))
@@ -107,11 +111,11 @@ def command(
 
 @dataclass(frozen=True)
 class _Scene:
-    """Camera, sensor, catalogue and sky objects of an image."""
+    """Camera, sensor, catalogue and sky of an image."""
 
     camera: Camera
     sensor: SensorModel
-    objects: SkyObjects
+    sky: SkyView
     catalog_path: str
     epoch: float
 
@@ -120,13 +124,14 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
     """Return the scene of a profile's device, or the default, with the camera options applied."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sky.objects import SkyObjects
+    from starhil.emulator.sky.view import Sky, SkyView
     from starid.camera import Camera
     from starid.catalog import DEFAULT_EPOCH
 
     if profile is None:
-        scene = _Scene(Camera.from_fov(), SensorModel(), SkyObjects(), "", DEFAULT_EPOCH)
+        scene = _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
     else:
-        from starhil.emulator.device.device import profile_defaults
+        from starhil.emulator.device.device import orbit_of, profile_defaults
         from starhil.emulator.device.parameters import Parameters
         from starhil.emulator.emulation import pipeline_setup
         from starhil.emulator.profile import load_profile
@@ -137,12 +142,15 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
         parameters = Parameters(icd, profile_defaults(loaded, icd))
         setup = pipeline_setup(loaded)
         sensor = SensorModel().with_(**setup.sensor)
+        orbit = orbit_of(loaded)
+        at_start = None if orbit is None else orbit.state(loaded.start_unix_s)
+        place = (None, None) if at_start is None else (at_start.position_m, at_start.velocity_m_s)
         scene = _Scene(
             Camera.from_dict(setup.camera),
             sensor.with_(
                 exposure_s=float(parameters["exposure"]) / 1000.0, gain=float(parameters["analog_gain"])
             ),
-            SkyObjects.from_dict(setup.sky),
+            Sky(setup.sky).view(loaded.start_unix_s, *place),
             setup.catalog_path,
             setup.epoch,
         )

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
@@ -278,7 +279,8 @@ class FrameCycle:
         truth = self.true_state(mid_ns)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
-        request = self.request(truth, exposure_s, predicted)
+        velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
+        request = self.request(truth, exposure_s, predicted, velocity)
         self._in_flight.append(frame)
         ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
         generation = self._generation
@@ -309,9 +311,29 @@ class FrameCycle:
             return state.completed(unix_s, None)
 
     def request(
-        self, truth: TruthState, exposure_s: float, predicted: Attitude | None, *, solve: bool = True
+        self,
+        truth: TruthState,
+        exposure_s: float,
+        predicted: Attitude | None,
+        velocity: NDArray[np.float64] | None = None,
+        *,
+        solve: bool = True,
     ) -> FrameRequest:
-        """Return the pipeline request for the next exposure."""
+        """Return the pipeline request for the next exposure.
+
+        Parameters
+        ----------
+        truth
+            True state at mid-exposure.
+        exposure_s
+            Exposure, seconds.
+        predicted
+            Attitude to track from; None: lost in space.
+        velocity
+            Velocity with which the device corrects aberration; None: it does not.
+        solve
+            False to render only.
+        """
         index = self.index
         self.index += 1
         parameters = self._parameters
@@ -334,6 +356,7 @@ class FrameCycle:
             unix_s=truth.unix_s,
             position_m=None if truth.orbit is None else as_triple(truth.orbit.position_m),
             velocity_m_s=None if truth.orbit is None else as_triple(truth.orbit.velocity_m_s),
+            observer_velocity=None if velocity is None else as_triple(velocity),
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:

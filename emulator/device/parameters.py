@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
+from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import FieldError, MessageError, Parameter, Value
@@ -29,6 +30,8 @@ _WIRE_FORMATS: Final = {
     "f64": "<d",
 }
 """Type of a parameter → its format in memory."""
+ORBIT_SIZE: Final = ("orbit_semi_major_axis", "orbit_eccentricity")
+"""Parameters that determine the perigee."""
 
 PERIOD_ROUNDING: Final = 1e-6
 """Fraction of a period by which rounding to single precision may shorten it."""
@@ -60,6 +63,12 @@ def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...
     for low, high in ORDERED:
         if float(values[low]) > float(values[high]):
             return (low, high), f"{low} {values[low]} is above {high} {values[high]}"
+    axis_km, eccentricity = (float(values.get(name, 0.0)) for name in ORBIT_SIZE)
+    if perigee_below_surface(axis_km, eccentricity):
+        return ORBIT_SIZE, (
+            f"orbit_semi_major_axis {axis_km:g} km and orbit_eccentricity {eccentricity:g} make an orbit that meets "
+            "the Earth; set them to a perigee above 6378 km, or the first to 0"
+        )
     rate, needed_s = float(values["update_rate"]), exposure_period_s(values)
     if needed_s * rate > 1.0 + PERIOD_ROUNDING:
         return ("update_rate", "exposure", "delay_time"), (

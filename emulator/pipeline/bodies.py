@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.pipeline.messages import FrameResult
-from starhil.emulator.sky.light import icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera

@@ -28,13 +28,16 @@ from starhil.emulator.pipeline.messages import (
     PipelineReady,
     PipelineSetup,
     SolverSettings,
+    Triple,
 )
 from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Renderer
-from starhil.emulator.sky.objects import SkyObjects
+from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.sky.view import Sky
+from starid.aberration import aberrated
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
@@ -59,6 +62,13 @@ REASONS: Final[dict[Reason, str]] = {
     Reason.BAD_INPUT: "bad_input",
 }
 """Reason of the star identifier → its name in telemetry."""
+
+_WARM_UP_BODIES: Final = SkyObjects(
+    sun=SunGlare(0.0, 80.0),
+    moon=Moon(90.0, 80.0),
+    earth=EarthLimb(180.0, 20.0, sun_ra_deg=0.0, sun_dec_deg=0.0),
+)
+"""Bodies in and near the field of the identity attitude."""
 
 _WARM_UP_RATES_RAD_S: Final = ((1e-3, 0.0, 0.0), (0.03, 0.0, 0.0))
 """Rates at which stars in a default exposure are round, and at which they leave trails of a few pixels."""
@@ -104,7 +114,7 @@ class Pipeline:
         self._identifiers = StarIdentifiers(
             lambda wanted: wanted.make(self.catalog), in_background=setup.build_in_background
         )
-        self._sky = SkyObjects.from_dict(setup.sky)
+        self._sky = Sky(setup.sky)
         self._last: _Exposure | None = None
         self.images: ImageSource | None = None
         """Where images come from; None: they are rendered."""
@@ -143,6 +153,8 @@ class Pipeline:
             helper.wait()  # kernels it compiled are loaded below; any others are compiled there
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
             self._process_frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
+        if self._sky.by_date:
+            self._renderer.render(Attitude.identity(), objects=_WARM_UP_BODIES)
         self._last = None
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
@@ -183,24 +195,24 @@ class Pipeline:
         if self.images is not None:
             image = self.images.image(request.index)
             return _Exposure(image, used_bits(image), request.index)
-        attitude, sky = Attitude(np.array(request.attitude_xyzw)), self._sky_of(request)
+        attitude = Attitude(np.array(request.attitude_xyzw))
+        sky = self._sky.view(
+            request.unix_s, _vector(request.position_m), _vector(request.velocity_m_s), request.faults
+        )
+        objects = sky.objects
+        if request.particles_s > 0.0:
+            objects = replace(objects, cosmic_rays_s=objects.cosmic_rays_s + request.particles_s)
         frame = self._renderer.render(
             attitude,
             request.rate_rad_s,
             request.index,
             exposure_s=request.exposure_s,
             temperature_c=request.temperature_c,
-            objects=sky,
+            objects=objects,
+            observer=sky.observer,
         )
-        in_field = bodies_in_field(sky, attitude, self.camera)
+        in_field = bodies_in_field(objects, attitude, self.camera)
         return _Exposure(frame.image, self._sensor.bits, frame.frame_index, in_field)
-
-    def _sky_of(self, request: FrameRequest) -> SkyObjects:
-        """Return the sky of a frame: that of the profile, with faults and the particles of its place."""
-        sky = SkyObjects.from_dict({**self._setup.sky, **request.faults}) if request.faults else self._sky
-        if request.particles_s > 0.0:
-            return replace(sky, cosmic_rays_s=sky.cosmic_rays_s + request.particles_s)
-        return sky
 
     def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
         """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""
@@ -220,11 +232,18 @@ class Pipeline:
         xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
         sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
         if request.predicted_xyzw is None:
-            solution = identifier.identify(xy, flux, sigma)
+            solution = identifier.identify(xy, flux, sigma, observer_velocity=request.observer_velocity)
         else:
             predicted = np.array(request.predicted_xyzw)
-            solution = identifier.track(xy, flux, predicted, sigma, window_px=tracking_window(settings))
-        if solution.valid and _within_margin(identifier, solution, xy, settings) < settings.min_stars_matched:
+            solution = identifier.track(
+                xy,
+                flux,
+                predicted,
+                sigma,
+                window_px=tracking_window(settings),
+                observer_velocity=request.observer_velocity,
+            )
+        if solution.valid and _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
@@ -304,14 +323,20 @@ class Pipeline:
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
 
 
+def _vector(values: Triple | None) -> NDArray[np.float64] | None:
+    return None if values is None else np.array(values)
+
+
 def _within_margin(
-    identifier: StarIdentifier, solution: Solution, xy: NDArray[np.float64], settings: SolverSettings
+    identifier: StarIdentifier, solution: Solution, xy: NDArray[np.float64], request: FrameRequest
 ) -> int:
     """Count the matched stars within the validation margin of their expected position."""
     icrs = identifier.catalog.vectors[solution.catalog_index]
+    if request.observer_velocity is not None:
+        icrs = aberrated(icrs, request.observer_velocity)
     expected_xy, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
     offset_px = np.hypot(*(expected_xy - xy[solution.detection_index]).T)
-    return int(np.count_nonzero(offset_px <= settings.validation_margin))
+    return int(np.count_nonzero(offset_px <= request.settings.validation_margin))
 
 
 def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:

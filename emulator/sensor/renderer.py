@@ -17,7 +17,9 @@ from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
-from starhil.emulator.sky.light import AreaLight, AreaPainter, icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.ephemeris import Observer
+from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -154,6 +156,8 @@ class Renderer:
         rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
+        parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
+        self._parallax_rad = np.radians(parallax_mas / 3.6e6)
         self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])
         self._cos_cone = math.cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
@@ -184,6 +188,7 @@ class Renderer:
         exposure_s: float | None = None,
         temperature_c: float | None = None,
         objects: SkyObjects | None = None,
+        observer: Observer | None = None,
     ) -> Frame:
         """Render one exposure.
 
@@ -201,6 +206,8 @@ class Renderer:
             Temperature of detector and lens instead of the sensor's, °C.
         objects : SkyObjects, optional
             Sky objects instead of the renderer's default.
+        observer : Observer, optional
+            Whose place and motion give the stars parallax and aberration; by default they have neither.
 
         Raises
         ------
@@ -216,7 +223,7 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature)
         self._optics = drifted_camera(self.camera, sensor, temperature)
         optical_axis = self._pointing(attitude, temperature)
-        path, chosen, inside = self._paths(optical_axis, rate, exposure)
+        path, chosen, inside = self._paths(optical_axis, rate, exposure, observer)
         electrons = self._flux_e_s[chosen] * exposure
         drawn = electrons
         object_truth = None
@@ -331,16 +338,24 @@ class Renderer:
         return self._work
 
     def _paths(
-        self, attitude: Attitude, rate: npt.NDArray[np.float64], exposure_s: float
+        self,
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+        observer: Observer | None,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars whose light may reach the image.
 
         A path is the parabola through the projections at the start, middle and end of the exposure.
         """
-        sweep = float(np.linalg.norm(rate)) * exposure_s
+        readout_s = self.camera.height * self.sensor.row_time_s
+        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
         cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
         near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
-        path, inside, touching = self._path_of(self._vectors[near], attitude, rate, exposure_s)
+        icrs = self._vectors[near]
+        if observer is not None:
+            icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
+        path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
 
     def _path_of(

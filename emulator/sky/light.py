@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -21,6 +22,12 @@ _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
 _SUN_SOFT_DEG: Final = 3.0
+
+_FLOOD_E_S: Final = 1e9
+"""Electrons/s in every pixel when light passes the baffle: saturates any exposure of a millisecond."""
+
+_GLOW_HEIGHTS: Final = 20.0
+"""Heights of the atmosphere above the limb up to which it glows."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +53,45 @@ class AreaLight:
         return self.transmission[rows, columns].astype(np.float64)
 
 
-def icrs_vector(ra_deg: float, dec_deg: float) -> npt.NDArray[np.float64]:
-    """Unit vector (3,) of a direction."""
-    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
-    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
+    """Whether the Sun or the lit Earth is within its exclusion angle, so that its light saturates the image."""
+    sun, earth = objects.sun, objects.earth
+    if sun is not None and _off_axis_deg(attitude, sun) < sun.exclusion_deg:
+        return True
+    if earth is None or earth.exclusion_deg == 0.0:
+        return False
+    off_axis = _off_axis_deg(attitude, earth)
+    near_deg = min(off_axis, earth.radius_deg)
+    return off_axis - near_deg < earth.exclusion_deg and _is_lit(earth, attitude.boresight, near_deg)
+
+
+def _is_lit(earth: EarthLimb, towards: npt.NDArray[np.float64], off_nadir_deg: float) -> bool:
+    """Whether the Sun shines on the point of the Earth seen at an angle from its centre towards a direction."""
+    sun = _sun_of(earth)
+    if sun is None:
+        return True
+    nadir = icrs_vector(earth.ra_deg, earth.dec_deg)
+    sideways = towards - float(towards @ nadir) * nadir
+    sideways /= max(float(np.linalg.norm(sideways)), 1e-12)
+    angle, distance = math.radians(off_nadir_deg), 1.0 / math.sin(math.radians(earth.radius_deg))
+    line = math.cos(angle) * nadir + math.sin(angle) * sideways
+    under = max(1.0 - (distance * math.sin(angle)) ** 2, 0.0)
+    normal = (distance * math.cos(angle) - math.sqrt(under)) * line - distance * nadir
+    return float(normal @ sun) > 0.0
+
+
+def _sun_of(earth: EarthLimb) -> npt.NDArray[np.float64] | None:
+    """Return the direction (3,) of the Sun that lights the Earth; None if all of the disc is lit."""
+    if earth.sun_ra_deg is None or earth.sun_dec_deg is None:
+        return None
+    return icrs_vector(earth.sun_ra_deg, earth.sun_dec_deg)
+
+
+def _off_axis_deg(attitude: Attitude, body: SunGlare | Moon | EarthLimb) -> float:
+    """Angle of a body's centre from the boresight, degrees."""
+    place, boresight = icrs_vector(body.ra_deg, body.dec_deg), attitude.boresight
+    chord = float(np.linalg.norm(place - boresight))
+    return math.degrees(2.0 * math.asin(min(0.5 * chord, 1.0)))
 
 
 @compiled_ieee
@@ -71,6 +113,55 @@ def _add_glare(
             u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
             chord2 = u * u + v * v + w * w + soft
             row[x] += factor / (chord2 * np.sqrt(chord2) if cube else chord2)
+
+
+@compiled_ieee
+def _earth_face(
+    shine: Image,
+    clear: Image,
+    directions: Image,
+    nadir: npt.NDArray[np.float64],
+    sun: npt.NDArray[np.float64],
+    radius: float,
+    atmosphere: float,
+) -> None:
+    """Fill in the Earth's brightness, 1 where the Sun is in the zenith, and the transmission of its edge.
+
+    Parameters
+    ----------
+    shine, clear : ndarray (h, w), float32
+        Filled: brightness, and fraction of the sky's light that passes.
+    directions : ndarray (3, h, w), float32
+        Of the pixels, sensor frame.
+    nadir, sun : ndarray (3,)
+        To the Earth's centre and to the Sun, sensor frame; zeros instead of the Sun light all of the disc.
+    radius, atmosphere : float
+        Angular radius of the disc and height over which its limb fades, radians.
+    """
+    n0, n1, n2 = nadir[0], nadir[1], nadir[2]
+    s0, s1, s2 = sun[0], sun[1], sun[2]
+    all_lit = s0 == 0.0 and s1 == 0.0 and s2 == 0.0
+    distance = 1.0 / math.sin(radius)
+    behind = -distance * (n0 * s0 + n1 * s1 + n2 * s2)
+    inner, outer = math.cos(radius), math.cos(min(radius + _GLOW_HEIGHTS * atmosphere, math.pi))
+    for y in range(shine.shape[0]):
+        dx, dy, dz = directions[0, y], directions[1, y], directions[2, y]
+        for x in range(shine.shape[1]):
+            u, v, w = float(dx[x]), float(dy[x]), float(dz[x])
+            cosine = n0 * u + n1 * v + n2 * w
+            if cosine < outer:
+                shine[y, x], clear[y, x] = 0.0, 1.0
+                continue
+            light, passed = 1.0, 0.0
+            if cosine < inner:
+                height = (math.acos(max(cosine, -1.0)) - radius) / atmosphere
+                light, passed = math.exp(-height), min(height, 1.0)
+            if not all_lit:
+                # cosine of the Sun's zenith distance where the line of sight meets a sphere of radius 1
+                under = max(1.0 - distance * distance * (1.0 - cosine * cosine), 0.0)
+                along = distance * cosine - math.sqrt(under)
+                light *= min(max(behind + along * (s0 * u + s1 * v + s2 * w), 0.0), 1.0)
+            shine[y, x], clear[y, x] = light, passed
 
 
 class AreaPainter:
@@ -104,12 +195,15 @@ class AreaPainter:
         """Return light and transmission of all extended objects at one attitude."""
         shape = (self._camera.height, self._camera.width)
         light = AreaLight(np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32))
-        if objects.sun is not None:
-            self._paint_sun(light, objects.sun, attitude)
-        if objects.moon is not None:
-            self._paint_moon(light, objects.moon, attitude)
-        if objects.earth is not None:
-            self._paint_earth(light, objects.earth, attitude)
+        sun, moon, earth = objects.sun, objects.moon, objects.earth
+        if sun is not None and _off_axis_deg(attitude, sun) <= sun.reach_deg:
+            self._paint_sun(light, sun, attitude)
+        if moon is not None and _off_axis_deg(attitude, moon) <= moon.reach_deg:
+            self._paint_moon(light, moon, attitude)
+        if earth is not None and self._earth_in_field(earth, attitude):
+            self._paint_earth(light, earth, attitude)
+        if baffle_passed(objects, attitude):
+            light.electrons_s[:] += np.float32(_FLOOD_E_S)
         for obstruction in objects.obstructions:
             transmission = self._obstruction_transmission(obstruction)
             light.electrons_s[:] *= transmission
@@ -184,16 +278,28 @@ class AreaPainter:
         """Add the Earth's disc, fading over the atmosphere; it hides everything behind it."""
         import cv2
 
-        source = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg)).astype(np.float32)
-        cosine = np.clip(np.tensordot(source, self._directions, axes=1), -1.0, 1.0)
-        above_deg = np.degrees(np.arccos(cosine)) - np.float32(earth.radius_deg)
-        face = np.clip(-above_deg / np.float32(earth.atmosphere_deg) + 1.0, 0.0, 1.0)
-        glow = np.exp(-np.maximum(above_deg, 0.0) / np.float32(earth.atmosphere_deg))
-        shine = np.float32(earth.electrons_s) * np.where(above_deg < 0.0, np.float32(1.0), glow)
-        shine[above_deg > 20.0 * earth.atmosphere_deg] = 0.0
-        blurred = cv2.GaussianBlur(shine.astype(np.float32), (0, 0), self._psf_sigma_px)
-        light.electrons_s[:] = light.electrons_s * (1.0 - face) + blurred
-        light.transmission[:] *= (1.0 - face).astype(np.float32)
+        shape = light.electrons_s.shape
+        shine, clear = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        sun = _sun_of(earth)
+        _earth_face(
+            shine,
+            clear,
+            self._directions,
+            attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg)),
+            np.zeros(3) if sun is None else attitude.to_sensor(sun),
+            math.radians(earth.radius_deg),
+            math.radians(earth.atmosphere_deg),
+        )
+        shine *= np.float32(earth.electrons_s)
+        blurred = cv2.GaussianBlur(shine, (0, 0), self._psf_sigma_px)
+        np.multiply(light.electrons_s, clear, out=light.electrons_s)
+        light.electrons_s[:] += blurred
+        light.transmission[:] *= clear
+
+    def _earth_in_field(self, earth: EarthLimb, attitude: Attitude) -> bool:
+        """Whether the Earth or the glow of its limb reaches into the field."""
+        reach_deg = earth.radius_deg + _GLOW_HEIGHTS * earth.atmosphere_deg
+        return _off_axis_deg(attitude, earth) <= reach_deg + math.degrees(self._camera.field_radius_rad) + 1.0
 
     def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
         """Return the transmission (h, w) of an obstruction."""

@@ -34,6 +34,8 @@ class Moon:
         Position angle of the midpoint of the bright limb, from north through east.
     glare_share : float
         Fraction of its light that the lens scatters over the field; falls with the square of the angle.
+    reach_deg : float
+        Angle from the boresight beyond which none of its light enters the lens.
     """
 
     ra_deg: float
@@ -43,6 +45,7 @@ class Moon:
     illuminated: float = 1.0
     bright_limb_deg: float = 90.0
     glare_share: float = 1e-3
+    reach_deg: float = 180.0
 
 
 @dataclass(frozen=True)
@@ -55,11 +58,17 @@ class SunGlare:
         Direction of the Sun, ICRS.
     electrons_s : float
         Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle.
+    exclusion_deg : float
+        Angle from the boresight within which sunlight passes the baffle and saturates the image.
+    reach_deg : float
+        Angle from the boresight beyond which no sunlight enters the lens.
     """
 
     ra_deg: float
     dec_deg: float
     electrons_s: float = 1000.0
+    exclusion_deg: float = 0.0
+    reach_deg: float = 180.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +85,11 @@ class EarthLimb:
         Electrons/s per pixel of the disc: 0 for the night side, millions for the day side.
     atmosphere_deg : float
         Angular height over which the limb fades.
+    exclusion_deg : float
+        Angle between the boresight and the nearest point of the disc, if that is lit, within which its light
+        passes the baffle and saturates the image; 0 for no baffle.
+    sun_ra_deg, sun_dec_deg : float, optional
+        Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit.
     """
 
     ra_deg: float
@@ -83,6 +97,9 @@ class EarthLimb:
     radius_deg: float = 64.0
     electrons_s: float = 1e6
     atmosphere_deg: float = 0.15
+    exclusion_deg: float = 0.0
+    sun_ra_deg: float | None = None
+    sun_dec_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +155,10 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     "electrons_s": (0.0, 1e12),
     "radius_deg": (0.1, 179.0),
     "atmosphere_deg": (1e-3, 20.0),
+    "exclusion_deg": (0.0, 180.0),
+    "reach_deg": (0.0, 180.0),
+    "sun_ra_deg": _ANGLE,
+    "sun_dec_deg": (-90.0, 90.0),
     "share": (0.0, 1.0),
     "angle_deg": _ANGLE,
     "polygon_px": (-1e5, 1e5),
@@ -194,6 +215,8 @@ class SkyObjects:
     blank: bool = False
 
     def __post_init__(self) -> None:
+        if self.earth is not None and (self.earth.sun_ra_deg is None) != (self.earth.sun_dec_deg is None):
+            raise EmulatorError("sky earth: sun_ra_deg and sun_dec_deg belong together; give both or neither")
         for body in (self.moon, self.sun, self.earth, *self.planets, *self.obstructions):
             if body is not None:
                 _check_fields(type(body).__name__, body)
@@ -282,7 +305,7 @@ def _check_fields(where: str, body: Any) -> None:
             raise EmulatorError(f"sky {where} {field.name}: {value!r} given, true or false needed")
         if type(field.default) is str and not isinstance(value, str):
             raise EmulatorError(f"sky {where} {field.name}: {value!r} given, a text needed")
-        if field.name not in _RANGES:
+        if field.name not in _RANGES or (value is None and field.default is None):
             continue
         low, high = _RANGES[field.name]
         whole = isinstance(low, int)

@@ -264,19 +264,7 @@ Metres: TypeAlias = Annotated[float, Field(ge=-1e9, le=1e9)]
 MetresPerSecond: TypeAlias = Annotated[float, Field(ge=-2e4, le=2e4)]
 
 
-class _Propagated(Strict):
-    """Keys of orbits that start from elements or a state."""
-
-    epoch: Date | None = None
-    """Date of these values; default: the date at which the run starts."""
-    j2: bool = True
-    """Let node and perigee drift at the secular rates of the Earth's oblateness."""
-
-    def _epoch_s(self, start_unix_s: float) -> float:
-        return start_unix_s if self.epoch is None else self.epoch
-
-
-class KeplerConfig(_Propagated):
+class KeplerConfig(Strict):
     """Keplerian elements, relative to the GCRS equator and equinox."""
 
     kind: Literal["kepler"]
@@ -292,12 +280,16 @@ class KeplerConfig(_Propagated):
     argument_of_perigee_deg: OrbitAngle = 0.0
     """Angle from the ascending node to the perigee."""
     mean_anomaly_deg: OrbitAngle = 0.0
-    """Mean anomaly at the epoch."""
+    """Mean anomaly at the date."""
+    date: Date | None = None
+    """Date of these values; default: the date at which the run starts."""
+    j2: bool = True
+    """Let node and perigee drift at the secular rates of the Earth's oblateness."""
 
     def build(self, start_unix_s: float) -> Orbit:
         """Make the orbit of a run that starts at a Unix time."""
         return KeplerOrbit(
-            self._epoch_s(start_unix_s),
+            start_unix_s if self.date is None else self.date,
             1e3 * self.semi_major_axis_km,
             self.eccentricity,
             math.radians(self.inclination_deg),
@@ -308,7 +300,7 @@ class KeplerConfig(_Propagated):
         )
 
 
-class StateConfig(_Propagated):
+class StateConfig(Strict):
     """Position and velocity at one time, relative to the Earth's centre, GCRS."""
 
     kind: Literal["state"]
@@ -317,11 +309,15 @@ class StateConfig(_Propagated):
     """Position."""
     velocity_m_s: Annotated[list[MetresPerSecond], Field(min_length=3, max_length=3)]
     """Velocity."""
+    date: Date | None = None
+    """Date of these values; default: the date at which the run starts."""
+    j2: bool = True
+    """Let node and perigee drift at the secular rates of the Earth's oblateness."""
 
     def build(self, start_unix_s: float) -> Orbit:
         """Make the orbit of a run that starts at a Unix time."""
         state = OrbitState(np.array(self.position_m), np.array(self.velocity_m_s))
-        return KeplerOrbit.from_state(self._epoch_s(start_unix_s), state, j2=self.j2)
+        return KeplerOrbit.from_state(start_unix_s if self.date is None else self.date, state, j2=self.j2)
 
 
 class TleConfig(Strict):

@@ -243,18 +243,26 @@ class ClassicIdentifier(ABC):
         row = self._catalog.index_of(stars.hip).astype(np.int64)
         return GuideStars(np.ascontiguousarray(stars.vectors), stars.v.copy(), row)
 
-    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+    def identify(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        observer_velocity: ArrayLike | None = None,
+    ) -> Solution:
         """Lost in space: attitude without any knowledge of it.
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `starid.interface.StarIdentifier.identify`.
 
         Returns
         -------
         Solution
-            With ``verify=False`` valid means no more than that the algorithm has an answer.
+            With ``verify=False`` valid means no more than that the algorithm has an answer, and aberration is not
+            corrected.
 
         Raises
         ------
@@ -273,7 +281,12 @@ class ClassicIdentifier(ABC):
         solution = self._raw(xy, observed, pairs)
         if self.options.verify:
             solution = self.verifier.verify(
-                xy, brightness, solution.attitude, xy_sigma_px, window_px=_VERIFY_WINDOW_PX
+                xy,
+                brightness,
+                solution.attitude,
+                xy_sigma_px,
+                window_px=_VERIFY_WINDOW_PX,
+                observer_velocity=observer_velocity,
             )
         return dataclasses.replace(solution, mode="lost_in_space", elapsed=time.perf_counter() - begin)
 
@@ -285,15 +298,18 @@ class ClassicIdentifier(ABC):
         xy_sigma_px: ArrayLike | None = None,
         *,
         window_px: float | None = None,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Attitude near a predicted one, as the verification finds it; these algorithms have no tracking of their own.
 
         Parameters
         ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px
+        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
             As in `starid.interface.StarIdentifier.track`.
         """
-        return self.verifier.track(xy_px, flux, predicted, xy_sigma_px, window_px=window_px)
+        return self.verifier.track(
+            xy_px, flux, predicted, xy_sigma_px, window_px=window_px, observer_velocity=observer_velocity
+        )
 
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""

@@ -17,6 +17,7 @@ from starid.geometric.refinement import (
     SCALE,
     VARIANCE,
     ZERO_POINT,
+    directions_depend_on_solution,
     refine,
     solve_symmetric,
 )
@@ -121,7 +122,7 @@ def test_and_refine(
         index, raw.params, observed, rotation, numbers[SCALE], faintest, settings, odds, order, used
     ):
         return 0, 0.0
-    seen = np.empty_like(observed) if settings[SCALE_TOLERANCE] > 0.0 else observed
+    seen = observed.copy() if directions_depend_on_solution(settings) else observed
     matched = refine(
         index,
         raw,

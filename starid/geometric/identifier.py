@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starid.aberration import checked_beta
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
@@ -31,6 +32,8 @@ from starid.geometric.pattern_index import field_solid_angle, seen_stars
 from starid.geometric.search import identify_kernel
 from starid.geometric.settings import (
     ACCEPTED,
+    BETA_X,
+    BETA_Z,
     FIELD_PX,
     LARGEST_SIGMA,
     LOG_CHANCE,
@@ -210,12 +213,19 @@ class Identifier:
         """Size of the index, bytes."""
         return sum(part.nbytes for part in self._index)
 
-    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+    def identify(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        observer_velocity: ArrayLike | None = None,
+    ) -> Solution:
         """Find the attitude without any prior knowledge (lost in space).
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `starid.interface.StarIdentifier.identify`.
 
         Raises
@@ -225,11 +235,22 @@ class Identifier:
         """
         begin = time.perf_counter()
         xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
-        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        numbers = self._numbers_for(xy_sigma_px, observer_velocity)
         if self._fov_tolerance > 0.0:
             return self._identify_any_scale(xy, brightness, sigmas, numbers, begin)
         answer = identify_kernel(self._index, self._camera.params, xy, brightness, sigmas, numbers)
         return self._solution(answer, "lost_in_space", begin)
+
+    def _numbers_for(
+        self, xy_sigma_px: ArrayLike | None, observer_velocity: ArrayLike | None
+    ) -> NDArray[np.float64]:
+        """Settings of the kernels for one call."""
+        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        if observer_velocity is None:
+            return numbers
+        numbers = numbers.copy()
+        numbers[BETA_X : BETA_Z + 1] = checked_beta(observer_velocity)
+        return numbers
 
     def _identify_any_scale(
         self,
@@ -276,12 +297,13 @@ class Identifier:
         xy_sigma_px: ArrayLike | None = None,
         *,
         window_px: float | None = None,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
 
         Parameters
         ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px
+        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
             As in `starid.interface.StarIdentifier.track`; the window is `TRACKING_WINDOW_PX` by default.
 
         Raises
@@ -290,7 +312,9 @@ class Identifier:
             As in `identify`, or the window is not positive.
         """
         window = TRACKING_WINDOW_PX if window_px is None else window_px
-        return self._identify_near(xy_px, flux, predicted, xy_sigma_px, window, anywhere=False)
+        return self._identify_near(
+            xy_px, flux, predicted, xy_sigma_px, window, observer_velocity, anywhere=False
+        )
 
     def verify(
         self,
@@ -300,12 +324,13 @@ class Identifier:
         xy_sigma_px: ArrayLike | None = None,
         *,
         window_px: float,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Verify an attitude that was selected from the whole sky, as strictly as `identify` does.
 
         Parameters
         ----------
-        xy_px, flux, candidate, xy_sigma_px, window_px
+        xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity
             As in `track`. That the attitude is near the candidate one is no evidence for it.
 
         Raises
@@ -313,7 +338,9 @@ class Identifier:
         StaridError
             As in `track`.
         """
-        return self._identify_near(xy_px, flux, candidate, xy_sigma_px, window_px, anywhere=True)
+        return self._identify_near(
+            xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, anywhere=True
+        )
 
     def _identify_near(
         self,
@@ -322,6 +349,7 @@ class Identifier:
         predicted: Attitude | ArrayLike,
         xy_sigma_px: ArrayLike | None,
         window_px: float,
+        observer_velocity: ArrayLike | None,
         *,
         anywhere: bool,
     ) -> Solution:
@@ -331,7 +359,7 @@ class Identifier:
         if not 0.0 < window_px < math.inf:
             raise StaridError(f"tracking window_px: {window_px} given, a positive number of pixels needed")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
-        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
+        numbers = self._numbers_for(xy_sigma_px, observer_velocity)
         window = window_px / self._px_per_rad
         prior = self._rotation_volume(window)
         if anywhere:

@@ -153,6 +153,37 @@ def observe_again(raw: Raw, observed: Table, scale: float, seen: Table) -> None:
 
 
 @inner
+def at_rest(
+    x: float, y: float, z: float, beta_x: float, beta_y: float, beta_z: float
+) -> tuple[float, float, float]:
+    """Direction for an observer at rest of what one with velocity β sees; the inverse of `starid.aberration.aberrated`."""
+    inverse_gamma = math.sqrt(1.0 - beta_x * beta_x - beta_y * beta_y - beta_z * beta_z)
+    along = beta_x * x + beta_y * y + beta_z * z
+    share = 1.0 - along / (1.0 + inverse_gamma)
+    x, y, z = (
+        inverse_gamma * x - share * beta_x,
+        inverse_gamma * y - share * beta_y,
+        inverse_gamma * z - share * beta_z,
+    )
+    norm = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * norm, y * norm, z * norm
+
+
+@inner
+def remove_aberration(
+    observed: Table, beta: tuple[float, float, float], rotation: NDArray[np.float64], seen: Table
+) -> None:
+    """Set the directions of `seen` to those of `observed` for an observer at rest, under an ICRS→sensor matrix."""
+    bx = rotation[0, 0] * beta[0] + rotation[0, 1] * beta[1] + rotation[0, 2] * beta[2]
+    by = rotation[1, 0] * beta[0] + rotation[1, 1] * beta[1] + rotation[1, 2] * beta[2]
+    bz = rotation[2, 0] * beta[0] + rotation[2, 1] * beta[1] + rotation[2, 2] * beta[2]
+    for i in range(seen.shape[0]):
+        x, y, z = observed[i, X], observed[i, Y], observed[i, Z]
+        if x * x + y * y + z * z > NOWHERE:
+            seen[i, X], seen[i, Y], seen[i, Z] = at_rest(x, y, z, bx, by, bz)
+
+
+@inner
 def scaled(model: float, x: float, y: float, z: float, scale: float) -> tuple[float, float, float]:
     """Unit direction seen where the focal length is divided by `scale` (without the distortion)."""
     if scale == 1.0:

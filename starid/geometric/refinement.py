@@ -35,10 +35,15 @@ from starid.geometric.observation import (
     V_Z,
     Raw,
     Table,
+    at_rest,
     observe_again,
+    remove_aberration,
 )
 from starid.geometric.pattern_index import STAR_MAGNITUDE, IndexArrays
 from starid.geometric.settings import (
+    BETA_X,
+    BETA_Y,
+    BETA_Z,
     MAGNITUDE_GATE,
     PX_PER_RAD,
     SCALE_TOLERANCE,
@@ -304,6 +309,49 @@ def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> f
 
 
 @inner
+def directions_depend_on_solution(settings: NDArray[np.float64]) -> bool:
+    """Whether the directions of the detections change with the solution: with its scale, or by aberration."""
+    return bool(settings[SCALE_TOLERANCE] > 0.0) or _observer_moves(settings)
+
+
+@inner
+def _observer_moves(settings: NDArray[np.float64]) -> bool:
+    return bool(settings[BETA_X] != 0.0 or settings[BETA_Y] != 0.0 or settings[BETA_Z] != 0.0)
+
+
+@inner
+def _observe_with(
+    raw: Raw,
+    observed: Table,
+    settings: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    scale: float,
+    seen: Table,
+) -> None:
+    """Fill `seen` with the detections under the refined scale and without aberration."""
+    if settings[SCALE_TOLERANCE] > 0.0:
+        observe_again(raw, observed, scale, seen)
+    if _observer_moves(settings):
+        beta = (settings[BETA_X], settings[BETA_Y], settings[BETA_Z])
+        remove_aberration(seen if settings[SCALE_TOLERANCE] > 0.0 else observed, beta, rotation, seen)
+
+
+@inner
+def _rotate_by_aberration(settings: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:
+    """Rotate an attitude derived from aberrated directions by the aberration of its boresight, in place."""
+    bx, by, bz = settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
+    x, y, _ = at_rest(
+        0.0,
+        0.0,
+        1.0,
+        rotation[0, 0] * bx + rotation[0, 1] * by + rotation[0, 2] * bz,
+        rotation[1, 0] * bx + rotation[1, 1] * by + rotation[1, 2] * bz,
+        rotation[2, 0] * bx + rotation[2, 1] * by + rotation[2, 2] * bz,
+    )
+    rotate_sensor(rotation, y, -x, 0.0)
+
+
+@inner
 def refine(
     index: IndexArrays,
     raw: Raw,
@@ -325,7 +373,8 @@ def refine(
     least_matched : int
         Fewer matches fail.
     seen : Table
-        Where the focal length is free: filled with the detections under the refined one. Else `observed`.
+        Where `directions_depend_on_solution`: a copy of `observed`, filled with the detections under the refined
+        focal length and attitude. Else `observed`.
     rotation : ndarray (3, 3)
         ICRS→sensor; coarse on entry, refined on return.
     stars : ndarray (n,) int64
@@ -350,8 +399,9 @@ def refine(
     right, step = np.empty(4), np.zeros(4)
     free_scale = settings[SCALE_TOLERANCE] > 0.0
     unknowns = 4 if free_scale else 3
-    if free_scale:
-        observe_again(raw, observed, numbers[SCALE], seen)
+    if _observer_moves(settings):
+        _rotate_by_aberration(settings, rotation)
+    _observe_with(raw, observed, settings, rotation, numbers[SCALE], seen)
     gate, numbers[SCATTER] = settings[MAGNITUDE_GATE], settings[MAGNITUDE_GATE]
     reach, sigma = settings[WINDOW], 1.0
     matched = 0
@@ -371,7 +421,7 @@ def refine(
         rotate_sensor(rotation, step[0], step[1], step[2])
         if free_scale:
             numbers[SCALE] *= math.exp(step[3])
-            observe_again(raw, observed, numbers[SCALE], seen)
+        _observe_with(raw, observed, settings, rotation, numbers[SCALE], seen)
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom
         if stable:

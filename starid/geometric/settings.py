@@ -30,7 +30,11 @@ FIELD_PX: Final = 11
 """Pixels in the field."""
 PART_STARS: Final = 12
 """Brightest detections of each part of the field that form triangles, 0 for none."""
-SETTING_COUNT: Final = 13
+BETA_X: Final = 13
+BETA_Y: Final = 14
+BETA_Z: Final = 15
+"""Velocity of the observer over that of light, ICRS; zeros where aberration is not corrected."""
+SETTING_COUNT: Final = 16
 
 NOTHING: Final = 0
 ACCEPTED: Final = 1

@@ -22,7 +22,7 @@ from starid.geometric.answer import (
     test_and_refine,
 )
 from starid.geometric.matching import to_sky
-from starid.geometric.observation import MAGNITUDE, Raw, Table, observe
+from starid.geometric.observation import MAGNITUDE, Raw, Table, at_rest, observe
 from starid.geometric.pattern_index import (
     DEEP_SHORTEST,
     GRID_CELLS,
@@ -35,6 +35,9 @@ from starid.geometric.refinement import SCALE, ZERO_POINT
 from starid.geometric.search import set_rotation, set_sensor_frame
 from starid.geometric.settings import (
     ACCEPTED,
+    BETA_X,
+    BETA_Y,
+    BETA_Z,
     LOG_CHANCE_TRACKING,
     MAGNITUDE_GATE,
     NOTHING,
@@ -175,7 +178,9 @@ def track_kernel(
     counts = np.zeros(PAIRED, dtype=np.int64)
     status, bound, work = TOO_FEW if n < LEAST_MATCHED else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
     for j in range(min(n, PAIRED) if status == NOTHING else 0):
-        x, y, z = to_sky(predicted, observed, j)
+        x, y, z = at_rest(
+            *to_sky(predicted, observed, j), settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
+        )
         counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
         for i in range(j):
             bound = _try_detections(

@@ -6,6 +6,8 @@ import dataclasses
 import time
 from typing import Final
 
+from numpy.typing import ArrayLike
+
 from starid.camera import Camera, Model
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -28,6 +30,7 @@ def solve_any_field(
     *,
     model: Model = "pinhole",
     settings: DetectionSettings | None = None,
+    observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
     """Find the stars on an image, and the attitude and field of view of its camera.
 
@@ -41,6 +44,8 @@ def solve_any_field(
         Projection of the lens.
     settings : DetectionSettings, optional
         For the detection.
+    observer_velocity : array (3,), optional
+        As in `starid.interface.StarIdentifier.identify`.
 
     Raises
     ------
@@ -63,7 +68,7 @@ def solve_any_field(
                 searches[camera] = search
                 solution = search.identify(found.xy_px, found.flux, rounds=[number])
                 if solution.valid:
-                    return refine_solution(solution, view, camera, search, begin)
+                    return refine_solution(solution, view, camera, search, begin, observer_velocity)
                 if first is None:
                     first = ImageSolution(solution, found, camera, search.identifier.stars)
                 if solution.reason is Reason.TOO_FEW_STARS:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
@@ -43,7 +43,7 @@ class ImageSolution:
     camera : Camera
         The camera, or its estimate from this image.
     stars : StarCatalog
-        Catalogue stars as the camera resolves them.
+        Catalogue stars as the camera resolves them, with aberration where it was corrected.
     mirrored : bool
         The image shows the sky mirrored; attitude, camera and detections are those of the image flipped left
         to right.
@@ -67,6 +67,7 @@ def solve_image(
     *,
     fov_tolerance: float = 0.0,
     settings: DetectionSettings | None = None,
+    observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
     """Find the stars on an image and the attitude of the camera.
 
@@ -84,6 +85,8 @@ def solve_image(
         the plain one fails (`starid.photograph.views`, `starid.photograph.rough_search`).
     settings : DetectionSettings, optional
         For the detection.
+    observer_velocity : array (3,), optional
+        As in `starid.interface.StarIdentifier.identify`.
 
     Raises
     ------
@@ -99,15 +102,23 @@ def solve_image(
         )
     sky = load_catalog() if catalog is None else catalog
     if fov_tolerance > 0.0:
-        return _solve_roughly(image, nominal, sky, fov_tolerance, settings)
+        return _solve_roughly(image, nominal, sky, fov_tolerance, settings, observer_velocity)
     found = detect(image, settings or DetectionSettings())
     identifier = Identifier(nominal, sky)
-    solution = identifier.identify(found.xy_px, found.flux, found.xy_sigma_px)
-    return ImageSolution(solution, found, solution.camera or nominal, identifier.stars)
+    solution = identifier.identify(
+        found.xy_px, found.flux, found.xy_sigma_px, observer_velocity=observer_velocity
+    )
+    stars = identifier.stars.aberrated(observer_velocity)
+    return ImageSolution(solution, found, solution.camera or nominal, stars)
 
 
 def _solve_roughly(
-    image: Counts, camera: Camera, sky: StarCatalog, fov_tolerance: float, settings: DetectionSettings | None
+    image: Counts,
+    camera: Camera,
+    sky: StarCatalog,
+    fov_tolerance: float,
+    settings: DetectionSettings | None,
+    observer_velocity: ArrayLike | None,
 ) -> ImageSolution:
     """Try one view of the image after another until one is identified."""
     begin = time.perf_counter()
@@ -122,13 +133,18 @@ def _solve_roughly(
             xy = flipped(found.xy_px, camera.width) if view.mirrored else found.xy_px
             answer = search.identify(xy, found.flux, rounds=rounds)
             if answer.valid:
-                return refine_solution(answer, view, camera, search, begin)
+                return refine_solution(answer, view, camera, search, begin, observer_velocity)
     answer = Solution.invalid(answer.reason, elapsed=time.perf_counter() - begin)
     return ImageSolution(answer, made[0].detections, camera, search.identifier.stars)
 
 
 def refine_solution(
-    solution: Solution, view: View, camera: Camera, search: RoughSearch, begin: float
+    solution: Solution,
+    view: View,
+    camera: Camera,
+    search: RoughSearch,
+    begin: float,
+    observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
     """Estimate the lens from the matched stars, where they suffice, and refine the solution with it.
 
@@ -144,6 +160,8 @@ def refine_solution(
         The search that found the solution.
     begin : float
         Value of the performance counter at the start.
+    observer_velocity : array (3,), optional
+        As in `starid.interface.StarIdentifier.identify`.
     """
     identifier = search.identifier
     found = view.detections
@@ -152,14 +170,15 @@ def refine_solution(
     refined = solution.camera or camera
     if solution.star_count >= _FEW:
         stars = Stars(found.xy_px, found.flux, found.xy_sigma_px)
-        refined = _refined(stars, solution, refined, camera, identifier.catalog)
+        refined = _refined(stars, solution, refined, camera, identifier.catalog.aberrated(observer_velocity))
     again = identifier.with_camera(refined).track(
-        found.xy_px, found.flux, solution.attitude, found.xy_sigma_px
+        found.xy_px, found.flux, solution.attitude, found.xy_sigma_px, observer_velocity=observer_velocity
     )
     if again.valid:
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
     solution = dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
-    return ImageSolution(solution, found, solution.camera or camera, identifier.stars, view.mirrored)
+    seen = identifier.stars.aberrated(observer_velocity)
+    return ImageSolution(solution, found, solution.camera or camera, seen, view.mirrored)
 
 
 def _refined(

@@ -228,12 +228,19 @@ class LsiIdentifier:
         )
         self._identify(xy, np.ones(len(xy)), None, [0.0])
 
-    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+    def identify(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        observer_velocity: ArrayLike | None = None,
+    ) -> Solution:
         """Lost in space: attitude without any knowledge of it.
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `Identifier.identify`.
 
         Raises
@@ -243,7 +250,9 @@ class LsiIdentifier:
         """
         begin = time.perf_counter()
         xy, brightness, _ = checked_detections(xy_px, flux)
-        solution = self._identify(xy, brightness, xy_sigma_px, self._zero_points(brightness))
+        solution = self._identify(
+            xy, brightness, xy_sigma_px, self._zero_points(brightness), observer_velocity
+        )
         if solution.valid:
             self.learn(solution, brightness)
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
@@ -254,6 +263,7 @@ class LsiIdentifier:
         brightness: NDArray[np.float64],
         xy_sigma_px: ArrayLike | None,
         zero_points: Sequence[float],
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """First verified answer of the zero points, tried in their order."""
         tried = verified = 0
@@ -272,7 +282,14 @@ class LsiIdentifier:
                 if attitude is None:
                     continue
                 verified += 1
-                solution = self.verifier.verify(xy, brightness, attitude, xy_sigma_px, window_px=_WINDOW_PX)
+                solution = self.verifier.verify(
+                    xy,
+                    brightness,
+                    attitude,
+                    xy_sigma_px,
+                    window_px=_WINDOW_PX,
+                    observer_velocity=observer_velocity,
+                )
                 if solution.valid:
                     self.last_report = LsiReport(coarse, tried, verified, zero_point)
                     return dataclasses.replace(solution, mode="lost_in_space")
@@ -288,15 +305,18 @@ class LsiIdentifier:
         xy_sigma_px: ArrayLike | None = None,
         *,
         window_px: float | None = None,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Attitude near a predicted one, as the verification finds it; the LSI algorithm has no tracking of its own.
 
         Parameters
         ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px
+        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
             As in `Identifier.track`.
         """
-        return self.verifier.track(xy_px, flux, predicted, xy_sigma_px, window_px=window_px)
+        return self.verifier.track(
+            xy_px, flux, predicted, xy_sigma_px, window_px=window_px, observer_velocity=observer_velocity
+        )
 
     def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
         """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""

@@ -150,17 +150,24 @@ class RsiIdentifier:
             self._filter.reset()
         self.statistics = RsiStatistics()
 
-    def identify(self, xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None) -> Solution:
+    def identify(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        xy_sigma_px: ArrayLike | None = None,
+        *,
+        observer_velocity: ArrayLike | None = None,
+    ) -> Solution:
         """Lost in space, by the LSI algorithm.
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `LsiIdentifier.identify`.
         """
         xy, brightness, _ = checked_detections(xy_px, flux)
         self._follow(xy, brightness)
-        return self.lsi.identify(xy, brightness, xy_sigma_px)
+        return self.lsi.identify(xy, brightness, xy_sigma_px, observer_velocity=observer_velocity)
 
     def track(
         self,
@@ -170,6 +177,7 @@ class RsiIdentifier:
         xy_sigma_px: ArrayLike | None = None,
         *,
         window_px: float | None = None,
+        observer_velocity: ArrayLike | None = None,
     ) -> Solution:
         """Attitude from the region of search about a predicted one, or from the whole sky if that fails.
 
@@ -177,7 +185,7 @@ class RsiIdentifier:
 
         Parameters
         ----------
-        xy_px, flux, xy_sigma_px
+        xy_px, flux, xy_sigma_px, observer_velocity
             As in `LsiIdentifier.identify`.
         predicted
             Attitude expected, or its scalar-last quaternion.
@@ -198,10 +206,10 @@ class RsiIdentifier:
         if window_px is not None:
             side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
-        solution = self._in_region(xy, brightness, true_stars, attitude, side, xy_sigma_px)
+        solution = self._in_region(xy, brightness, true_stars, attitude, side, xy_sigma_px, observer_velocity)
         triggered = not solution.valid
         if triggered:
-            solution = self.lsi.identify(xy, brightness, xy_sigma_px)
+            solution = self.lsi.identify(xy, brightness, xy_sigma_px, observer_velocity=observer_velocity)
         old = self.statistics
         self.statistics = RsiStatistics(
             old.frames + 1,
@@ -248,6 +256,7 @@ class RsiIdentifier:
         predicted: Attitude,
         side_deg: float,
         xy_sigma_px: ArrayLike | None,
+        observer_velocity: ArrayLike | None,
     ) -> Solution:
         """Verified answer from the cells of the region, the likeliest first."""
         lsi = self.lsi
@@ -271,7 +280,9 @@ class RsiIdentifier:
         for attitude, _ in lsi.attitudes(chosen, places):
             if attitude is None:
                 continue
-            solution = lsi.verifier.verify(xy, flux, attitude, xy_sigma_px, window_px=_WINDOW_PX)
+            solution = lsi.verifier.verify(
+                xy, flux, attitude, xy_sigma_px, window_px=_WINDOW_PX, observer_velocity=observer_velocity
+            )
             if solution.valid:
                 lsi.learn(solution, flux)
                 return dataclasses.replace(solution, mode="tracking")

@@ -7,7 +7,7 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
-from starhil.emulator.sky.light import icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA

@@ -182,7 +182,7 @@ def test_orbits_of_a_profile_are_built_from_elements_state_or_tle():
         "kind": "state",
         "position_m": state.position_m.tolist(),
         "velocity_m_s": state.velocity_m_s.tolist(),
-        "epoch": "2026-01-01T00:00:00Z",
+        "date": "2026-01-01T00:00:00Z",
     }
     later = NEW_YEAR + 600.0
     same = ORBIT.validate_python(typed).build(0.0).state(later)
@@ -202,7 +202,7 @@ def test_orbits_of_a_profile_are_built_from_elements_state_or_tle():
             EmulatorError,
         ),
         (
-            {"kind": "kepler", "semi_major_axis_km": 7000, "inclination_deg": 9.0, "epoch": "soon"},
+            {"kind": "kepler", "semi_major_axis_km": 7000, "inclination_deg": 9.0, "date": "soon"},
             ValidationError,
         ),
     ],

@@ -1,0 +1,68 @@
+"""The device's own velocity, from its clock and the orbit in its parameters, to correct stellar aberration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.truth.orbit import EARTH_RADIUS_M, KeplerOrbit
+from starid.earth import earth_velocity
+
+ParameterValue = bool | int | float | str
+
+
+def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> NDArray[np.float64] | None:
+    """Return the velocity (3,) that the device assumes, relative to the barycentre, ICRS, m/s.
+
+    Parameters
+    ----------
+    parameters
+        The device's parameters.
+    unix_s
+        Unix time on the device's clock.
+
+    Returns
+    -------
+    ndarray (3,) or None
+        None if the device does not correct aberration.
+    """
+    if not parameters.get("corrects_aberration", False):
+        return None
+    velocity = earth_velocity(unix_s)
+    orbit = known_orbit(parameters)
+    return velocity if orbit is None else velocity + orbit.state(unix_s).velocity_m_s
+
+
+def known_orbit(parameters: Mapping[str, ParameterValue]) -> KeplerOrbit | None:
+    """Return the orbit in the device's parameters; None if there is none."""
+    elements = {
+        name: float(parameters.get(f"orbit_{name}", 0.0))
+        for name in (
+            "epoch",
+            "semi_major_axis",
+            "eccentricity",
+            "inclination",
+            "node",
+            "perigee",
+            "mean_anomaly",
+        )
+    }
+    if elements["semi_major_axis"] == 0.0:
+        return None
+    return KeplerOrbit(
+        elements["epoch"],
+        1e3 * elements["semi_major_axis"],
+        elements["eccentricity"],
+        math.radians(elements["inclination"]),
+        math.radians(elements["node"]),
+        math.radians(elements["perigee"]),
+        math.radians(elements["mean_anomaly"]),
+    )
+
+
+def perigee_below_surface(semi_major_axis_km: float, eccentricity: float) -> bool:
+    """Whether an orbit that is known, with a semi-major axis other than 0, meets the Earth."""
+    return semi_major_axis_km != 0.0 and 1e3 * semi_major_axis_km * (1.0 - eccentricity) < EARTH_RADIUS_M

@@ -1,0 +1,14 @@
+"""Directions in the sky as vectors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+
+def icrs_vector(ra_deg: float, dec_deg: float) -> npt.NDArray[np.float64]:
+    """Unit vector (3,) of a direction."""
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])

@@ -1,0 +1,242 @@
+"""Sun, Moon, Earth and planets as an observer sees them at a date, by the series of `erfa`.
+
+All directions are apparent: with light time, the observer's parallax and aberration. The Sun's place is good
+to 0.1″, the Moon's to 20″ (`erfa.moon98`), the planets' to 1.5′ (`erfa.plan94`). Magnitudes of the planets
+follow Mallama & Hilton 2018, Saturn's with its rings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.objects import EarthLimb, Moon, PointSource, SunGlare
+from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
+from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, earth_state, in_metres, sun_position, terrestrial_time
+
+Vector = NDArray[np.float64]
+
+SUN_RADIUS_M: Final = 6.957e8
+MOON_RADIUS_M: Final = 1.7374e6
+EARTH_RADIUS_M: Final = 6.371e6
+SMALLEST_EARTH_RAD: Final = math.radians(0.1)
+"""Angular radius below which the Earth is left out."""
+MOON_DISTANCE_M: Final = 3.844e8
+"""Mean distance of the Moon, for which its magnitude is given."""
+
+ATMOSPHERE_M: Final = 12_000.0
+"""Height over which the Earth's limb fades."""
+
+_PLANETS: Final[tuple[tuple[str, int, tuple[float, ...]], ...]] = (
+    ("Mercury", 1, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)),
+    ("Venus", 2, (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)),
+    ("Mars", 4, (-1.601, 2.267e-2, -1.302e-4)),
+    ("Jupiter", 5, (-9.395, -3.7e-4, 6.16e-4)),
+    ("Saturn", 6, (-8.914, 0.026)),
+    ("Uranus", 7, (-7.110,)),
+    ("Neptune", 8, (-7.00,)),
+)
+"""Name, number in `erfa.plan94`, and V at 1 au from Sun and Earth as a polynomial in the phase angle, degrees."""
+
+_SATURN_POLE: Final = (0.08547, 0.07323, 0.99365)
+"""Direction of the pole of Saturn's rings, ICRS (IAU 2015: right ascension 40.589°, declination 83.537°)."""
+
+_LIGHT_TIME_ROUNDS: Final = 2
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Date, place and velocity of the sensor.
+
+    Attributes
+    ----------
+    unix_s : float
+        Unix time.
+    offset_m, relative_velocity_m_s : ndarray (3,) or None
+        Position and velocity relative to the Earth's centre, GCRS; None: at the centre, without an Earth.
+    """
+
+    unix_s: float
+    offset_m: Vector | None = None
+    relative_velocity_m_s: Vector | None = None
+
+    @cached_property
+    def _state(self) -> tuple[Vector, Vector]:
+        position, velocity = self.earth
+        if self.offset_m is not None:
+            position = position + self.offset_m
+        if self.relative_velocity_m_s is not None:
+            velocity = velocity + self.relative_velocity_m_s
+        return position, velocity
+
+    @cached_property
+    def earth(self) -> tuple[Vector, Vector]:
+        """Barycentric position, m, and velocity, m/s, of the Earth's centre, ICRS."""
+        return earth_state(self.unix_s)
+
+    @property
+    def position_m(self) -> Vector:
+        """Barycentric position (3,), ICRS."""
+        return self._state[0]
+
+    @property
+    def velocity_m_s(self) -> Vector:
+        """Barycentric velocity (3,), ICRS."""
+        return self._state[1]
+
+    @cached_property
+    def sun(self) -> Vector:
+        """Barycentric position (3,) of the Sun, m, ICRS."""
+        return sun_position(self.unix_s)
+
+    def towards(self, place_m: Vector) -> Vector:
+        """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
+        gap = place_m - self.position_m
+        return aberrated(gap / np.linalg.norm(gap, axis=-1, keepdims=True), self.velocity_m_s)
+
+    def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
+        """Return the directions (n, 3) of stars with parallax and aberration."""
+        shift = parallax_rad[:, None] * (self.position_m / ASTRONOMICAL_UNIT_M)
+        places = vectors - shift
+        places /= np.linalg.norm(places, axis=1, keepdims=True)
+        return aberrated(places, self.velocity_m_s)
+
+
+def sun_seen_by(observer: Observer, style: SunGlare) -> SunGlare:
+    """Return the Sun in its place, with the other fields of `style`."""
+    return dataclasses.replace(style, **_place(observer.towards(observer.sun)))
+
+
+def moon_seen_by(observer: Observer, style: Moon) -> Moon:
+    """Return the Moon in its place, with its size, phase and magnitude, and the other fields of `style`.
+
+    Its magnitude follows Allen (1976): −12.73 + 0.026 i + 4·10⁻⁹ i⁴ for the phase angle i in degrees.
+    """
+    import erfa
+
+    offset, velocity = in_metres(erfa.moon98(*terrestrial_time(observer.unix_s)))
+    earth, earth_velocity = observer.earth
+    place = earth + offset
+    delay_s = _length(place - observer.position_m) / SPEED_OF_LIGHT_M_S
+    place = place - delay_s * (earth_velocity + velocity)
+    to_observer, to_sun = observer.position_m - place, observer.sun - place
+    distance, sun_distance = _length(to_observer), _length(to_sun)
+    phase = _angle(to_observer / distance, to_sun / sun_distance)
+    degrees = math.degrees(phase)
+    light = 5.0 * math.log10(distance / MOON_DISTANCE_M * sun_distance / ASTRONOMICAL_UNIT_M)
+    direction = observer.towards(place)
+    return dataclasses.replace(
+        style,
+        **_place(direction),
+        diameter_deg=2.0 * math.degrees(math.asin(min(MOON_RADIUS_M / distance, 1.0))),
+        magnitude=-12.73 + 0.026 * degrees + 4e-9 * degrees**4 + light,
+        illuminated=0.5 * (1.0 + math.cos(phase)),
+        bright_limb_deg=_position_angle(direction, observer.towards(observer.sun)),
+    )
+
+
+def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
+    """Return the Earth's disc, lit by the Sun, with the other fields of `style`; None if it is too small or far."""
+    if observer.offset_m is None:
+        return None
+    distance = _length(observer.offset_m)
+    if distance * math.sin(SMALLEST_EARTH_RAD) > EARTH_RADIUS_M or distance == 0.0:
+        return None
+    nadir = -observer.offset_m / distance
+    if observer.relative_velocity_m_s is not None:
+        nadir = aberrated(nadir, observer.relative_velocity_m_s)
+    to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
+    sun = _place(observer.towards(observer.sun))
+    return dataclasses.replace(
+        style,
+        **_place(nadir),
+        radius_deg=math.degrees(math.asin(min(EARTH_RADIUS_M / distance, 1.0))),
+        atmosphere_deg=math.degrees(math.atan(ATMOSPHERE_M / to_limb)),
+        sun_ra_deg=sun["ra_deg"],
+        sun_dec_deg=sun["dec_deg"],
+    )
+
+
+def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
+    """Return the planets from Mercury to Neptune in their places, with their magnitudes."""
+    import erfa
+
+    numbers = np.array([number for _, number, _ in _PLANETS])
+    first, rest = terrestrial_time(observer.unix_s)
+    delay_s = np.zeros(len(numbers))
+    places = np.zeros((len(numbers), 3))
+    for _ in range(_LIGHT_TIME_ROUNDS):
+        heliocentric, _ = in_metres(erfa.plan94(first, rest - delay_s / DAY_S, numbers))
+        places = observer.sun + heliocentric
+        delay_s = np.linalg.norm(places - observer.position_m, axis=1) / SPEED_OF_LIGHT_M_S
+    return tuple(
+        PointSource(**_place(direction), magnitude=_planet_magnitude(observer, place, name, law), name=name)
+        for (name, _, law), place, direction in zip(_PLANETS, places, observer.towards(places), strict=True)
+    )
+
+
+def _planet_magnitude(observer: Observer, place_m: Vector, name: str, law: tuple[float, ...]) -> float:
+    """V magnitude of a planet at a barycentric place."""
+    to_observer, to_sun = observer.position_m - place_m, observer.sun - place_m
+    distance, sun_distance = _length(to_observer), _length(to_sun)
+    phase = math.degrees(_angle(to_observer / distance, to_sun / sun_distance))
+    rings = 0.0
+    if name == "Saturn":
+        tilt = abs(float(to_observer @ np.array(_SATURN_POLE))) / distance
+        rings = -tilt * (1.825 + 0.378 * math.exp(-2.25 * phase))
+    light = 5.0 * math.log10(distance * sun_distance / ASTRONOMICAL_UNIT_M**2)
+    return light + rings + sum(term * phase**power for power, term in enumerate(law))
+
+
+def visible_share_of_sun(observer: Observer, earth: EarthLimb | None) -> float:
+    """Return the share of the Sun's disc that the Earth leaves visible, 0…1 (the limb taken as straight)."""
+    if earth is None:
+        return 1.0
+    radius = math.asin(SUN_RADIUS_M / _length(observer.sun - observer.position_m))
+    above = _angle(observer.towards(observer.sun), icrs_vector(earth.ra_deg, earth.dec_deg))
+    height = (above - math.radians(earth.radius_deg)) / radius
+    if abs(height) >= 1.0:
+        return 1.0 if height > 0.0 else 0.0
+    return (math.acos(-height) + height * math.sqrt(1.0 - height * height)) / math.pi
+
+
+def hidden_by(earth: EarthLimb | None, ra_deg: float, dec_deg: float) -> bool:
+    """Whether the Earth's disc lies in front of a direction."""
+    if earth is None:
+        return False
+    apart = _angle(icrs_vector(ra_deg, dec_deg), icrs_vector(earth.ra_deg, earth.dec_deg))
+    return apart < math.radians(earth.radius_deg)
+
+
+def _place(direction: Vector) -> dict[str, float]:
+    """Right ascension and declination of a direction, degrees, by the names of a body's fields."""
+    x, y, z = direction.tolist()
+    return {
+        "ra_deg": math.degrees(math.atan2(y, x)) % 360.0,
+        "dec_deg": math.degrees(math.atan2(z, math.hypot(x, y))),
+    }
+
+
+def _length(vector: Vector) -> float:
+    """Length of a vector (3,)."""
+    return math.hypot(*vector.tolist())
+
+
+def _angle(one: Vector, other: Vector) -> float:
+    """Angle between two unit vectors, radians."""
+    a, b = one.tolist(), other.tolist()
+    return 2.0 * math.atan2(math.dist(a, b), math.hypot(*(x + y for x, y in zip(a, b, strict=True))))
+
+
+def _position_angle(origin: Vector, target: Vector) -> float:
+    """Position angle of one direction seen from another, from north through east, degrees."""
+    x, y, z = origin.tolist()
+    east, north = np.array([-y, x, 0.0]), np.array([-x * z, -y * z, x * x + y * y])
+    return math.degrees(math.atan2(float(target @ east), float(target @ north))) % 360.0

@@ -1,0 +1,148 @@
+"""The sky of a run: objects at typed directions, and what follows from date and orbit."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sky.ephemeris import (
+    Observer,
+    Vector,
+    earth_seen_by,
+    hidden_by,
+    moon_seen_by,
+    planets_seen_by,
+    sun_seen_by,
+    visible_share_of_sun,
+)
+from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+
+BODIES: Final = ("typed", "ephemeris")
+"""Where Sun, Moon, Earth and planets are: only where they are typed in, or where the date puts them."""
+
+_PLACE: Final = {"ra_deg": 0.0, "dec_deg": 0.0}
+_STYLES: Final[dict[str, Any]] = {
+    "sun": SunGlare(**_PLACE, exclusion_deg=30.0, reach_deg=90.0),
+    "moon": Moon(**_PLACE, reach_deg=90.0),
+    "earth": EarthLimb(**_PLACE),
+}
+"""Defaults of the bodies that the date places."""
+
+_COMPUTED: Final = {
+    "sun": (),
+    "moon": ("diameter_deg", "magnitude", "illuminated", "bright_limb_deg"),
+    "earth": ("radius_deg", "atmosphere_deg", "sun_ra_deg", "sun_dec_deg"),
+}
+"""Fields that follow from the date, besides the direction."""
+
+
+@dataclass(frozen=True)
+class SkyView:
+    """What a sensor sees at one time: objects, and the observer by whose motion the stars are displaced."""
+
+    objects: SkyObjects
+    observer: Observer | None = None
+
+
+class Sky:
+    """The sky of a profile.
+
+    Parameters
+    ----------
+    values
+        The table `[sky]`: the fields of `SkyObjects`, and
+
+        - `date`: set if the stars are to be seen with aberration and parallax;
+        - `bodies`: one of `BODIES`; with `ephemeris`, a table `sun`, `moon` or `earth` without a direction
+          changes the defaults of that body, and one with a direction replaces it;
+        - `aberration`: false for stars without aberration and parallax all the same.
+
+    Raises
+    ------
+    EmulatorError
+        A key or value is invalid.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        fields = dict(values)
+        dated = fields.pop("date", None) is not None
+        bodies = fields.pop("bodies", BODIES[0])
+        if bodies not in BODIES:
+            raise EmulatorError(f"sky bodies: {bodies!r} given, {' or '.join(map(repr, BODIES))} needed")
+        self.by_date = bodies == BODIES[1]
+        """Whether the date places Sun, Moon, Earth and planets."""
+        self._moving = fields.pop("aberration", dated or self.by_date)
+        if not isinstance(self._moving, bool):
+            raise EmulatorError(f"sky aberration: {self._moving!r} given, true or false needed")
+        self._styles = {name: _styled(name, style, fields) for name, style in _STYLES.items() if self.by_date}
+        self._fields = fields
+        self._typed = SkyObjects.from_dict(fields)
+
+    def view(
+        self,
+        unix_s: float | None = None,
+        position_m: Vector | None = None,
+        velocity_m_s: Vector | None = None,
+        faults: Mapping[str, Any] | None = None,
+    ) -> SkyView:
+        """Return the sky at a time.
+
+        Parameters
+        ----------
+        unix_s
+            Date, Unix time; None: only what is typed in.
+        position_m, velocity_m_s
+            Relative to the Earth's centre, GCRS (3,); None: at the centre.
+        faults
+            Fields of `SkyObjects` in place of the profile's.
+
+        Raises
+        ------
+        EmulatorError
+            A field of `faults` is invalid.
+        """
+        objects = SkyObjects.from_dict({**self._fields, **faults}) if faults else self._typed
+        if unix_s is None or not (self.by_date or self._moving):
+            return SkyView(objects)
+        observer = Observer(unix_s, position_m, velocity_m_s)
+        if self.by_date:
+            objects = self._with_bodies(objects, observer)
+        return SkyView(objects, observer if self._moving else None)
+
+    def _with_bodies(self, objects: SkyObjects, observer: Observer) -> SkyObjects:
+        """Add the bodies of the date, but those that are typed in; what the Earth hides is left out."""
+        changes: dict[str, Any] = {"planets": objects.planets + planets_seen_by(observer)}
+        earth = objects.earth or earth_seen_by(observer, self._styles["earth"])
+        changes["earth"] = earth
+        share = visible_share_of_sun(observer, earth)
+        if objects.sun is None and share > 0.0:
+            sun = sun_seen_by(observer, self._styles["sun"])
+            changes["sun"] = dataclasses.replace(sun, electrons_s=share * sun.electrons_s)
+        if objects.moon is None:
+            moon = moon_seen_by(observer, self._styles["moon"])
+            if not hidden_by(earth, moon.ra_deg, moon.dec_deg):
+                changes["moon"] = moon
+        return dataclasses.replace(objects, **changes)
+
+
+def _styled(name: str, style: Any, fields: dict[str, Any]) -> Any:
+    """Return the defaults of a body, changed by its table if that has no direction; the table is then removed."""
+    table = fields.get(name)
+    if not isinstance(table, Mapping) or "ra_deg" in table or "dec_deg" in table:
+        return style
+    computed = [key for key in _COMPUTED[name] if key in table]
+    if computed:
+        raise EmulatorError(
+            f"sky {name}: {computed[0]} follows from the date; leave it out, or give ra_deg and dec_deg"
+        )
+    del fields[name]
+    place = dataclasses.asdict(style)
+    unknown = sorted(table.keys() - place.keys())
+    if unknown:
+        raise EmulatorError(f"sky {name}: unknown key {unknown[0]!r}; known: {', '.join(sorted(place))}")
+    changed = dataclasses.replace(style, **table)
+    SkyObjects(**{name: changed})
+    return changed
