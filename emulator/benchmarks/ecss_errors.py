@@ -26,6 +26,7 @@ from starhil.emulator.errors import EmulatorError
 SIGNIFICANCE: Final = 1e-3
 """Probability with which an influence is reported that is not there."""
 
+BIAS: Final = "bias"
 THERMO_ELASTIC: Final = "thermo-elastic error"
 ABERRATION: Final = "aberration residual"
 
@@ -197,7 +198,7 @@ def static_errors(
     bias_least = standard_error * float(t_distribution.isf(0.5 * SIGNIFICANCE, nested.fields - 1))
     bias = np.where(np.abs(nested.mean) > bias_least, np.abs(nested.mean), 0.0)
     return (
-        ErrorLine("bias", bias, bias_least),
+        ErrorLine(BIAS, bias, bias_least),
         ErrorLine("field-of-view spatial error", factor * np.sqrt(field), factor * np.sqrt(field_least)),
         ErrorLine("pixel spatial error", factor * np.sqrt(pixel), factor * np.sqrt(pixel_least)),
         ErrorLine("temporal noise (NEA)", factor * np.sqrt(nested.noise_ms), np.zeros(3)),

@@ -13,6 +13,9 @@ import numpy as np
 
 from starhil.emulator.benchmarks.ecss_campaign import DATED, INFLUENCES, REST, STATIC, THERMAL, EcssPlan
 from starhil.emulator.benchmarks.ecss_errors import (
+    ABERRATION,
+    BIAS,
+    THERMO_ELASTIC,
     ErrorLine,
     ErrorSeries,
     aberration_residual,
@@ -84,16 +87,17 @@ class EcssReport:
 
     @property
     def total(self) -> ErrorLine:
-        """Bias and thermo-elastic error, plus the root of the sum of the squares of the others."""
-        arcsec = {line.name: np.zeros(3) if line.arcsec is None else line.arcsec for line in self.lines}
-        bias, *random = (arcsec[line.name] for line in self.lines if line.name != "thermo-elastic error")
-        summed = bias + arcsec["thermo-elastic error"] + np.sqrt(sum(part**2 for part in random))
-        return ErrorLine("total", np.asarray(summed), np.zeros(3))
+        """Bias and thermo-elastic error, plus the root of the sum of the squares of the others but aberration."""
+        arcsec = {line.name: line.arcsec for line in self.lines if line.arcsec is not None}
+        steady = [arcsec.pop(name) for name in (BIAS, THERMO_ELASTIC)]
+        random = [size for name, size in arcsec.items() if name != ABERRATION]
+        summed = np.sum(steady, axis=0) + np.sqrt(np.sum(np.square(random), axis=0))
+        return ErrorLine("total without aberration", np.asarray(summed), np.zeros(3))
 
     @property
     def measured(self) -> ErrorLine:
         """Quantile of all errors at rest."""
-        return ErrorLine("measured over sky and orbit", self.measured_arcsec, np.zeros(3))
+        return ErrorLine("measured over sky and orbit, without aberration", self.measured_arcsec, np.zeros(3))
 
     def figures(self) -> dict[str, Any]:
         """Return the figures as plain values."""
@@ -197,7 +201,7 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
             f"From {plan.fields} fields of the sky at {plan.positions} sub-pixel positions with {plan.repeats} frames each, and "
             f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit and {plan.dated_fields} on {plan.dates} dates of a year. An error that does not stand out from the noise "
             "is given as below the smallest that would have. The total is the sum of bias and thermo-elastic error and the root of the "
-            f"sum of the squares of the others; the last line is the quantile of {plan.rest_frames} frames at random attitudes."
+            f"sum of the squares of the others but aberration; the last line is the quantile of {plan.rest_frames} frames at random attitudes."
         ),
         "",
         "## Availability at rest",
@@ -233,7 +237,7 @@ def _error_row(line: ErrorLine) -> str:
     ]
     across, about = line.across_arcsec, line.about_arcsec
     both = [
-        f"{value:.3g}″ ({value / _ARCSEC_PER_DEG:.2g}°)" if value > 0.0 else "—" for value in (across, about)
+        f"{value:.3g}″ ({value / _ARCSEC_PER_DEG:.3g}°)" if value > 0.0 else "—" for value in (across, about)
     ]
     return f"| {line.name} | {' | '.join(cells)} | {' | '.join(both)} |"
 
