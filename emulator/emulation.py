@@ -498,6 +498,8 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False) -> PipelineSet
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped" and not repeatable,
+        dark_frames=profile.device.dark_frames,
+        images=profile.images.resolved(profile.folder),
     )
 
 

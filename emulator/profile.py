@@ -9,9 +9,9 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, PrivateAttr, ValidationError, field_validator
+from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import read_toml
@@ -32,6 +32,8 @@ MAX_EXTENDS_DEPTH: Final = 8
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
 
+Milliamperes = Annotated[float, Field(ge=0.0, le=10_000.0)]
+ParticleRate = Annotated[float, Field(ge=0.0, le=1e6)]
 FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
 PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
 DistortionTerm = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -104,6 +106,79 @@ class DeviceConfig(Strict):
     """Minimum time in boot mode."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames for the body rate, if the star identifier does not estimate it."""
+    dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
+    """Frames averaged on the ground into the dark frame that the unit subtracts from each image; 0: none."""
+
+
+class PowerConfig(Strict):
+    """What the unit draws in each phase of a frame: the first CubeStar's published currents."""
+
+    voltage_v: Annotated[float, Field(ge=0.1, le=100.0)] = 3.3
+    """Supply voltage."""
+    idle_ma: Milliamperes = 71.0
+    """Current while idle, and in modes without frames."""
+    imager_on_ma: Milliamperes = 121.0
+    """Current from switching on the imager to the exposure."""
+    exposure_ma: Milliamperes = 177.0
+    """Current during exposure, read-out and processing."""
+    transfer_ma: Milliamperes = 82.0
+    """Current while the result is transferred."""
+    imager_on_s: FrameSeconds = 0.068
+    """Time by which the imager is on before an exposure."""
+    transfer_s: FrameSeconds = 0.404
+    """Duration of the transfer."""
+
+
+class ThermalConfig(Strict):
+    """Temperature of the unit: its mounting's, and what its own power adds."""
+
+    mounting_c: Annotated[float, Field(ge=-100.0, le=150.0)] = 20.0
+    """Mean temperature of the mounting, degrees Celsius."""
+    swing_c: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    """Amplitude of its variation over an orbit, degrees."""
+    period_s: Annotated[float, Field(ge=1.0, le=1e6)] = 5700.0
+    """Period of that variation."""
+    heating_c_w: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    """Rise of detector and lens above the mounting for each watt of mean power, in the end."""
+    time_constant_s: Annotated[float, Field(ge=0.1, le=1e6)] = 600.0
+    """Time constant of that rise."""
+
+
+class RadiationConfig(Strict):
+    """Energetic particles that hit the detector, in addition to `sky.cosmic_rays_s`."""
+
+    quiet_s: ParticleRate = 0.0
+    """Particles per second outside the South Atlantic Anomaly."""
+    anomaly_s: ParticleRate = 0.0
+    """Particles per second in addition in its centre at an altitude of 500 km; needs a truth with a position."""
+
+
+class ImagesConfig(Strict):
+    """Images from elsewhere in place of rendered ones; `[camera]` is then the camera that takes them."""
+
+    folder: str = ""
+    """Folder of PNG, TIFF or JPEG images, taken in the order of their names; relative to the profile's folder."""
+    capture: Annotated[int, Field(ge=0, le=99)] | str = ""
+    """Number of a camera (0 is the first), or a video file, as OpenCV's `VideoCapture` opens it."""
+    repeat: bool = True
+    """Begin the folder again after its last image."""
+    dark: str = ""
+    """Image of the same camera and exposure without light, to subtract from each."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.folder and self.capture != "":
+            raise ValueError("folder and capture exclude each other; give one of them")
+        return self
+
+    def resolved(self, relative_to: Path) -> dict[str, Any]:
+        """Return the keys, with paths relative to a folder resolved."""
+        files = {
+            key: str(relative_to / Path(value).expanduser())
+            for key, value in (("folder", self.folder), ("dark", self.dark))
+            if value
+        }
+        return {**self.model_dump(), "capture": str(self.capture), **files}
 
 
 class TimingConfig(Strict):
@@ -190,10 +265,18 @@ class Profile(Strict):
     """True attitude of the sensor."""
     orbit: OrbitConfig | None = None
     """True orbit of the spacecraft; none: the sensor is at the Earth's centre, and the Earth is not in its sky."""
+    images: ImagesConfig = ImagesConfig()
+    """Images from elsewhere."""
     device: DeviceConfig = DeviceConfig()
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
     """Modelled processing times."""
+    power: PowerConfig = PowerConfig()
+    """Currents by phase."""
+    thermal: ThermalConfig = ThermalConfig()
+    """Temperature."""
+    radiation: RadiationConfig = RadiationConfig()
+    """Particles along the orbit."""
     links: LinksConfig = LinksConfig()
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)

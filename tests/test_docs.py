@@ -114,6 +114,9 @@ def sensor_defaults() -> dict[str, object]:
         "sensor": dataclasses.asdict(SensorModel(**profile.sensor)),
         "timing": profile.timing.model_dump(),
         "device": profile.device.model_dump(),
+        "thermal": profile.thermal.model_dump(),
+        "power": profile.power.model_dump(),
+        "radiation": profile.radiation.model_dump(),
         "catalog": profile.catalog.model_dump(),
         "parameters": {name: item.default for name, item in load_unit().parameters.items()}
         | profile.parameters,
@@ -124,7 +127,7 @@ def sensor_defaults() -> dict[str, object]:
 def test_sensor_gives_the_defaults_of_the_default_profile():
     defaults, icd = sensor_defaults(), load_unit()
     checked = 0
-    for heading in ("Optics", "Detector", "Timing"):
+    for heading in ("Optics", "Detector", "Temperature, power, radiation", "Timing"):
         for row in table_after("sensor.md", heading):
             if not row[1].startswith("`"):
                 continue
@@ -136,7 +139,7 @@ def test_sensor_gives_the_defaults_of_the_default_profile():
             if key.startswith("parameters."):
                 parameter = icd.parameters[key.removeprefix("parameters.")]
                 assert f"; {parameter.minimum:g} to {parameter.maximum:g} {parameter.unit}" in shown, key
-    assert checked >= 25
+    assert checked >= 40
 
 
 def test_sensor_gives_the_modelled_latency_and_the_highest_rates():

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -24,7 +23,7 @@ import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude, random_attitude
-from starid.files import write_atomically
+from starid.result_store import ResultStore
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.renderer import Renderer
@@ -115,7 +114,8 @@ def made_by() -> dict[str, str]:
     import starid
 
     emulator = Path(__file__).parent.parent
-    roots = (Path(starid.__file__).parent, emulator / "sky", emulator / "sensor", emulator / "benchmarks")
+    rooms = ("sky", "sensor", "pipeline", "benchmarks")
+    roots = (Path(starid.__file__).parent, *(emulator / room for room in rooms))
     digest = hashlib.sha256()
     for root in roots:
         files = [root] if root.is_file() else sorted(root.rglob("*"))
@@ -125,84 +125,6 @@ def made_by() -> dict[str, str]:
                 digest.update(hashlib.sha256(file.read_bytes()).digest())
     versions = {name: importlib.metadata.version(name) for name in ("starhil", *LIBRARIES)}
     return {**versions, "sources": digest.hexdigest()[:16]}
-
-
-class CampaignStore:
-    """The folder of a campaign: its plan, and one file per finished chunk, written atomically."""
-
-    def __init__(self, folder: Path, plan: CampaignPlan) -> None:
-        self.folder = folder
-        plan_file = folder / "plan.json"
-        content = {**asdict(plan), "made_by": made_by()}
-        try:
-            if plan_file.exists():
-                _check_same(plan_file, content)
-                return
-            text = json.dumps(content, indent=1, sort_keys=True)
-            write_atomically(plan_file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-        except OSError as error:
-            raise EmulatorError(
-                f"campaign: {folder} cannot be used: {error.strerror}; give another folder"
-            ) from error
-
-    def _file(self, chunk: int) -> Path:
-        return self.folder / f"chunk-{chunk:06d}.npy"
-
-    def load(self, chunk: int) -> npt.NDArray[np.void] | None:
-        """Return the rows of a finished chunk (RECORD), or None if it is not finished."""
-        file = self._file(chunk)
-        if not file.exists():
-            return None
-        try:
-            rows = np.load(file)
-        except (OSError, ValueError) as error:
-            raise EmulatorError(
-                f"campaign: {file} cannot be read ({error}): remove it to compute it again"
-            ) from error
-        if rows.dtype != RECORD:
-            raise EmulatorError(f"campaign: {file} was made by another version: give another folder")
-        return np.asarray(rows)
-
-    def save(self, chunk: int, rows: npt.NDArray[np.void]) -> None:
-        """Write a finished chunk atomically."""
-        file = self._file(chunk)
-
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as stream:
-                np.save(stream, rows)
-
-        try:
-            write_atomically(file, write)
-        except OSError as error:
-            raise EmulatorError(
-                f"campaign: {file} cannot be written: {error.strerror}; run the same command again to resume"
-            ) from error
-
-
-def _check_same(plan_file: Path, content: dict[str, Any]) -> None:
-    """Reject a plan file with other content, naming the first difference."""
-    try:
-        kept = json.loads(plan_file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise EmulatorError(f"campaign: {plan_file} cannot be read ({error}): give another folder") from error
-    kept = _flat(kept if isinstance(kept, dict) else {})
-    wanted = _flat(content)
-    for key in sorted(kept.keys() | wanted.keys()):
-        if kept.get(key) != wanted.get(key):
-            own = key.startswith("made_by.")
-            remedy = "the version that made it" if own else "the same options"
-            raise EmulatorError(
-                f"campaign: {plan_file} holds another plan: {key} is {kept.get(key)!r} there and "
-                f"{wanted.get(key)!r} here: give another folder, or {remedy}"
-            )
-
-
-def _flat(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the plan with the keys of its inner table as `made_by.NAME`."""
-    inner = content.get("made_by")
-    versions = inner if isinstance(inner, dict) else {}
-    outer = {key: value for key, value in content.items() if key != "made_by"}
-    return {**outer, **{f"made_by.{key}": value for key, value in versions.items()}}
 
 
 class FrameMaker:
@@ -327,6 +249,20 @@ def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
     return np.array([maker.solve(number) for number in numbers], RECORD)
 
 
+def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
+    """Open the folder of a campaign: its plan with the versions of everything that affects it, and finished parts.
+
+    Raises
+    ------
+    StaridError : the folder holds another plan, or cannot be used.
+    """
+    return ResultStore(folder, {**plan, "made_by": made_by()}, "campaign")
+
+
+def _part(chunk: int) -> str:
+    return f"chunk-{chunk:06d}"
+
+
 def _run_numbered(plan: CampaignPlan, chunk: int) -> tuple[int, npt.NDArray[np.void]]:
     return chunk, run_chunk(plan, chunk)
 
@@ -344,22 +280,22 @@ def run_campaign(
 
     Raises
     ------
-    EmulatorError : `folder` holds another campaign or a file that cannot be read.
+    StaridError : `folder` holds another campaign or a file that cannot be read.
     """
     from joblib import Parallel, delayed
 
-    store = None if folder is None else CampaignStore(folder, plan)
+    store = None if folder is None else open_store(folder, asdict(plan))
     todo = []
     for chunk in range(plan.chunks):
-        rows = None if store is None else store.load(chunk)
-        if rows is None:
+        kept = None if store is None else store.load(_part(chunk))
+        if kept is None:
             todo.append(chunk)
         else:
-            yield rows
+            yield kept["rows"]
     work = (delayed(_run_numbered)(plan, chunk) for chunk in todo)
     for chunk, rows in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
         if store is not None:
-            store.save(chunk, rows)
+            store.save(_part(chunk), {"rows": rows})
         yield rows
 
 

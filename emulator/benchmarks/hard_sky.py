@@ -38,18 +38,20 @@ def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
         Source of everything that differs between frames.
     """
     planets = tuple(
-        PointSource(*_direction(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES)))
+        PointSource(
+            *direction_around(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES))
+        )
         for _ in range(_PLANETS)
     )
     moon, sun = None, None
     if rng.random() < 0.5:
         moon = Moon(
-            *_direction(attitude, (0.0, _WITHIN_DEG), rng),
+            *direction_around(attitude, (0.0, _WITHIN_DEG), rng),
             illuminated=float(rng.uniform()),
             bright_limb_deg=float(rng.uniform(0.0, 360.0)),
         )
     else:
-        sun = SunGlare(*_direction(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_ELECTRONS_S)))
+        sun = SunGlare(*direction_around(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_ELECTRONS_S)))
     return SkyObjects(
         moon=moon,
         sun=sun,
@@ -60,7 +62,7 @@ def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
     )
 
 
-def _direction(
+def direction_around(
     attitude: Attitude, away_deg: tuple[float, float], rng: np.random.Generator
 ) -> tuple[float, float]:
     """Draw a direction (RA, Dec in degrees) uniformly from a ring around the boresight."""

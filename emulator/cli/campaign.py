@@ -12,12 +12,74 @@ import typer
 
 from starhil.emulator.cli.options import AsJson
 
-group = typer.Typer(help="Measure accuracy over many seeded frames of random attitude.", no_args_is_help=True)
+group = typer.Typer(
+    help="Measure accuracy over many seeded frames of random attitude.", invoke_without_command=True
+)
 
 
 @group.callback()
-def _campaigns() -> None:
-    """Measure accuracy over many seeded frames of random attitude."""
+def campaigns(
+    context: typer.Context,
+    ecss: Annotated[
+        bool,
+        typer.Option("--ecss", help="Performance of a device after ECSS-E-ST-60-20C, with a report in -o."),
+    ] = False,
+    profile: Annotated[str, typer.Option(help="Device profile: a name or a TOML file.")] = "cubestar",
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the profile; may be repeated."),
+    ] = None,
+    confidence: Annotated[
+        float, typer.Option(help="Level of confidence of the errors, 0.5 to below 1.")
+    ] = 0.997,
+    rest_frames: Annotated[int, typer.Option(min=10, help="Frames over the sky at rest.")] = 2000,
+    frames: Annotated[int, typer.Option(min=5, help="Frames at each value of an influence.")] = 100,
+    fields: Annotated[int, typer.Option(min=3, help="Directions of the sky for the kinds of error.")] = 80,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder for report.md, CSV, plots and, in parts/, finished parts. A second run resumes from it.",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure accuracy over many seeded frames of random attitude.
+
+    With --ecss: bias, thermo-elastic error, field-of-view and pixel spatial error, temporal
+    noise; availability and correct, wrong and invalid attitudes against rate, Sun, Moon, Earth,
+    false stars and particles. Exit status 1 if any attitude at rest is wrong.
+    """
+    if context.invoked_subcommand is not None:
+        if ecss:
+            raise typer.BadParameter(f"--ecss stands alone; leave out {context.invoked_subcommand}")
+        return
+    if not ecss:
+        typer.echo(context.get_help())
+        raise typer.Exit(2)
+    from starhil.emulator.benchmarks.ecss_campaign import EcssPlan, parts, run_ecss
+    from starhil.emulator.benchmarks.ecss_errors import coverage_factor
+    from starhil.emulator.benchmarks.ecss_report import as_markdown, make_report, write_report
+
+    coverage_factor(confidence)  # before hours of work
+    plan = EcssPlan(
+        profile, tuple(setting or ()), seed, fields=fields, rest_frames=rest_frames, frames=frames
+    )
+    folder = None if output is None else output / "parts"
+    finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=jobs), len(parts(plan))))
+    report = make_report(plan, finished, confidence)
+    files = () if output is None else write_report(report, output)
+    if as_json:
+        print(json.dumps({**report.figures(), "files": [str(file) for file in files]}))
+    elif output is None:
+        print(as_markdown(report))
+    else:
+        print(f"report written to {output / 'report.md'}")
+    if report.outcomes[0].wrong:
+        raise typer.Exit(1)
 
 
 @group.command("lost-in-space")

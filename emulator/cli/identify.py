@@ -70,6 +70,10 @@ def command(
             help="Convert a colour image to grey, or reject it; default: reject, but convert with --fov.",
         ),
     ] = None,
+    dark: Annotated[
+        Path | None,
+        typer.Option(help="Image of the same camera, exposure and temperature without light, to subtract."),
+    ] = None,
     annotate: Annotated[
         Path | None,
         typer.Option(
@@ -91,7 +95,12 @@ def command(
     if annotate is not None:
         image_suffix(annotate)
         prepare_output(annotate, "-o")
-    pixels = read_image(image, allow_colour=fov is not None if allow_colour is None else allow_colour)
+    colour = fov is not None if allow_colour is None else allow_colour
+    pixels = read_image(image, allow_colour=colour)
+    if dark is not None:
+        from starid.imaging.dark_frame import dark_excess, without_dark
+
+        pixels = without_dark(pixels, dark_excess(read_image(dark, allow_colour=colour)))
     unix_s = None if date is None else _unix_time(date)
     if epoch is None:
         epoch = DEFAULT_EPOCH if unix_s is None else float(round(julian_year(unix_s)))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.parameters import memory_bits
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.wire_faults import WireFaultSettings
+from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
 
@@ -41,6 +43,25 @@ NO_ERROR: Final = 0
 """Value in `device_error` that means no error."""
 
 
+class UpsetFault(Strict):
+    """A bit that a particle flips in the device's memory: of a parameter, or of a star's direction in the catalogue."""
+
+    parameter: str | None = None
+    """Name of the parameter."""
+    star: Annotated[int, Field(ge=1, le=200_000)] | None = None
+    """Hipparcos number of the star."""
+    component: Annotated[int, Field(ge=0, le=2)] = 0
+    """Component of the star's direction: 0, 1 or 2 for x, y or z."""
+    bit: Annotated[int, Field(ge=0, le=63)]
+    """Bit, 0 the least significant; components of directions have 32."""
+
+    @model_validator(mode="after")
+    def _one_target(self) -> Self:
+        if (self.parameter is None) == (self.star is None):
+            raise ValueError("give either parameter or star")
+        return self
+
+
 class DeviceFault(Strict):
     """A fault of the device."""
 
@@ -50,6 +71,8 @@ class DeviceFault(Strict):
     """Enter the error mode with this error, a name of the enumeration `device_error`."""
     reset: str | None = None
     """Restart now for this cause, a name of the enumeration `reset_cause`."""
+    upset: UpsetFault | None = None
+    """Flip a bit in the memory; a restart, or restoring the parameters, undoes it."""
 
 
 class WireFault(Strict):
@@ -126,6 +149,14 @@ class Faults:
                 device.reset(request.device.reset)
             if request.device.error is not None:
                 device.modes.fail(request.device.error)
+            if request.device.upset is not None:
+                self._upset(request.device.upset)
+
+    def _upset(self, upset: UpsetFault) -> None:
+        if upset.parameter is not None:
+            self._device.upset_parameter(upset.parameter, upset.bit)
+        elif upset.star is not None:
+            self._device.cycle.upsets += (CatalogUpset(upset.star, upset.component, upset.bit),)
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected.
@@ -144,6 +175,8 @@ class Faults:
             ):
                 if name is not None and name not in known:
                     raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
+            if request.device.upset is not None:
+                self._check_upset(request.device.upset)
         there = {name for name, _ in self._wires}
         for name, fault in (("serial", request.serial), ("can", request.can)):
             if fault is not None and name not in there:
@@ -151,12 +184,27 @@ class Faults:
                     f"{name}: this run has no such link; start it with --{name}, or leave this out"
                 )
 
+    def _check_upset(self, upset: UpsetFault) -> None:
+        if upset.parameter is not None:
+            definition = self._device.icd.parameters.get(upset.parameter)
+            if definition is None:
+                raise EmulatorError(f"device.upset.parameter: {upset.parameter!r} is no parameter")
+            if upset.bit >= memory_bits(definition):
+                raise EmulatorError(
+                    f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"
+                )
+        elif upset.bit >= DIRECTION_BITS:
+            raise EmulatorError(f"device.upset.bit: a direction has bits 0 to {DIRECTION_BITS - 1}")
+        elif self._device.profile.run.algorithm != "geometric":
+            raise EmulatorError("device.upset.star: only the algorithm geometric keeps directions in memory")
+
     def clear(self) -> None:
-        """Remove all faults; the error mode is left by telecommand only."""
+        """Remove all faults; the error mode is left by telecommand only, and flipped parameters by a restart."""
         self._optical = {}
         device = self._device
         device.cycle.faults = lambda _index: {}
         device.unresponsive = False
+        device.cycle.upsets = ()
         for _, wire in self._wires:
             wire.settings = WireFaultSettings()
 
@@ -167,6 +215,9 @@ class Faults:
             found["optical"] = dict(self._optical)
         if self._device.unresponsive:
             found["device"] = {"stuck": True}
+        if self._device.cycle.upsets:
+            stars = [upset.hip for upset in self._device.cycle.upsets]
+            found.setdefault("device", {})["upset_stars"] = stars
         for name, wire in self._wires:
             if not wire.settings.none:
                 found[name] = vars(wire.settings)

@@ -23,12 +23,14 @@ from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.imager import Imager, PipelineReply
 from starhil.emulator.pipeline.messages import (
     ZERO,
+    CatalogUpset,
     Failure,
     FrameRequest,
     FrameResult,
@@ -100,6 +102,14 @@ class Measurement:
         return (self.published_ns - self.mid_ns) / NANOSECONDS
 
 
+@dataclass(frozen=True)
+class Conditions:
+    """What the surroundings do to the detector: its temperature, °C, and particles per second."""
+
+    temperature_c: float | None = None
+    particles_s: float = 0.0
+
+
 @dataclass
 class _Frame:
     """An exposure that is not published yet."""
@@ -162,6 +172,9 @@ class FrameCycle:
         """True date at simulation time zero, Unix time."""
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
         self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
+        self.conditions: Callable[[TruthState], Conditions] = lambda _truth: Conditions()
+        self.upsets: tuple[CatalogUpset, ...] = ()
+        """Bits flipped in the star catalogue since start-up."""
         self.after_exposure: Callable[[], None] | None = None
         """Called once, when the next exposure has been sent to the pipeline."""
         self.index = 0
@@ -174,6 +187,17 @@ class FrameCycle:
     def running(self) -> bool:
         """Whether the sensor is exposing."""
         return self._next is not None
+
+    @property
+    def timing(self) -> FrameTiming:
+        """When the sensor exposes and for how long it is busy."""
+        tracking = self.mode() is Mode.TRACKING
+        return FrameTiming(
+            self.running,
+            self._grid_ns + int(self._parameters["delay_time"]) * 1_000_000,
+            self._exposure_s() + self._processing_ns(tracking=tracking) / NANOSECONDS,
+            self._period_ns() / NANOSECONDS,
+        )
 
     def start(self) -> None:
         """Start to expose now."""
@@ -194,6 +218,7 @@ class FrameCycle:
         self.stop()
         self._rates.clear()
         self.published = self.skipped = 0
+        self.upsets = ()
 
     def retime(self) -> None:
         """Apply a new update rate at once."""
@@ -314,6 +339,7 @@ class FrameCycle:
         parameters = self._parameters
         chosen: dict[str, Any] = {name: parameters[name] for name in _SETTINGS}
         settings = SolverSettings(**chosen)
+        conditions = self.conditions(truth)
         return FrameRequest(
             index=index,
             attitude_xyzw=as_quaternion(truth.attitude),
@@ -324,6 +350,9 @@ class FrameCycle:
             predicted_xyzw=None if predicted is None else as_quaternion(predicted),
             settings=settings,
             faults=self.faults(index),
+            temperature_c=conditions.temperature_c,
+            particles_s=conditions.particles_s,
+            upsets=self.upsets,
             unix_s=truth.unix_s,
             position_m=None if truth.orbit is None else as_triple(truth.orbit.position_m),
             velocity_m_s=None if truth.orbit is None else as_triple(truth.orbit.velocity_m_s),

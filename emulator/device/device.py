@@ -9,11 +9,12 @@ from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
 from starhil.emulator.device.counters import Acknowledge, Counters
-from starhil.emulator.device.cycle import FrameCycle, Measurement
+from starhil.emulator.device.cycle import Conditions, FrameCycle, Measurement
 from starhil.emulator.device.file_download import FileDownload
 from starhil.emulator.device.images import ImageStore
 from starhil.emulator.device.modes import Mode, Modes, Transition
 from starhil.emulator.device.parameters import Parameters, ParameterValue
+from starhil.emulator.device.power import PowerModel, ThermalModel
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
@@ -22,8 +23,9 @@ from starhil.emulator.guard import call_guarded, log_internal_error, one_line
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import IDENTITY, FrameRequest, Quaternion
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
+from starhil.emulator.sky.radiation import particle_rate
 from starhil.emulator.truth.orbit import Orbit
-from starhil.emulator.truth.source import TruthSource
+from starhil.emulator.truth.source import TruthSource, TruthState
 from starhil.protocol.codec import Field
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
@@ -124,6 +126,9 @@ class Device:
             profile.device.rate_window,
         )
         self.cycle.truth = truth
+        self.cycle.conditions = self._conditions
+        self.power = PowerModel(profile.power)
+        self.thermal = ThermalModel(profile.thermal)
         self.cycle.start_unix_s = profile.start_unix_s
         self.cycle.orbit = orbit_of(profile)
         self.cycle.mode = lambda: self.modes.mode
@@ -201,6 +206,7 @@ class Device:
         self.accepted.clear()
         self.modes.reset()
         self.mode_changes = self.frames_valid = self.valid_in_a_row = 0
+        self.thermal.start(self.started_ns, self.power.mean_power_w(self.cycle.timing))
         for name in self.parameters.restore(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
         for observer in self.on_start:
@@ -271,6 +277,12 @@ class Device:
         """Set all parameters to their stored values, or to their defaults where none is stored."""
         self.parameters.restore(self._stored_parameters)
 
+    def upset_parameter(self, name: str, bit: int) -> None:
+        """Flip a bit of a parameter in memory; enter the error mode if the result is not a valid setting."""
+        log.warning("bit %d of the parameter %s flipped", bit, name)
+        if not self.parameters.flip_bit(name, bit):
+            self.modes.fail("parameter_store")
+
     def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
         content = self._persistent_state()
         self._background(lambda: self.store.save(content), done)
@@ -322,6 +334,7 @@ class Device:
             self.cycle.stop()
             self.images.cycle_stopped()
             self.latest = None
+        self._power_changed()
         for observer in self.on_mode:
             call_guarded("mode", observer, transition)
 
@@ -336,6 +349,19 @@ class Device:
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if names & {"update_rate", "exposure", "delay_time"}:
             self.cycle.retime()
+            self._power_changed()
+
+    # --- surroundings ---
+
+    def _power_changed(self) -> None:
+        self.thermal.set_power(self.clock.now_ns(), self.power.mean_power_w(self.cycle.timing))
+
+    def _conditions(self, truth: TruthState) -> Conditions:
+        """Return what the surroundings do to the detector now."""
+        radiation = self.profile.radiation
+        position_m = None if truth.orbit is None else truth.orbit.position_m
+        particles_s = particle_rate(radiation.quiet_s, radiation.anomaly_s, position_m, truth.unix_s)
+        return Conditions(self.thermal.temperature_c(self.clock.now_ns()), particles_s)
 
 
 def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:

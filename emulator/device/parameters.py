@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
@@ -16,6 +17,19 @@ ParameterValue = bool | int | float | str
 ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
 """Pairs whose first parameter must not exceed the second."""
 
+_WIRE_FORMATS: Final = {
+    "bool": "<B",
+    "enum8": "<B",
+    "u8": "<B",
+    "i8": "<b",
+    "u16": "<H",
+    "i16": "<h",
+    "u32": "<I",
+    "i32": "<i",
+    "f32": "<f",
+    "f64": "<d",
+}
+"""Type of a parameter → its format in memory."""
 ORBIT_SIZE: Final = ("orbit_semi_major_axis", "orbit_eccentricity")
 """Parameters that determine the perigee."""
 
@@ -29,6 +43,19 @@ def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
     Read-out and processing overlap with the next exposure and do not count.
     """
     return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
+
+
+def memory_bits(definition: Parameter) -> int:
+    """Return the number of bits of a parameter in memory."""
+    return 8 * struct.calcsize(_WIRE_FORMATS[definition.type])
+
+
+def flipped_number(value: float, wire_format: str, bit: int) -> float:
+    """Return a number with one bit of its memory flipped, 0 the least significant."""
+    whole = wire_format[-1] not in "fd"
+    raw = bytearray(struct.pack(wire_format, int(value) if whole else value))
+    raw[bit // 8] ^= 1 << bit % 8
+    return float(struct.unpack(wire_format, raw)[0])
 
 
 def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...], str] | None:
@@ -115,6 +142,20 @@ class Parameters(Mapping[str, ParameterValue]):
             A value is outside its limits, or two values contradict each other.
         """
         self._assign(self._checked(self._values, changes))
+
+    def flip_bit(self, name: str, bit: int) -> bool:
+        """Flip a bit of a parameter in memory, as a particle does; return whether the result is a valid setting.
+
+        A setting that is not valid is replaced by the default, as the device finds it when it checks its parameters.
+        """
+        definition = self._definitions[name]
+        flipped = flipped_number(self.number(name), _WIRE_FORMATS[definition.type], bit)
+        try:
+            self.set({name: flipped})
+        except MessageError:
+            self._assign({name: self._defaults[name]})
+            return False
+        return True
 
     def set_defaults(self) -> None:
         """Set all parameters to their defaults."""

@@ -237,6 +237,22 @@ QUANTITIES["request.processed"] = lambda shot: shot.device.acknowledge.processed
 QUANTITIES["request.error"] = lambda shot: shot.device.acknowledge.error.name.lower()
 QUANTITIES["request.index"] = lambda shot: shot.device.acknowledge.parameter_index
 
+# --- health ---
+
+QUANTITIES["power.phase"] = lambda shot: shot.phase.value
+QUANTITIES["power.voltage"] = lambda shot: shot.device.profile.power.voltage_v
+QUANTITIES["power.current"] = lambda shot: shot.device.power.current_a(shot.phase)
+QUANTITIES["power.now"] = lambda shot: shot.device.power.power_w(shot.phase)
+QUANTITIES["power.mean"] = lambda shot: shot.device.power.mean_power_w(shot.device.cycle.timing)
+QUANTITIES["temperature.mounting"] = lambda shot: shot.device.thermal.mounting_c(shot.device.clock.now_ns())
+QUANTITIES["temperature.detector"] = lambda shot: shot.device.thermal.temperature_c(
+    shot.device.clock.now_ns()
+)
+_of_frame("sky.sun_in_field", lambda frame: "sun" in frame.result.in_field)
+_of_frame("sky.moon_in_field", lambda frame: "moon" in frame.result.in_field)
+_of_frame("sky.earth_in_field", lambda frame: "earth" in frame.result.in_field)
+_of_frame("rate.too_high", lambda frame: frame.reason == "rate_too_high")
+
 # --- parameters ---
 
 QUANTITIES["parameters.changed"] = lambda shot: shot.device.parameters.differ_from_store

@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.power import Phase
 from starhil.emulator.device.reported import Reported, reported
 from starhil.emulator.pipeline.messages import MatchedStar
 
@@ -67,6 +68,11 @@ class Snapshot:
         """Middle of the exposure on the device's clock since the unit's epoch, nanoseconds; None without a frame."""
         frame = self.frame
         return None if frame is None else self.device.icd.conventions.reported_ns(frame.mid_unix_ns)
+
+    @once
+    def phase(self) -> Phase:
+        """The phase of the cycle of a frame."""
+        return self.device.power.phase(self.device.cycle.timing, self.device.clock.now_ns())
 
     @once
     def uptime_ns(self) -> int:

@@ -41,6 +41,10 @@ class PipelineSetup:
         that a run on the stepped clock is reproducible byte for byte.
     previews
         Somebody may look at the frames: be ready to make previews.
+    dark_frames
+        Frames averaged into the dark frame that is subtracted from each image; 0: none.
+    images
+        Images from elsewhere in place of rendered ones: keys of a profile's `[images]`.
     """
 
     camera: dict[str, Any]
@@ -53,6 +57,8 @@ class PipelineSetup:
     seed: int
     build_in_background: bool = False
     previews: bool = False
+    dark_frames: int = 0
+    images: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,29 @@ class SolverSettings:
     p2: float = 0.0
 
 
+DIRECTION_BITS: Final = 32
+"""Bits of a component of a star's direction in the unit's memory."""
+
+
+@dataclass(frozen=True)
+class CatalogUpset:
+    """A bit flipped in the unit's star catalogue.
+
+    Attributes
+    ----------
+    hip
+        Hipparcos number of the star.
+    component
+        Component of its direction: 0, 1 or 2 for x, y or z.
+    bit
+        Bit of the component in single precision, 0 the least significant.
+    """
+
+    hip: int
+    component: int
+    bit: int
+
+
 @dataclass(frozen=True)
 class FrameRequest:
     """Render one exposure and, if requested, solve it.
@@ -100,6 +129,12 @@ class FrameRequest:
         Parameters of detection and identification.
     faults
         Fields of the sky objects that the control channel overrides.
+    temperature_c
+        Temperature of detector and lens, °C; None: that of the sensor model.
+    particles_s
+        Particles per second that hit the detector, in addition to those of the sky.
+    upsets
+        Bits that radiation has flipped in the unit's star catalogue.
     unix_s
         True date of mid-exposure, Unix time; None leaves the sky undated.
     position_m, velocity_m_s
@@ -120,6 +155,9 @@ class FrameRequest:
     predicted_xyzw: Quaternion | None = None
     settings: SolverSettings = field(default_factory=SolverSettings)
     faults: dict[str, Any] = field(default_factory=dict)
+    temperature_c: float | None = None
+    particles_s: float = 0.0
+    upsets: tuple[CatalogUpset, ...] = ()
     unix_s: float | None = None
     position_m: Triple | None = None
     velocity_m_s: Triple | None = None
@@ -180,6 +218,8 @@ class FrameResult:
         True if solved with the star index of earlier settings, while the index for these is being built.
     background_dn, noise_dn
         Level and noise of the background, counts.
+    in_field
+        Bodies in or at the field of view: `sun`, `moon`, `earth`.
     render_s, detect_s, identify_s
         Wall time of each step, for the log; never in telemetry.
     preview
@@ -203,6 +243,7 @@ class FrameResult:
     index_pending: bool = False
     background_dn: float = 0.0
     noise_dn: float = 0.0
+    in_field: tuple[str, ...] = ()
     solved: bool = True
     render_s: float = 0.0
     detect_s: float = 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
 from starhil.emulator.pipeline.binning import mean_over_squares
+from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
+from starhil.emulator.pipeline.image_source import ImageSource, open_images, used_bits
 from starhil.emulator.pipeline.messages import (
     IDENTITY,
     ZERO,
@@ -25,14 +27,16 @@ from starhil.emulator.pipeline.messages import (
     MatchedStar,
     PipelineReady,
     PipelineSetup,
+    Preview,
     SolverSettings,
     Triple,
 )
 from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
 from starhil.emulator.pipeline.preview import make_preview
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
+from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
-from starhil.emulator.sensor.renderer import Frame, Renderer
+from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starhil.emulator.sky.view import Sky
 from starid.aberration import aberrated
@@ -77,13 +81,32 @@ def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Fail
     begin = time.perf_counter()
     try:
         pipeline = Pipeline(setup)
+        images = open_images(setup.images, pipeline.camera)
+        if images is not None:
+            images.image(0)  # one of another size fails before the long start
         pipeline.warm_up()
+        pipeline.images = images
     except (EmulatorError, StaridError) as error:
         return Failure(str(error))
     except Exception as error:  # noqa: BLE001 (reported in one line instead of the worker's traceback)
         return Failure(f"pipeline: internal error: {one_line(error)}")
     warm = PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), time.perf_counter() - begin)
     return pipeline, warm
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    """An image, the number of bits it uses, the number of its exposure, and the bodies in its field.
+
+    A rendered one has its truth too: the frame and the objects of the sky.
+    """
+
+    image: NDArray[Any]
+    bits: int
+    index: int
+    in_field: tuple[str, ...] = ()
+    frame: Frame | None = None
+    objects: SkyObjects = field(default_factory=SkyObjects)
 
 
 class Pipeline:
@@ -99,7 +122,10 @@ class Pipeline:
             lambda wanted: wanted.make(self.catalog), in_background=setup.build_in_background
         )
         self._sky = Sky(setup.sky)
-        self._last: Frame | None = None
+        self._last: _Exposure | None = None
+        self.images: ImageSource | None = None
+        """Where images come from; None: they are rendered."""
+        self._dark: DarkMap | None = None
 
     def warm_up(self) -> None:
         """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
@@ -131,7 +157,7 @@ class Pipeline:
         if helper is not None:
             for rate in _WARM_UP_RATES_RAD_S:
                 frame = self._renderer.render(Attitude.identity(), rate)
-                detect(frame.image, detection_settings(self._sensor, settings))
+                detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
             helper.wait()  # kernels it compiled are loaded below; any others are compiled there
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
             self._process_frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
@@ -155,34 +181,72 @@ class Pipeline:
         sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
         if sensor.gain != self._renderer.sensor.gain:
             self._renderer = self._renderer.with_sensor(sensor)
+        exposure = self._last = self._expose(request)
+        rendered = time.perf_counter()
+        if not request.solve:
+            preview = self._preview(exposure, sensor) if request.preview else None
+            return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
+        if self.images is None:
+            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
+        else:
+            image, known = exposure.image, DetectionSettings()
+        found = detect(image, detection_settings(known, request.settings))
+        detected = time.perf_counter()
+        identifier, current = self._identifiers.get(self._identifier_setup(request))
+        solution = self._solve(identifier, found, request)
+        solved = time.perf_counter()
+        result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        result = with_bodies(result, exposure.in_field)
+        if request.preview:
+            result = replace(result, preview=self._preview(exposure, sensor, found, solution))
+        return result if current else replace(result, index_pending=True)
+
+    def _preview(
+        self,
+        exposure: _Exposure,
+        sensor: SensorModel,
+        found: Detections | None = None,
+        solution: Solution | None = None,
+    ) -> Preview:
+        """Return the preview of an image; of one from elsewhere, without its truth."""
+        frame = exposure.frame or frame_without_truth(exposure.image, exposure.index)
+        return make_preview(frame, self.camera, sensor, exposure.objects, found, solution)
+
+    def _expose(self, request: FrameRequest) -> _Exposure:
+        """Take the next image: from elsewhere, or rendered."""
+        if self.images is not None:
+            image = self.images.image(request.index)
+            return _Exposure(image, used_bits(image), request.index)
         attitude = Attitude(np.array(request.attitude_xyzw))
         sky = self._sky.view(
             request.unix_s, _vector(request.position_m), _vector(request.velocity_m_s), request.faults
         )
+        objects = sky.objects
+        if request.particles_s > 0.0:
+            objects = replace(objects, cosmic_rays_s=objects.cosmic_rays_s + request.particles_s)
         frame = self._renderer.render(
             attitude,
             request.rate_rad_s,
             request.index,
             exposure_s=request.exposure_s,
-            objects=sky.objects,
+            temperature_c=request.temperature_c,
+            objects=objects,
             observer=sky.observer,
         )
-        self._last = frame
-        rendered = time.perf_counter()
-        if not request.solve:
-            preview = make_preview(frame, self.camera, sensor, sky.objects) if request.preview else None
-            return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
-        found = detect(frame.image, detection_settings(sensor, request.settings))
-        detected = time.perf_counter()
-        identifier, current = self._identifiers.get(self._identifier_setup(request.settings))
-        solution = self._solve(identifier, found, request)
-        solved = time.perf_counter()
-        result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
-        if request.preview:
-            result = replace(
-                result, preview=make_preview(frame, self.camera, sensor, sky.objects, found, solution)
+        in_field = bodies_in_field(objects, attitude, self.camera)
+        return _Exposure(frame.image, self._sensor.bits, frame.frame_index, in_field, frame, objects)
+
+    def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
+        """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""
+        if self._setup.dark_frames == 0:
+            return image
+        if self._dark is None:
+            camera, setup = self.camera, self._setup
+            self._dark = measure_dark_map(
+                self._sensor, camera.height, camera.width, setup.dark_frames, setup.seed
             )
-        return result if current else replace(result, index_pending=True)
+        temperature = self._sensor.temperature_c if request.temperature_c is None else request.temperature_c
+        return self._dark.subtracted(image, request.exposure_s, request.gain, temperature)
 
     def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
         settings = request.settings
@@ -208,16 +272,18 @@ class Pipeline:
             return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
         return solution
 
-    def _identifier_setup(self, settings: SolverSettings) -> StarIdentifierSetup:
+    def _identifier_setup(self, request: FrameRequest) -> StarIdentifierSetup:
         """Return the setup of the star identifier for these parameters and the calibrated camera."""
-        setup = self._setup
+        setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
         camera = calibrated_camera(self.camera, settings)
         margin = settings.error_margin / 100.0
-        return StarIdentifierSetup(setup.algorithm, camera, margin, tuple(sorted(options.items())))
+        return StarIdentifierSetup(
+            setup.algorithm, camera, margin, tuple(sorted(options.items())), request.upsets
+        )
 
     def _frame_result(
         self,
@@ -272,7 +338,7 @@ class Pipeline:
     def _scaled_image(self, request: ImageRequest) -> ImageResult:
         if self._last is None:
             return ImageResult(0, 0, -1, b"")
-        image, bits, frame = self._last.image, self._sensor.bits, self._last.frame_index
+        image, bits, frame = self._last.image, self._last.bits, self._last.index
         if request.edge == 0:
             height, width = image.shape
             return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
@@ -295,9 +361,10 @@ def _within_margin(
     return int(np.count_nonzero(offset_px <= request.settings.validation_margin))
 
 
-def detection_settings(sensor: SensorModel, settings: SolverSettings) -> DetectionSettings:
-    """Return the detection settings for the device's parameters."""
-    return sensor.detection_settings(
+def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:
+    """Return what is known of the image, with the thresholds of the device's parameters."""
+    return replace(
+        known,
         threshold_sigma=settings.detection_threshold,
         pixel_sigma=settings.star_threshold,
         min_star_pixels=settings.min_star_pixels,

@@ -12,13 +12,19 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.messages import CatalogUpset
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.interface import ALGORITHMS, StarIdentifier, make_identifier
+
+if TYPE_CHECKING:
+    from starid.geometric.identifier import Identifier
 
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "float": (int, float),
@@ -43,12 +49,15 @@ class StarIdentifierSetup:
         Tolerance of triangle sides relative to the nominal one; geometric algorithm only.
     options
         Keyword arguments of the algorithm's class, sorted by name.
+    upsets
+        Bits flipped in the directions of its stars; geometric algorithm only.
     """
 
     algorithm: str
     camera: Camera
     margin: float
     options: tuple[tuple[str, Any], ...]
+    upsets: tuple[CatalogUpset, ...] = ()
 
     def make(self, catalog: StarCatalog) -> StarIdentifier:
         """Make the star identifier; takes seconds if its index is not cached on disk.
@@ -60,12 +69,16 @@ class StarIdentifierSetup:
         """
         options = dict(self.options)
         self._check_options(options)
-        if self.algorithm == "geometric":
-            from starid.geometric.identifier import Effort
+        if self.algorithm != "geometric":
+            return make_identifier(self.algorithm, self.camera, catalog, **options)
+        from starid.geometric.identifier import Effort, Identifier
 
-            nominal = Effort()
-            options["effort"] = replace(nominal, tolerance_px=nominal.tolerance_px * self.margin)
-        return make_identifier(self.algorithm, self.camera, catalog, **options)
+        nominal = Effort()
+        options["effort"] = replace(nominal, tolerance_px=nominal.tolerance_px * self.margin)
+        identifier = Identifier(self.camera, catalog, **options)
+        for upset in self.upsets:
+            identifier = _with_upset(identifier, upset)
+        return identifier
 
     def _check_options(self, options: dict[str, Any]) -> None:
         """Reject an option that the algorithm does not have, or a value of the wrong type."""
@@ -81,6 +94,18 @@ class StarIdentifierSetup:
                 raise EmulatorError(
                     f"identifier.{option}: {value!r} given, {known[option].removesuffix(' | None')} needed"
                 )
+
+
+def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:
+    """Return the identifier with one bit of a star's direction flipped; itself if it does not hold the star."""
+    rows = np.flatnonzero(identifier.stars.hip == upset.hip)
+    if len(rows) == 0:
+        return identifier
+    direction = identifier.directions[rows[0]].copy()
+    bits = direction.astype(np.float32).view(np.uint32)
+    bits[upset.component] ^= np.uint32(1 << upset.bit)
+    direction[upset.component] = bits.view(np.float32)[upset.component]
+    return identifier.with_direction(int(rows[0]), direction)
 
 
 def _known_options(algorithm: type) -> dict[str, str]:

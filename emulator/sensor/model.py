@@ -32,6 +32,15 @@ _RANGES: Final[dict[str, tuple[float, float, str]]] = {
     "full_well_e": (10.0, 1e7, "electrons"),
     "read_noise_e": (0.0, 1e4, "electrons"),
     "dark_e_s": (0.0, 1e6, "electrons/s"),
+    "temperature_c": (-100.0, 150.0, "°C"),
+    "reference_c": (-100.0, 150.0, "°C"),
+    "dark_doubling_c": (1.0, 100.0, "°C"),
+    "row_time_s": (0.0, 0.01, "seconds"),
+    "boresight_drift_x": (-1000.0, 1000.0, "arcseconds/°C"),
+    "boresight_drift_y": (-1000.0, 1000.0, "arcseconds/°C"),
+    "boresight_drift_z": (-1000.0, 1000.0, "arcseconds/°C"),
+    "focal_drift": (-1e-3, 1e-3, "a share/°C"),
+    "k1_drift": (-1e-2, 1e-2, "1/°C"),
     "sky_mag_arcsec2": (-10.0, 40.0, "magnitudes/arcsec²"),
     "dsnu": (0.0, 2.0, "a share of the dark current"),
     "prnu": (0.0, 0.3, "a share"),
@@ -83,7 +92,22 @@ class SensorModel:
     read_noise_e : float
         Electrons, standard deviation.
     dark_e_s : float
-        Mean dark current, electrons/s.
+        Mean dark current at `reference_c`, electrons/s.
+    temperature_c : float
+        Temperature of detector and lens, °C, where no other is given for a frame.
+    reference_c : float
+        Temperature at which dark currents, lens and mounting have their stated values, °C.
+    dark_doubling_c : float
+        Rise of the temperature that doubles the dark current, °C; 5 to 8 for silicon.
+    row_time_s : float
+        Time from the exposure of one row to that of the next, seconds: 0 for a global shutter, which exposes all rows
+        at once. The middle row of a rolling shutter is exposed at the time of the frame.
+    boresight_drift_x, boresight_drift_y, boresight_drift_z : float
+        Rotation of the optics relative to the mounting about the axes of the sensor frame, arcseconds/°C.
+    focal_drift : float
+        Relative change of the focal length, 1/°C.
+    k1_drift : float
+        Change of the distortion k1, 1/°C.
     sky_mag_arcsec2 : float
         Brightness of the empty sky (zodiacal light and unresolved stars), V magnitudes/arcsec².
     dsnu, prnu : float
@@ -91,7 +115,7 @@ class SensorModel:
     hot_pixels, dead_pixels : int
         Number of pixels with excessive dark current, and without signal.
     hot_e_s : float
-        Median dark current of hot pixels, electrons/s; log-normal with a factor of 2.7 per sigma.
+        Median dark current of hot pixels at `reference_c`, electrons/s; log-normal with a factor of 2.7 per sigma.
     pattern_seed : int
         Seed of the fixed pattern.
     limiting_magnitude : float
@@ -118,6 +142,15 @@ class SensorModel:
     full_well_e: float = 15000.0
     read_noise_e: float = 12.0
     dark_e_s: float = 30.0
+    temperature_c: float = 20.0
+    reference_c: float = 20.0
+    dark_doubling_c: float = 6.5
+    row_time_s: float = 0.0
+    boresight_drift_x: float = 0.0
+    boresight_drift_y: float = 0.0
+    boresight_drift_z: float = 0.0
+    focal_drift: float = 0.0
+    k1_drift: float = 0.0
     sky_mag_arcsec2: float = 22.1
     dsnu: float = 0.2
     prnu: float = 0.01
@@ -161,6 +194,10 @@ class SensorModel:
         """Electrons/s per pixel from the empty sky, for pixels of `pixel_scale_rad` on a side."""
         arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
         return self.zero_magnitude_e_s * arcsec2 * math.pow(10.0, -0.4 * self.sky_mag_arcsec2)
+
+    def dark_factor(self, temperature_c: float) -> float:
+        """Dark current at a temperature relative to that at `reference_c`."""
+        return math.pow(2.0, (temperature_c - self.reference_c) / self.dark_doubling_c)
 
     @property
     def max_dn(self) -> int:

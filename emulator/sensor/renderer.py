@@ -15,6 +15,8 @@ from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
 from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
+from starhil.emulator.sensor.rolling_shutter import at_row_times
+from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area, add_glare
@@ -117,6 +119,15 @@ class Frame:
     objects: ObjectTruth | None = None
 
 
+def frame_without_truth(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], frame_index: int) -> Frame:
+    """Return the frame of an image (h, w) that was not rendered: it has no stars, and its attitude is the identity."""
+    none = np.zeros(0)
+    stars = StarTruth(
+        none.astype(np.int32), none.astype(np.int64), np.zeros((0, 2)), none, none, none.astype(np.bool_)
+    )
+    return Frame(image, stars, Attitude.identity(), (0.0, 0.0, 0.0), 0.0, 0, frame_index)
+
+
 class Renderer:
     """Renders exposures for one camera, catalogue and sensor, and caches what they share.
 
@@ -164,7 +175,9 @@ class Renderer:
         self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
         self._sky_e_s = np.float32(self.sensor.sky_e_s(camera.pixel_scale_rad))
         self._still = np.empty((camera.height, camera.width), dtype=np.float32)
-        self._still_exposure_s = math.nan
+        self._still_conditions = (math.nan, math.nan)
+        self._optics = camera
+        """The camera at the temperature of the frame."""
         self._work = np.empty_like(self._still)
 
     def sensor_magnitudes(self) -> npt.NDArray[np.float64]:
@@ -185,6 +198,7 @@ class Renderer:
         frame_index: int = 0,
         *,
         exposure_s: float | None = None,
+        temperature_c: float | None = None,
         objects: SkyObjects | None = None,
         observer: Observer | None = None,
     ) -> Frame:
@@ -200,6 +214,8 @@ class Renderer:
             Number of the frame in the run; determines the noise together with the seed.
         exposure_s : float, optional
             Exposure instead of the sensor's, seconds.
+        temperature_c : float, optional
+            Temperature of detector and lens instead of the sensor's, °C.
         objects : SkyObjects, optional
             Sky objects instead of the renderer's default.
         observer : Observer, optional
@@ -208,21 +224,21 @@ class Renderer:
         Raises
         ------
         EmulatorError
-            A rate, exposure or index is not a number or out of range.
+            A rate, exposure, temperature or index is not a number or out of range.
         """
-        exposure = (
-            self.sensor.exposure_s
-            if exposure_s is None
-            else self.sensor.with_(exposure_s=exposure_s).exposure_s
-        )
+        given = {"exposure_s": exposure_s, "temperature_c": temperature_c}
+        sensor = self.sensor.with_(**{name: value for name, value in given.items() if value is not None})
+        exposure, temperature = sensor.exposure_s, sensor.temperature_c
         rate = _rate(rate_rad_s)
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
+        self._optics = drifted_camera(self.camera, sensor, temperature)
+        optical_axis = self._pointing(attitude, temperature)
         area = None
         if others is not None and others.has_extended_objects:
-            area = self._painter.paint(others, attitude)
-        mean = self._mean_without_stars(exposure, area)
-        path, chosen, inside = self._paths(attitude, rate, exposure, observer)
+            area = self._painter.paint(others, optical_axis)
+        mean = self._mean_without_stars(exposure, temperature, area)
+        path, chosen, inside = self._paths(optical_axis, rate, exposure, observer)
         electrons = self._flux_e_s[chosen] * exposure
         drawn = electrons
         object_truth = None
@@ -231,7 +247,7 @@ class Renderer:
             drawn[np.flatnonzero(inside)[: others.missing_stars]] = 0.0
             if area is not None:
                 drawn *= area.seen_at(path[:, :2])
-            object_truth = self._add_objects(mean, others, attitude, rate, exposure, index, area)
+            object_truth = self._add_objects(mean, others, optical_axis, rate, exposure, index, area)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[inside]]
@@ -313,13 +329,21 @@ class Renderer:
         end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
         return end - start
 
-    def _mean_without_stars(self, exposure_s: float, area: AreaLight | None) -> npt.NDArray[np.float32]:
+    def _pointing(self, attitude: Attitude, temperature_c: float) -> Attitude:
+        """Return the attitude of the optics, which drift against the mounting with the temperature."""
+        drift = boresight_drift_rad(self.sensor, temperature_c)
+        return attitude.rotated(drift) if np.any(drift) else attitude
+
+    def _mean_without_stars(
+        self, exposure_s: float, temperature_c: float, area: AreaLight | None
+    ) -> npt.NDArray[np.float32]:
         """Return the mean electrons (h, w) of sky, dark current and extended objects, in a buffer that is reused."""
-        if exposure_s != self._still_exposure_s:
+        if self._still_conditions != (exposure_s, temperature_c):
+            factor = np.float32(self.sensor.dark_factor(temperature_c))
             np.multiply(self._pattern.sensitivity, self._sky_e_s, out=self._still)
-            self._still += self._pattern.dark_e_s
+            self._still += self._pattern.dark_e_s if factor == 1.0 else self._pattern.dark_e_s * factor
             self._still *= np.float32(exposure_s)
-            self._still_exposure_s = exposure_s
+            self._still_conditions = (exposure_s, temperature_c)
         sensitivity = self._pattern.sensitivity
         if area is not None and area.flooded:
             self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
@@ -344,7 +368,8 @@ class Renderer:
 
         A path is the parabola through the projections at the start, middle and end of the exposure.
         """
-        sweep = float(np.linalg.norm(rate)) * exposure_s
+        readout_s = self.camera.height * self.sensor.row_time_s
+        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
         cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
         near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
         icrs = self._vectors[near]
@@ -361,13 +386,19 @@ class Renderer:
         exposure_s: float,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Return paths (n, 6) of directions (n, 3), and masks of those centred inside and touching the image."""
-        middle, inside = self.camera.project(attitude.to_sensor(icrs))
+        camera, row_time_s = self._optics, self.sensor.row_time_s
+
+        def positions(turn: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+            seen = (attitude.rotated(turn) if np.any(turn) else attitude).to_sensor(icrs)
+            return camera.project(at_row_times(seen, camera, rate, row_time_s))
+
+        half = 0.5 * exposure_s * rate
+        middle, inside = positions(np.zeros(3))
         path = np.zeros((len(icrs), 6))
         path[:, :2] = middle
         if np.any(rate):
-            half = 0.5 * exposure_s * rate
-            start, _ = self.camera.project(attitude.rotated(-half).to_sensor(icrs))
-            end, _ = self.camera.project(attitude.rotated(half).to_sensor(icrs))
+            start, _ = positions(-half)
+            end, _ = positions(half)
             path[:, 2:4] = 0.5 * (end - start)
             path[:, 4:6] = 0.5 * (end + start) - middle
         reach = 1.0 + MAX_RADIUS_SIGMA * self.sensor.psf_sigma_px * (1.0 + 2.0 * self.sensor.psf_growth)

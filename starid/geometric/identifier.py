@@ -411,6 +411,21 @@ class Identifier:
         other._configure(camera, fov_tolerance, effort or self._effort)
         return other
 
+    @property
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors (m, 3) of `stars`, as the index holds them."""
+        return self._index.stars[:, :3]
+
+    def with_direction(self, row: int, direction: NDArray[np.float64]) -> Identifier:
+        """Identifier whose index holds another direction (3,), not necessarily of unit length, for a row of `stars`."""
+        stars = self._index.stars.copy()
+        stars[row, :3] = direction
+        stars.flags.writeable = False  # as in an index from its file: the same machine code serves both
+        other = object.__new__(Identifier)
+        other.__dict__.update(self.__dict__)
+        other._index = self._index._replace(stars=stars)
+        return other
+
     def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
         if answer.status != ACCEPTED:
             reason = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST

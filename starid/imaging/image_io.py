@@ -18,7 +18,7 @@ IMAGE_LIMIT: Final = 1000 * MEGABYTE
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 _TIFFS: Final = (b"II*\x00", b"MM\x00*")
-_SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _CHUNK_FRAME: Final = 12
 _GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in the luma of ITU-R BT.601."""
@@ -62,8 +62,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
                 f"image {source}: has {pixels.shape[2]} channels; a star sensor's frame is grey, "
                 "convert it or allow colour"
             )
-        grey = np.rint(pixels[:, :, :3] @ _GREY_WEIGHTS)
-        pixels = grey.astype(pixels.dtype)
+        pixels = grey_of(pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise StaridError(f"image {source}: pixels of type {pixels.dtype}; 8 or 16 bit whole numbers needed")
     low, high = int(pixels.min()), int(pixels.max())
@@ -77,6 +76,12 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
     return np.ascontiguousarray(pixels)
 
 
+def grey_of(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Luma (h, w) of an image (h, w, 3 or 4) in the order blue, green, red, of the same type; alpha is dropped."""
+    grey: NDArray[Any] = np.rint(pixels[:, :, :3] @ _GREY_WEIGHTS).astype(pixels.dtype)
+    return grey
+
+
 def image_suffix(path: Path) -> str:
     """Return the suffix that selects the format of an image to write; .png for a device or pipe without a suffix.
 
@@ -88,8 +93,8 @@ def image_suffix(path: Path) -> str:
     if path.is_dir():
         raise StaridError(f"image {path}: is a folder; name a file in it")
     suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
-    if suffix not in _SUFFIXES:
-        raise StaridError(f"image {path}: suffix {suffix!r} given, one of {', '.join(_SUFFIXES)} needed")
+    if suffix not in SUFFIXES:
+        raise StaridError(f"image {path}: suffix {suffix!r} given, one of {', '.join(SUFFIXES)} needed")
     return suffix
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.files import write_atomically
+from starid.result_store import read_results, write_results
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -93,26 +92,15 @@ def _run_part(plan: _Plan, part: Part) -> tuple[str, float]:
     results = plan.experiment.work(plan.context, part)
     seconds = _processor_time() - start
 
-    arrays: dict[str, Any] = {**results, "seconds_": np.float64(seconds)}
-
-    def write(path: Path) -> None:
-        with path.open("wb") as stream:
-            np.savez_compressed(stream, **arrays)
-
-    write_atomically(plan.file(part), write)
+    write_results(plan.file(part), {**results, "seconds_": np.array(seconds)})
     return plan.experiment.name, seconds
 
 
 def _load_part(path: Path) -> tuple[Results, float]:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            results = {name: stored[name] for name in stored.files}
-            seconds = float(results.pop("seconds_"))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ReproduceError(
-            f"reproduce: {path} cannot be read ({error}); remove it to have it made again"
-        ) from error
-    return results, seconds
+    results = read_results(path, "reproduce")
+    if "seconds_" not in results:
+        raise ReproduceError(f"reproduce: {path} is not complete; remove it to compute it again")
+    return results, float(results.pop("seconds_"))
 
 
 def _finished_before(plan: _Plan) -> Finished | None:

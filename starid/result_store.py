@@ -1,0 +1,156 @@
+"""Results of long computations on disk: one file per finished part, written atomically, and a plan that guards them."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.errors import StaridError
+from starid.files import write_atomically
+
+PLAN_FILE: Final = "plan.json"
+
+Results = dict[str, NDArray[Any]]
+"""What a part yields: named arrays."""
+
+
+def write_results(path: Path, results: Mapping[str, NDArray[Any]]) -> None:
+    """Write the results of a part, whole or not at all.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as stream:
+            np.savez_compressed(stream, **results)  # type: ignore[arg-type]  # the names are not allow_pickle
+
+    write_atomically(path, write)
+
+
+def read_results(path: Path, what: str) -> Results:
+    """Read the results of a part.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        The kind of computation, for messages.
+
+    Raises
+    ------
+    StaridError
+        The file is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise StaridError(
+            f"{what}: {path} cannot be read ({error}); remove it to compute it again"
+        ) from error
+
+
+class ResultStore:
+    """A folder with a plan, and one file for each part that is finished.
+
+    Parameters
+    ----------
+    folder
+        Created if missing.
+    plan
+        What the results depend on: plain values, as JSON has them; tables one level deep.
+    what
+        The kind of computation, for messages.
+
+    Raises
+    ------
+    StaridError
+        The folder holds another plan, or cannot be used.
+    """
+
+    def __init__(self, folder: Path, plan: Mapping[str, Any], what: str) -> None:
+        self.folder = folder
+        self._what = what
+        plan_file = folder / PLAN_FILE
+        content = json.loads(json.dumps(plan))
+        try:
+            if plan_file.exists():
+                self._check_same(plan_file, content)
+                return
+            text = json.dumps(content, indent=1, sort_keys=True)
+            write_atomically(plan_file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+        except OSError as error:
+            raise StaridError(
+                f"{what}: {folder} cannot be used: {error.strerror}; give another folder"
+            ) from error
+
+    def file(self, part: str) -> Path:
+        """Return the file of a part."""
+        return self.folder / f"{part}.npz"
+
+    def load(self, part: str) -> Results | None:
+        """Return the results of a part, or None if it is not finished.
+
+        Raises
+        ------
+        StaridError
+            Its file is damaged.
+        """
+        file = self.file(part)
+        return read_results(file, self._what) if file.exists() else None
+
+    def save(self, part: str, results: Mapping[str, NDArray[Any]]) -> None:
+        """Keep the results of a finished part.
+
+        Raises
+        ------
+        StaridError
+            The file cannot be written.
+        """
+        file = self.file(part)
+        try:
+            write_results(file, results)
+        except OSError as error:
+            raise StaridError(
+                f"{self._what}: {file} cannot be written: {error.strerror}; run the same command again to resume"
+            ) from error
+
+    def _check_same(self, plan_file: Path, content: dict[str, Any]) -> None:
+        """Reject a plan file with other content, naming the first difference."""
+        try:
+            kept = json.loads(plan_file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise StaridError(
+                f"{self._what}: {plan_file} cannot be read ({error}): give another folder"
+            ) from error
+        there, here = _flat(kept if isinstance(kept, dict) else {}), _flat(content)
+        for key in sorted(there.keys() | here.keys()):
+            if there.get(key) != here.get(key):
+                made_by = key.startswith("made_by.")
+                remedy = "the version that made it" if made_by else "the same options"
+                raise StaridError(
+                    f"{self._what}: {plan_file} holds another plan: {key} is {there.get(key)!r} there and "
+                    f"{here.get(key)!r} here: give another folder, or {remedy}"
+                )
+
+
+def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the plan with the keys of its inner tables as TABLE.KEY."""
+    flat: dict[str, Any] = {}
+    for key, value in content.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{inner}": item for inner, item in value.items()}
+        else:
+            flat[key] = value
+    return flat

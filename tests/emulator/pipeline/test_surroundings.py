@@ -1,0 +1,91 @@
+"""What the surroundings do to a frame: bodies in the field, particles, heat, upsets in the catalogue."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.emulation import pipeline_setup
+from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
+from starhil.emulator.pipeline.messages import CatalogUpset, FrameRequest, FrameResult
+from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.profile import Profile
+from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA
+
+ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+BETELGEUSE = 27989
+REQUEST = FrameRequest(0, as_quaternion(ORION), (0.0, 0.0, 0.0), 0.1, 1.0)
+SIGN_BIT, EXPONENT_BIT = 31, 30
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    return Pipeline(pipeline_setup(Profile.model_validate({"run": {"clock": "stepped"}})))
+
+
+def error_arcsec(result: FrameResult) -> float:
+    return Attitude(np.array(result.quaternion_xyzw)).error_to(ORION).total_arcsec
+
+
+@pytest.mark.parametrize(
+    ("sky", "expected"),
+    [
+        (SkyObjects(), ()),
+        (SkyObjects(sun=SunGlare(90.0, 5.0)), ("sun",)),
+        (SkyObjects(sun=SunGlare(150.0, 0.0)), ()),
+        (SkyObjects(moon=Moon(105.0, -1.2)), ("moon",)),
+        (SkyObjects(moon=Moon(106.0, -1.2)), ()),
+        (SkyObjects(earth=EarthLimb(83.8, 84.0, radius_deg=64.5)), ("earth",)),
+        (SkyObjects(earth=EarthLimb(83.8, 86.0, radius_deg=64.0)), ()),
+        (SkyObjects(sun=SunGlare(90.0, 5.0), earth=EarthLimb(83.8, -1.2)), ("sun", "earth")),
+    ],
+)
+def test_a_body_is_in_the_field_if_any_part_of_it_is(sky, expected):
+    assert bodies_in_field(sky, ORION, DEFAULT_CAMERA) == expected
+
+
+def test_a_body_in_the_field_is_the_reason_where_stars_are_missing():
+    lost = FrameResult(1, reason="too_few_stars")
+    assert with_bodies(lost, ("moon",)).reason == "blinded"
+    assert with_bodies(lost, ()).reason == "too_few_stars"
+    found = FrameResult(1, valid=True, reason="ok")
+    assert (with_bodies(found, ("moon",)).reason, with_bodies(found, ("moon",)).in_field) == ("ok", ("moon",))
+    assert with_bodies(replace(lost, reason="residual"), ("earth",)).reason == "residual"
+
+
+def test_the_earth_across_the_field_blinds_the_sensor(pipeline):
+    earth = {"ra_deg": 83.8, "dec_deg": -1.2, "electrons_s": 1e6}
+    result = pipeline.handle(replace(REQUEST, faults={"earth": earth}))
+    assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("earth",))
+
+
+def test_particles_of_the_place_are_added_to_those_of_the_sky(pipeline):
+    quiet = pipeline.handle(replace(REQUEST, index=3))
+    anomaly = pipeline.handle(replace(REQUEST, index=3, particles_s=3000.0))
+    assert anomaly.refused + anomaly.detected > quiet.refused + quiet.detected + 50
+    assert error_arcsec(anomaly) < 20.0
+
+
+def test_heat_raises_background_and_noise(pipeline):
+    cold, hot = (pipeline.handle(replace(REQUEST, temperature_c=degrees)) for degrees in (-20.0, 60.0))
+    assert hot.background_dn > cold.background_dn + 5.0
+    assert hot.noise_dn > cold.noise_dn
+    assert hot.valid
+
+
+@pytest.mark.parametrize("bit", [SIGN_BIT, EXPONENT_BIT, 22])
+def test_a_star_with_a_flipped_direction_is_lost_and_the_attitude_holds(pipeline, bit):
+    before = pipeline.handle(REQUEST)
+    assert BETELGEUSE in {star.hip for star in before.stars}
+    after = pipeline.handle(replace(REQUEST, upsets=(CatalogUpset(BETELGEUSE, 1, bit),)))
+    assert after.valid
+    assert BETELGEUSE not in {star.hip for star in after.stars}
+    assert after.matched >= before.matched - 2
+    assert error_arcsec(after) < 5.0
+    restored = pipeline.handle(REQUEST)
+    assert restored.quaternion_xyzw == before.quaternion_xyzw
