@@ -10,6 +10,7 @@ from typing import Final, Literal
 from starhil.protocol.values import IcdError
 
 NANOSECONDS: Final = 1_000_000_000
+SENSOR_AXES: Final = ("+x", "+y", "+z")
 DAY_NS: Final = 86_400 * NANOSECONDS
 
 EPOCHS: Final = {"unix": "1970-01-01", "gps": "1980-01-06", "j2000": "2000-01-01T12:00:00"}
@@ -22,7 +23,7 @@ class Conventions:
 
     quaternion: Literal["rotation", "attitude"] = "rotation"
     scalar_sign: Literal["positive", "any"] = "positive"
-    axes: tuple[str, str, str] = ("+x", "+y", "+z")
+    axes: tuple[str, str, str] = SENSOR_AXES
     epoch: str = "unix"
     byte_order: Literal["little", "big"] = "little"
 

@@ -76,7 +76,10 @@ def unit(key: str) -> str:
 def literal(value: object) -> str:
     """Return a value as a TOML file has it."""
     if isinstance(value, BaseModel):
-        return ", ".join(f"{key} {item:g}" for key, item in value.model_dump(exclude_none=True).items())
+        items = value.model_dump(exclude_none=True).items()
+        return ", ".join(
+            f"{key} {item if isinstance(item, str) else format(item, 'g')}" for key, item in items
+        )
     if value is None or value in ({}, ""):
         return ""
     if isinstance(value, float) and value >= LARGE and float(f"{value:g}") == value:
@@ -350,7 +353,7 @@ def scenario() -> str:
 
 def unit_definition() -> str:
     """Tables and keys of the files of a unit."""
-    from starhil.protocol import icd_schema
+    from starhil.protocol import icd_schema, link_schema
 
     headings: dict[str, type[BaseModel]] = {
         "[unit]": icd_schema.UnitModel,
@@ -362,6 +365,22 @@ def unit_definition() -> str:
         "bits": icd_schema.BitModel,
         "repeat": icd_schema.RepeatModel,
         "[[parameter]]": icd_schema.ParameterModel,
+        "[link.serial]": link_schema.SerialLinkModel,
+        'framing = { kind = "escaped" }': link_schema.EscapedFraming,
+        'framing = { kind = "slip" }': link_schema.SlipFraming,
+        'framing = { kind = "length" }': link_schema.LengthFraming,
+        'framing = { kind = "fixed" }': link_schema.FixedFraming,
+        'framing = { kind = "delimited" }': link_schema.DelimitedFraming,
+        'framing = { kind = "cubespace" }': link_schema.CubeSpaceFraming,
+        'framing = { kind = "custom" }': link_schema.CustomFraming,
+        'check = { kind = "sum" }': link_schema.SumCheck,
+        'check = { kind = "xor" }': link_schema.XorCheck,
+        'check = { kind = "crc" }': link_schema.CrcCheck,
+        'check = { kind = "xxh32" }': link_schema.XxHashCheck,
+        'check = { kind = "custom" }': link_schema.CustomCheck,
+        "request_header, reply_header": link_schema.HeaderFieldModel,
+        "bits of a header": link_schema.HeaderBitModel,
+        "[link.can]": link_schema.CubeSpaceCanModel,
     }
     parts = []
     for heading, model in headings.items():
@@ -374,6 +393,7 @@ def unit_definition() -> str:
             (f"`{key}`", "", limits(properties[key]), default(field), texts[name])
             for name, field in model.model_fields.items()
             for key in (field.alias or name,)
+            if f'{key} = "' not in heading
         ]
         parts.append(f"### `{heading}`\n\n{plain_text(model.__doc__ or '')}\n\n{table(rows)}")
     return "\n\n".join(parts)

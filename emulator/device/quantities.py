@@ -55,14 +55,13 @@ def getter_of(name: str) -> Getter:
 # --- attitude and rate ---
 
 
-def _reported(name: str, attribute: str, axis: int) -> None:
-    QUANTITIES[name] = lambda shot: float(getattr(shot.reported, attribute)[axis])
-
-
-for _axis, _letter in enumerate("xyzw"):
-    _reported(f"attitude.{_letter}", "quaternion_xyzw", _axis)
-for _axis, _letter in enumerate("xyz"):
-    _reported(f"rate.{_letter}", "rate_rad_s", _axis)
+QUANTITIES["attitude.x"] = lambda shot: shot.reported.quaternion_xyzw[0]
+QUANTITIES["attitude.y"] = lambda shot: shot.reported.quaternion_xyzw[1]
+QUANTITIES["attitude.z"] = lambda shot: shot.reported.quaternion_xyzw[2]
+QUANTITIES["attitude.w"] = lambda shot: shot.reported.quaternion_xyzw[3]
+QUANTITIES["rate.x"] = lambda shot: shot.reported.rate_rad_s[0]
+QUANTITIES["rate.y"] = lambda shot: shot.reported.rate_rad_s[1]
+QUANTITIES["rate.z"] = lambda shot: shot.reported.rate_rad_s[2]
 
 QUANTITIES["attitude.valid"] = lambda shot: bool(shot.frame is not None and shot.frame.valid)
 QUANTITIES["attitude.stable"] = lambda shot: shot.device.valid_in_a_row

@@ -14,7 +14,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple
-from starhil.protocol.conventions import Conventions
+from starhil.protocol.conventions import SENSOR_AXES, Conventions
 from starid.attitude import Attitude
 
 
@@ -53,7 +53,7 @@ def reported(device: Device) -> Reported:
         return Reported(False, last.reason, mid_unix_s=mid_unix_s)  # noqa: FBT003
     attitude = Attitude(np.array(last.result.quaternion_xyzw))
     rate = np.array(last.rate_rad_s)
-    turns = mounting_turns(device.parameters) + axes_turns(device.icd.conventions)
+    turns = _turns(device)
     for turn in turns:
         attitude = attitude.rotated(turn)
         rate = Attitude.identity().rotated(turn).to_sensor(rate)
@@ -63,7 +63,7 @@ def reported(device: Device) -> Reported:
 
 def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
     """Turn a vector (3,) from the sensor frame to the reported frame."""
-    for turn in mounting_turns(device.parameters) + axes_turns(device.icd.conventions):
+    for turn in _turns(device):
         vector = Attitude.identity().rotated(turn).to_sensor(vector)
     return vector
 
@@ -82,12 +82,16 @@ def _in_convention(attitude: Attitude, device: Device) -> Quaternion:
     return x, y, z, w
 
 
+def _turns(device: Device) -> list[np.ndarray]:
+    """Return the rotation vectors from the sensor frame to the reported frame: mounting, then axes."""
+    turns, conventions = mounting_turns(device.parameters), device.icd.conventions
+    return turns if conventions.axes == SENSOR_AXES else turns + axes_turns(conventions)
+
+
 @cache
 def axes_turns(conventions: Conventions) -> list[np.ndarray]:
-    """Return the rotation vector from the sensor's axes to those of the reported frame, radians, if they differ."""
+    """Return the rotation vector from the sensor's axes to those of the reported frame, radians."""
     matrix = np.array(conventions.rows, dtype=np.float64)
-    if np.array_equal(matrix, np.eye(3)):
-        return []
     return [Rotation.from_matrix(matrix.T).as_rotvec()]
 
 

@@ -55,6 +55,8 @@ class Requests:
         self.telecommand_bindings = {
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
         }
+        self._telemetry_rows = {(row.klass, row.id): row for row in icd.telemetry.values()}
+        self._telecommand_rows = {(row.klass, row.id): row for row in icd.telecommands.values()}
         serial = icd.link.serial
         self._stamped = serial is not None and any(
             item.role in ("ticks", "time") for item in serial.reply_header
@@ -78,12 +80,11 @@ class Requests:
         device = self.device
         if device.unresponsive:
             return []
-        row = device.icd.rows_by_key.get((request.klass, request.id))
-        if row is not None and row.kind != request.kind.value:
-            row = None
         if request.kind is RequestKind.TELEMETRY:
+            row = self._telemetry_rows.get((request.klass, request.id))
             device.counters.telemetry = (device.counters.telemetry + 1) & 0xFFFF
             return self._replies(request, row, self._answer_telemetry(request, row))
+        row = self._telecommand_rows.get((request.klass, request.id))
         device.counters.telecommands = (device.counters.telecommands + 1) & 0xFFFF
         code, replies = self._execute(request, row)
         if code is not None:
