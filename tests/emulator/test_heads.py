@@ -31,7 +31,7 @@ def test_two_heads_on_one_bus_report_one_turn_each_in_its_own_frame(run, tmp_pat
         await stub.connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
         read = []
         for address in (4, 5):
-            client = AsyncObcClient(CanHostLink(BUS, device_address=address))
+            client = AsyncObcClient(CanHostLink(BUS, device_address=address), emulation.icd)
             await client.start()
             values = await client.telemetry("precise_attitude")
             read.append((values["frame_counter"], [values[f"rate_{axis}"] for axis in "xyz"]))

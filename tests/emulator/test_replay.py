@@ -42,7 +42,7 @@ def report_of(folder):
 
 async def talk(emulation, frames):
     """Command and read the device over its serial line, as an OBC does, for some frames."""
-    client = AsyncObcClient(SerialHostLink(emulation.ready_fields["serial"]))
+    client = AsyncObcClient(SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd)
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
@@ -58,7 +58,9 @@ async def talk(emulation, frames):
 
 async def talk_over_a_bad_wire(emulation):
     """Read telemetry of which some does not arrive whole."""
-    client = AsyncObcClient(SerialHostLink(emulation.ready_fields["serial"]), timeout_s=0.1)
+    client = AsyncObcClient(
+        SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=0.1
+    )
     await client.start()
     for _ in range(10):
         with contextlib.suppress(BenchError):
@@ -92,7 +94,7 @@ def test_can_frames_and_canopen_are_repeated(record):
     bus = "virtual:recorded"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus))
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd)
         await client.start()
         async with asyncio.timeout(WITHIN_S):
             while emulation.device.cycle.published < 4:

@@ -1,6 +1,7 @@
 """Which files a truth log takes, and what it leaves as it was."""
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -58,11 +59,18 @@ def test_a_device_that_takes_nothing_is_rejected():
 
 def test_a_device_that_would_make_the_writer_wait_is_rejected():
     leader, follower = os.openpty()
-    for _ in range(100):  # nobody reads: the terminal is full after a few kilobytes
-        os.set_blocking(follower, False)
+    os.set_blocking(follower, False)
+    refused = 0
+    for _ in range(
+        200
+    ):  # nobody reads: the terminal is full after a few kilobytes, which the kernel moves on in the background
         try:
             os.write(follower, bytes(10_000))
+            refused = 0
         except BlockingIOError:
+            refused += 1
+            time.sleep(0.02)
+        if refused == 10:
             break
     with pytest.raises(EmulatorError, match="temporarily unavailable"):
         TruthLog(Path(os.ttyname(follower)))
