@@ -194,6 +194,8 @@ class Emulation:
             passing = self.clock.source if isinstance(self.clock, LatchedClock) else self.clock
             self._pump = ClockPump(device.scheduler, passing, self.tape)
             self._pump.start()
+        if self.tape is not None:
+            self.tape.begin()
         self._revival = PipelineRevival(
             self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
         )

@@ -100,6 +100,9 @@ class Player:
         """Ends of slow writes that are still open."""
         self._ends_at_once = ends_at_once
 
+    def begin(self) -> None:
+        """Do nothing: the entries follow."""
+
     def latch(self) -> None:
         """Do nothing: the clock shows the time of the entry that is played."""
 

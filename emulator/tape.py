@@ -45,6 +45,9 @@ class Tape(Protocol):
     def clock(self) -> Clock:
         """The clock of the model."""
 
+    def begin(self) -> None:
+        """Note that everything is open and time passes."""
+
     def latch(self) -> None:
         """Let the clock show the present time."""
 
@@ -123,6 +126,21 @@ class Recorder:
         self._latched = LatchedClock(clock) if clock.speed > 0.0 else None
         self.clock: Clock = self._latched or clock
         self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8", buffering=1)
+        self._held: list[Callable[[], None]] | None = []
+        """Entries that arrived while the links were being opened, which takes no time on the tape; None once open."""
+
+    def begin(self) -> None:
+        """Process the entries that arrived while the links were being opened."""
+        held, self._held = self._held or [], None
+        for entry in held:
+            entry()
+
+    def when_open(self, entry: Callable[[], None]) -> None:
+        """Process an entry, once everything is open."""
+        if self._held is None:
+            entry()
+        else:
+            self._held.append(entry)
 
     def latch(self) -> None:
         """Let the clock show the present time."""
@@ -158,8 +176,11 @@ class Recorder:
 
         def background(work: Callable[[], None], done: Done) -> None:
             def ended(error: EmulatorError | None) -> None:
-                self.enter("stored")
-                done(error)
+                def entry() -> None:
+                    self.enter("stored")
+                    done(error)
+
+                self.when_open(entry)
 
             inner(work, ended)
 
@@ -181,8 +202,11 @@ class _RecordedTransport(Transport[Item]):
 
     async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
         def received(item: Item) -> None:
-            self._recorder.enter("in", link=self._name, data=as_json(item))
-            on_receive(item)
+            def entry() -> None:
+                self._recorder.enter("in", link=self._name, data=as_json(item))
+                on_receive(item)
+
+            self._recorder.when_open(entry)
 
         await self._inner.start(received, on_error)
         self.description = self._inner.description
