@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
@@ -31,7 +30,6 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import Value
-from starid.camera import Camera
 
 log = logging.getLogger("starhil.device")
 
@@ -292,11 +290,6 @@ class Device:
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---
-
-    @cached_property
-    def camera(self) -> Camera:
-        """The camera of the profile."""
-        return Camera.from_dict(self.profile.camera.values())
 
     @property
     def fresh(self) -> Measurement | None:

@@ -166,7 +166,7 @@ _of_star("confidence", lambda shot, _star: _confidence(shot))
 def _of_directions(letter: str, axis: int) -> None:
     _of_star(
         f"vector_{letter}",
-        lambda shot, star: float(to_reported_frame(shot.device, _direction(shot, star))[axis]),
+        lambda shot, star: float(to_reported_frame(shot.device, np.array(star.vector))[axis]),
     )
     _of_star(f"icrs_{letter}", lambda shot, star: float(_icrs(shot, star)[axis]))
 
@@ -175,17 +175,11 @@ for _axis, _letter in enumerate("xyz"):
     _of_directions(_letter, _axis)
 
 
-def _direction(shot: Snapshot, star: MatchedStar) -> np.ndarray:
-    """Return the direction of a star's centroid in the sensor frame, by the camera of the profile."""
-    vector: np.ndarray = shot.device.camera.back_project(np.array([[star.x, star.y]]))[0]
-    return vector
-
-
 def _icrs(shot: Snapshot, star: MatchedStar) -> np.ndarray:
     if shot.frame is None:
         return np.zeros(3)
     attitude = Attitude(np.array(shot.frame.result.quaternion_xyzw))
-    vector: np.ndarray = attitude.matrix.T @ _direction(shot, star)
+    vector: np.ndarray = attitude.matrix.T @ np.array(star.vector)
     return vector
 
 

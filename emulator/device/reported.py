@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import as_quaternion
@@ -92,7 +92,9 @@ def _turns(device: Device) -> list[np.ndarray]:
 def axes_turns(conventions: Conventions) -> list[np.ndarray]:
     """Return the rotation vector from the sensor's axes to those of the reported frame, radians."""
     matrix = np.array(conventions.rows, dtype=np.float64)
-    return [Rotation.from_matrix(matrix.T).as_rotvec()]
+    *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
+    sine = float(np.linalg.norm(axis))
+    return [np.array(axis) / sine * 2.0 * math.atan2(sine, w)] if sine > 0.0 else []
 
 
 def mounting_turns(parameters: Parameters) -> list[np.ndarray]:

@@ -183,13 +183,26 @@ class Preview:
 
 @dataclass(frozen=True)
 class MatchedStar:
-    """An identified star: Hipparcos number, position in pixels, measured magnitude, signal-to-noise ratio."""
+    """An identified star.
+
+    Attributes
+    ----------
+    hip
+        Hipparcos number.
+    x, y
+        Position, pixels.
+    magnitude, snr
+        Measured magnitude and signal-to-noise ratio.
+    vector
+        Direction in the sensor frame, by the camera of the profile.
+    """
 
     hip: int
     x: float
     y: float
     magnitude: float
     snr: float
+    vector: Triple
 
 
 @dataclass(frozen=True)

@@ -294,6 +294,7 @@ class Pipeline:
         times: tuple[float, float, float, float],
     ) -> FrameResult:
         begin, rendered, detected, solved = times
+        directions = self.camera.back_project(found.xy_px[solution.detection_index]).tolist()
         stars = sorted(
             (
                 MatchedStar(
@@ -302,8 +303,11 @@ class Pipeline:
                     y=float(found.xy_px[row, 1]),
                     magnitude=measured_magnitude(float(found.flux[row]), sensor),
                     snr=float(found.flux[row] / found.flux_sigma[row]),
+                    vector=(direction[0], direction[1], direction[2]),
                 )
-                for row, hip in zip(solution.detection_index, solution.hip, strict=True)
+                for row, hip, direction in zip(
+                    solution.detection_index, solution.hip, directions, strict=True
+                )
             ),
             key=lambda star: (star.magnitude, star.hip),
         )

@@ -146,7 +146,10 @@ class SimulatedPort:
         return self._unit.loop.time()
 
 
-STARS = (MatchedStar(32349, 86.0, 824.6, -1.44, 900.0), MatchedStar(27989, 361.0, 282.7, 0.45, 600.0))
+STARS = (
+    MatchedStar(32349, 86.0, 824.6, -1.44, 900.0, (-0.283, 0.264, 0.922)),
+    MatchedStar(27989, 361.0, 282.7, 0.45, 600.0, (-0.086, -0.149, 0.985)),
+)
 
 
 class TruthImager:

@@ -32,14 +32,23 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA
 from tests.emulator.runs import DirectImager, FakeImager
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+
+
+def star(hip, x, y, magnitude, snr):
+    """An identified star where the default camera sees it."""
+    (vector,) = DEFAULT_CAMERA.back_project([[x, y]]).tolist()
+    return MatchedStar(hip, x, y, magnitude, snr, tuple(vector))
+
+
 STARS = (
-    MatchedStar(32349, 86.0, 824.6, -1.44, 900.0),
-    MatchedStar(101772, 578.0, 618.6, 0.18, 700.0),
-    MatchedStar(27989, 361.0, 282.7, 0.45, 600.0),
-    MatchedStar(21421, 793.0, 65.7, 0.87, 500.0),
+    star(32349, 86.0, 824.6, -1.44, 900.0),
+    star(101772, 578.0, 618.6, 0.18, 700.0),
+    star(27989, 361.0, 282.7, 0.45, 600.0),
+    star(21421, 793.0, 65.7, 0.87, 500.0),
 )
 
 PREVIEW = Preview(b"jpeg of a frame", b'{"width": 937, "height": 937, "hips": [32349]}')

@@ -10,6 +10,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode, ReplyKind
 from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\n'
 ATTITUDE = Attitude.from_radec_roll(251.3, 38.7, 200.0)
@@ -68,7 +69,7 @@ def test_the_reported_frame_has_the_axes_that_the_unit_names(unit, axes):
     for mine, axis in zip(matrix, axes, strict=True):
         assert mine == pytest.approx((-1.0 if axis[0] == "-" else 1.0) * rows[axis[1]], abs=1e-12)
     values = bench.read("attitude")
-    camera = bench.device.camera.back_project(
+    camera = DEFAULT_CAMERA.back_project(
         [[bench.device.fresh.result.stars[0].x, bench.device.fresh.result.stars[0].y]]
     )[0]
     for letter, axis in zip("xyz", axes, strict=True):
