@@ -1,4 +1,4 @@
-"""The comparison of identification programs as a Markdown table and as pictures."""
+"""The comparison of identification programs as a Markdown table and as plots."""
 
 from __future__ import annotations
 
@@ -85,19 +85,19 @@ def _text(value: float | None, digits: int) -> str:
 
 
 def write_leaderboard(answer: Answer, folder: Path, command: str) -> list[Path]:
-    """Write leaderboard.md, leaderboard.json and two pictures, rates.png and times.png, into a folder; return their paths."""
+    """Write leaderboard.md, leaderboard.json and two plots, rates.png and times.png, into a folder; return their paths."""
     import json
 
     folder.mkdir(parents=True, exist_ok=True)
     report, data = folder / "leaderboard.md", folder / "leaderboard.json"
-    pictures = [folder / "rates.png", folder / "times.png"]
-    text = markdown(answer, command) + "".join(f"\n![{path.stem}]({path.name})\n" for path in pictures)
+    plots = [folder / "rates.png", folder / "times.png"]
+    text = markdown(answer, command) + "".join(f"\n![{path.stem}]({path.name})\n" for path in plots)
     write_atomically(report, lambda part: part.write_text(text, encoding="utf-8"))
     content = json.dumps(answer, indent=1, ensure_ascii=False)
     write_atomically(data, lambda part: part.write_text(content, encoding="utf-8"))
-    _plot_rates(answer, pictures[0])
-    _plot_times(answer, pictures[1])
-    return [report, data, *pictures]
+    _plot_rates(answer, plots[0])
+    _plot_times(answer, plots[1])
+    return [report, data, *plots]
 
 
 def _names(answer: Answer, key: str) -> Sequence[str]:

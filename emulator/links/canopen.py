@@ -142,11 +142,11 @@ class DeviceApplication:
             raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being captured")
         deferred = Deferred()
 
-        def done(picture: GreyImage | None) -> None:
-            if picture is None:
+        def done(image: GreyImage | None) -> None:
+            if image is None:
                 self._finish_write(deferred, SdoAbortError(AbortCode.HARDWARE, "no frame"))
             else:
-                self._last_image = picture
+                self._last_image = image
                 self._finish_write(deferred, None)
 
         self._device.images.capture_full(

@@ -1,4 +1,4 @@
-"""Files that a user names: what is read, and what becomes of that which is written over."""
+"""Files that a user names: how they are read, and what is kept when one is written over."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ _WORDS: Final = {
     "missing": "missing stars: {}",
 }
 _OWN_SKY: Final = {"lsi": "flat", "geometric": "sphere"}
-"""The sky that an algorithm of ours, or the thesis's, is made for."""
+"""The sky that an algorithm of this project, or of the thesis, is made for."""
 
 _SKY_WORDS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars on the sphere"}
 _SENSOR: Final = (12.0, 1024, 6.0)

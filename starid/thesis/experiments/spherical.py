@@ -163,7 +163,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
 
 
 _NOTE: Final = """Camera of 42° on 937 pixels, stars to 6 mag, random attitudes (LSI) or a slew of 0.6° a frame from a random one
-(RSI), positions and fluxes without pictures. Features of the stars to 5.1 mag in the inscribed circle, cells 0.42° apart over
+(RSI), positions and fluxes without images. Features of the stars to 5.1 mag in the inscribed circle, cells 0.42° apart over
 the whole sphere, 234 095 of them. The thesis's own answer, one nearest neighbour and LASSO, is right in few frames: noise of
 0.1 mag already carries several stars across the brightness limit, and each of them moves all five features. As an order in
 which to try cells the features still do well: among the candidates that they put first, the stars themselves vote for a roll,

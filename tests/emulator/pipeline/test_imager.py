@@ -1,4 +1,4 @@
-"""What becomes of requests when an answer's callback fails, or when the pipeline ends in the middle."""
+"""The outcome of requests when an answer's callback fails, or when the pipeline ends in the middle."""
 
 import asyncio
 import pickle
