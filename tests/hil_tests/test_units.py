@@ -34,7 +34,7 @@ def row(kind: str, number: int, name: str, fields: str = "", more: str = "") -> 
 
 
 class FakeLink:
-    """Answers each request as it is told to."""
+    """Answers each request with the replies that the test has set."""
 
     def __init__(self, *replies: Reply) -> None:
         self.replies = replies

@@ -25,6 +25,7 @@ from starhil.protocol.messages import (
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_stack import ComposedStack, CubeSpaceStack, RowShape, SerialStack, build_stack
 from starhil.protocol.values import IcdError
+from tests.protocol.mutations import mutated
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 SEED = 20260517
@@ -579,27 +580,9 @@ def test_cubespace_keeps_its_codec_and_dialects() -> None:
     assert not stack.supports_unsolicited(Dialect.A)
 
 
+MARKS = b"\xc0\xdb\x10\x02\x03\x7e\x7d\xde\xad\xaa\x55\r\n$\xff\x00"
+
 # -- any input ---------------------------------------------------------------------------------------------------------
-
-
-def mutated(seeds: list[bytes], source: random.Random) -> bytes:
-    data = bytearray(b"".join(source.choices(seeds, k=source.randrange(1, 4))))
-    for _ in range(source.randrange(5)):
-        place = source.randrange(len(data) + 1)
-        match source.randrange(5):
-            case 0 if place < len(data):
-                data[place] = source.randrange(256)
-            case 1:
-                data.insert(
-                    place, source.choice(b"\xc0\xdb\x10\x02\x03\x7e\x7d\xde\xad\xaa\x55\r\n$\xff\x00")
-                )
-            case 2:
-                del data[place : place + source.randrange(1, 9)]
-            case 3:
-                data[place:place] = source.randbytes(source.randrange(12))
-            case _:
-                del data[place:]
-    return bytes(data)
 
 
 @pytest.mark.parametrize("name", STACKS)
@@ -612,7 +595,7 @@ def test_no_input_throws_a_receiver_off(name: str) -> None:
     device, host = stack.device(), stack.host()
     now = 0.0
     for _ in range(FUZZ_INPUTS):
-        data = mutated(seeds, source)
+        data = mutated(seeds, source, MARKS)
         now += source.choice((0.0, 0.01, 0.6))
         host.expect(source.choice(requests), source.randrange(12))
         for receiver in (device, host):

@@ -12,6 +12,7 @@ from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Re
 from starhil.protocol.serial_stack import SerialStack, build_serial_stack
 from starhil.protocol.unit_folders import shipped_units
 from starhil.protocol.values import MessageError
+from tests.protocol.mutations import mutated
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "1500"))
 SEED = 20261122
@@ -39,24 +40,6 @@ def exchanges(icd: InterfaceDefinition, stack: SerialStack) -> tuple[list[bytes]
     return requests, replies
 
 
-def mutated(seeds: list[bytes], source: random.Random) -> bytes:
-    data = bytearray(b"".join(source.choices(seeds, k=source.randrange(1, 3))))
-    for _ in range(source.randrange(5)):
-        place = source.randrange(len(data) + 1)
-        match source.randrange(5):
-            case 0 if place < len(data):
-                data[place] = source.randrange(256)
-            case 1:
-                data.insert(place, source.choice(MARKS))
-            case 2:
-                del data[place : place + source.randrange(1, 9)]
-            case 3:
-                data[place:place] = source.randbytes(source.randrange(12))
-            case _:
-                del data[place:]
-    return bytes(data)
-
-
 @pytest.mark.parametrize("unit", UNITS)
 def test_decoders_stand_mutated_input_and_read_the_next_request(unit):
     icd = load_unit(unit)
@@ -69,11 +52,11 @@ def test_decoders_stand_mutated_input_and_read_the_next_request(unit):
     decoded = 0
     for _ in range(INPUTS):
         now += source.choice((0.0, 0.01, 0.6))
-        for event in device.feed(mutated(requests, source), now):
+        for event in device.feed(mutated(requests, source, MARKS), now):
             decoded += decode(icd, event)
         row = source.choice(rows)
         host.expect(icd.request(row), row.size if row.kind == "telemetry" else 0)
-        for event in host.feed(mutated(replies, source), now):
+        for event in host.feed(mutated(replies, source, MARKS), now):
             decoded += decode(icd, event)
     assert decoded > INPUTS // 10
     device.flush(now + 1.0)

@@ -12,7 +12,7 @@ from starhil.protocol.can_framing import CanFrame, CanId, MessageType, encode_re
 from starhil.protocol.hub import CanHub
 from starhil.protocol.messages import Request
 from starhil.protocol.transports import open_can
-from tests.emulator.links.test_links import Wire
+from tests.emulator.wire import Wire
 
 BUS = "socketcand:127.0.0.1:1/test-of-addresses"
 REQUEST = encode_request_frames(Request.of(128), 1, 4)[0]

@@ -20,42 +20,11 @@ from starhil.protocol.can_framing import (
 )
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
-from starhil.protocol.transports.base import Transport
+from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 
 SEED = 20260101
 JUNK = 10_000
-
-
-class Wire(Transport):
-    """A transport that keeps what is sent and lets a test put in what arrives."""
-
-    def __init__(self) -> None:
-        super().__init__("wire")
-        self.sent: list = []
-
-    async def _open(self) -> None:
-        return
-
-    def send(self, item) -> bool:
-        self.sent.append(item)
-        return True
-
-    async def drain(self) -> None:
-        return
-
-    async def close(self) -> None:
-        return
-
-    def arrive(self, item) -> None:
-        self._receive(item)
-
-    def set_baud(self, baud: int) -> None:
-        self.sent.append(baud)
-
-    def take(self) -> list:
-        sent, self.sent = self.sent, []
-        return sent
 
 
 class Linked:

@@ -13,42 +13,11 @@ from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.truth.source import RateTruth
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.transports.base import Transport
 from tests.emulator.conftest import Bench
+from tests.emulator.wire import Wire
 
 RA_DEG, DEC_DEG = 83.8, -1.2
 """Where the emulated unit looks, with celestial north up in the image."""
-
-
-class Wire(Transport):
-    """Keeps what the device sends; a test puts in what arrives."""
-
-    def __init__(self) -> None:
-        super().__init__("wire")
-        self.sent: list = []
-
-    async def _open(self) -> None:
-        return
-
-    def send(self, item) -> bool:
-        self.sent.append(item)
-        return True
-
-    async def drain(self) -> None:
-        return
-
-    async def close(self) -> None:
-        return
-
-    def set_baud(self, _baud: int) -> None:
-        return
-
-    def arrive(self, item) -> None:
-        self._receive(item)
-
-    def take(self) -> list:
-        sent, self.sent = self.sent, []
-        return sent
 
 
 class Emulated:
