@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from starhil.emulator.clock import make_clock
-from starhil.emulator.console.obc import MakeClient, ObcClient, ObcPort
+from starhil.emulator.console.obc import MakeClient
 from starhil.emulator.control.channel import ControlServer, ControlTarget
 from starhil.emulator.control.faults import Faults
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
-from starhil.emulator.links.can import CanLink
-from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.replay import prepare_recording
@@ -203,13 +199,14 @@ class Run:
             if scenario is not None:
                 for head in self.heads:
                     head.enter(scenario)
-            if options.control != "off":
+            if options.control != "off" or options.watched:
                 targets = [ControlTarget(head.emulation, head.faults) for head in self.heads]
                 self.control = ControlServer(targets, self.ended.set, options.control_token)
+            if self.control is not None and options.control != "off":
                 where = await self.control.start(options.control)
                 self.emulation.ready_fields["control"] = where
-            if options.watched:
-                await self._open_console()
+            if self.control is not None and options.watched:
+                await self._open_console(self.control)
         except (EmulatorError, ProtocolError):
             for head in opened:
                 head.emulation.device.withdraw_start()
@@ -249,10 +246,14 @@ class Run:
             closers.append(self._recorder.close)
         await close_all(closers)
 
-    async def _open_console(self) -> None:
+    async def _open_console(self, control: ControlServer) -> None:
         """Open console and MCAP file, with an OBC on the bus of the first head."""
+        from starhil.emulator.console.obc_link import open_obc
+
         options, emulation = self.options, self.emulation
-        client = await self._open_obc()
+        if options.make_client is None:
+            raise EmulatorError("run: console and recording need make_client")
+        client = await open_obc(emulation, options.make_client, self._closers)
         if options.mcap is not None:
             from starhil.emulator.console.recorder import McapRecorder
 
@@ -263,53 +264,12 @@ class Run:
             from starhil.emulator.console.console import Console
             from starhil.emulator.console.server import ConsoleServer
 
-            targets = [ControlTarget(head.emulation, head.faults) for head in self.heads]
-            control = ControlServer(targets, self.ended.set)
             console = Console(emulation, control.execute, client)
             self._closers.append(console.close)
             console.start()
             server = ConsoleServer(console)
             self._closers.append(server.close)
             emulation.ready_fields["view"] = await server.start(options.view)
-
-    async def _open_obc(self) -> ObcClient:
-        """Open an OBC on the CAN bus of the run, or on a link of its own if the unit has no bus there.
-
-        Raises
-        ------
-        EmulatorError
-            The caller has given no `make_client`.
-        """
-        make_client, emulation = self.options.make_client, self.emulation
-        if make_client is None:
-            raise EmulatorError("run: console and recording need make_client")
-        device, has = emulation.device, emulation.icd.link
-        bus: Literal["can", "serial", ""] = "can" if has.can is not None else ""
-        where = emulation.ready_fields["can"] if emulation.can is not None else ""
-        own: SerialLink | CanLink | None = None
-        from starhil.protocol.transports.can import open_can
-        from starhil.protocol.transports.serial import open_serial
-
-        if bus and not where:
-            where = f"virtual:starhil-console-{os.getpid()}"
-            own = CanLink(emulation.requests, open_can(where))
-        elif not bus and has.serial is not None:
-            bus = "serial"
-            own = SerialLink(emulation.requests, open_serial("auto", paced=False))
-        if own is not None:
-            self._closers.append(own.close)
-            where = await own.start()
-        port = ObcPort(
-            bus,
-            where,
-            emulation.icd,
-            device_address=lambda: int(device.parameters["can_address"]),
-            dialect=lambda: own.dialect if isinstance(own, SerialLink) else None,
-        )
-        client = make_client(port)
-        self._closers.append(client.close)
-        await client.start()
-        return client
 
 
 def path_of_head(path: Path, number: int) -> Path:
