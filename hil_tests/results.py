@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,8 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.expect import show
 from starhil.hil_tests.interruption import Interrupted
 from starhil.protocol.values import Value
+
+_STDOUT: Final = 1
 
 PASSED: Final = "passed"
 FAILED: Final = "failed"
@@ -145,7 +148,7 @@ def prepare_report(path: Path) -> None:
 
 
 def write_report(path: Path, data: bytes) -> None:
-    """Write a report, atomically, or into a device or pipe; create its folder if needed.
+    """Write a report as `write_whole` does; create its folder if needed.
 
     Raises
     ------
@@ -160,13 +163,19 @@ def write_report(path: Path, data: bytes) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file atomically; data go into a device or pipe, and a symbolic link stays one.
+    """Write a file atomically; data go into a device, a pipe or the standard output, and a symbolic link stays one.
 
     Raises
     ------
     OSError
         It cannot be written.
     """
+    if _is_stdout(path):
+        # the descriptor itself: a file behind it, opened anew, would be written from its beginning
+        sys.stdout.flush()
+        with os.fdopen(os.dup(_STDOUT), "wb") as stream:
+            stream.write(data)
+        return
     if _is_stream(path):
         path.write_bytes(data)
         return
@@ -182,7 +191,14 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def _is_stream(path: Path) -> bool:
-    return path.exists() and not path.is_file() and not path.is_dir()
+    return _is_stdout(path) or (path.exists() and not path.is_file() and not path.is_dir())
+
+
+def _is_stdout(path: Path) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(_STDOUT))
+    except OSError:
+        return False
 
 
 def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float) -> None:

@@ -59,15 +59,29 @@ def _print_version(value: bool) -> None:
         raise typer.Exit
 
 
+_PYTHON_NUMBERS: Final = "starhil.python_numbers"
+
+
+def _only_python_reads(word: str) -> bool:
+    """Whether an argument is a number with underscores or digits of another script."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" in word or not word.isascii()
+
+
 OPTIONAL_VALUES: Final = {"--view": "auto"}
 """Options whose value may be left out → the value that they then have; typer has no such options."""
 
 
 class FiniteCommand(TyperCommand):
-    """A command that rejects infinite and NaN options; typer's bounds let NaN pass."""
+    """A command that rejects numbers that typer lets pass: infinite, NaN, and in a notation of Python alone (`1_0`)."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, with the values of `OPTIONAL_VALUES` added where they are left out."""
+        words = [word.rpartition("=")[2] for word in args]
+        ctx.meta[_PYTHON_NUMBERS] = {float(word): word for word in words if _only_python_reads(word)}
         whole = []
         for argument, after in itertools.pairwise([*args, "--"]):
             whole.append(argument)
@@ -81,14 +95,18 @@ class FiniteCommand(TyperCommand):
         Raises
         ------
         typer.BadParameter
-            An option is not finite.
+            A number is not finite, or is written as only Python reads it.
         """
+        python_numbers = ctx.meta[_PYTHON_NUMBERS]
         params: list[Any] = list(self.params)
         for param in params:
             value = ctx.params.get(param.name)
             values = value if isinstance(value, (list, tuple)) else (value,)
-            if not all(math.isfinite(each) for each in values if isinstance(each, float)):
+            numbers = [each for each in values if isinstance(each, (int, float))]
+            if not all(math.isfinite(each) for each in numbers):
                 raise typer.BadParameter("must be finite", ctx=ctx, param=param)
+            if word := next((python_numbers[each] for each in numbers if each in python_numbers), None):
+                raise typer.BadParameter(f"{word!r} is not a number", ctx=ctx, param=param)
         return super().invoke(ctx)
 
 

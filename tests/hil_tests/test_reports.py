@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import subprocess
 import sys
 from xml.etree import ElementTree as ET
 
@@ -89,6 +90,18 @@ def test_a_report_into_a_device_leaves_the_device(tmp_path):
     assert null.is_char_device()
     assert full.is_char_device()
     assert sorted(tmp_path.iterdir()) == [full, null]
+
+
+def test_a_report_into_the_standard_output_comes_between_the_lines_printed_there(tmp_path):
+    file = tmp_path / "output"
+    code = (
+        "from pathlib import Path; from starhil.hil_tests.results import write_report; "
+        "print('before'); write_report(Path('/dev/stdout'), b'<report/>'); print('after')"
+    )
+    with file.open("wb") as stream:
+        subprocess.run([sys.executable, "-c", code], stdout=stream, check=True, timeout=120)
+    assert file.read_text() == "before\n<report/>after\n"
+    assert [each.name for each in tmp_path.iterdir()] == ["output"]
 
 
 def test_a_report_over_a_link_replaces_the_file_that_it_leads_to(tmp_path):

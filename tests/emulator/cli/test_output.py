@@ -113,22 +113,26 @@ def test_every_command_refuses_what_is_not_finite() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "option"),
+    ("arguments", "why"),
     [
-        ("catalog --limit nan", "--limit"),
-        ("catalog --cone 1 inf 3", "--cone"),
-        ("campaign lost-in-space --require-valid nan", "--require-valid"),
-        ("features --ra 1 --dec 2 --kappa=-inf", "--kappa"),
+        ("catalog --limit nan", "'--limit': must be finite"),
+        ("catalog --cone 1 inf 3", "'--cone': must be finite"),
+        ("campaign lost-in-space --require-valid nan", "'--require-valid': must be finite"),
+        ("features --ra 1 --dec 2 --kappa=-inf", "'--kappa': must be finite"),
+        ("catalog --limit 1_0", "'--limit': '1_0' is not a number"),
+        ("catalog --cone 1 1_0 3", "'--cone': '1_0' is not a number"),
+        ("campaign lost-in-space --frames 1_0", "'--frames': '1_0' is not a number"),
+        ("conformance --canopen=1_0", "'--canopen': '1_0' is not a number"),
     ],
 )
-def test_a_number_that_is_not_finite_is_refused(
-    arguments: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_number_that_other_programs_do_not_read_is_refused(
+    arguments: str, why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])
     with pytest.raises(SystemExit) as caught:
         app.main()
     assert caught.value.code == 2
-    assert f"invalid value for '{option}': must be finite" in capsys.readouterr().err
+    assert f"invalid value for {why}" in capsys.readouterr().err
 
 
 def test_the_epoch_0_is_not_the_default_one() -> None:
