@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from starhil.hil_tests.conformance.case import check
 from starhil.hil_tests.conformance.link_probe import (
     BURST_ID,
     FIRST_TELEMETRY,
@@ -13,7 +14,7 @@ from starhil.hil_tests.conformance.link_probe import (
     ProbeTimes,
 )
 from starhil.hil_tests.conformance.ports import Port
-from starhil.hil_tests.raw_traffic import format_frame, parse_frame
+from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -105,6 +106,16 @@ class CanProbe(LinkProbe):
     def send_text(self, text: str) -> None:
         """Send a frame in the format of `cansend`, with HH and DD for the addresses."""
         self.send(parse_frame(self.with_addresses(text)))
+
+    def expecting(self, *answers: str) -> None:
+        """Do nothing: an answer carries its identifier."""
+
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next frame, which must be one with HH, DD, and `..` for any byte."""
+        wanted = pattern(self.with_addresses(answer))
+        frame = self.next_frame()
+        seen = "nothing" if frame is None else format_frame(frame)
+        check(matches(wanted, seen), wanted, seen)
 
     def with_addresses(self, text: str) -> str:
         """Replace HH and DD in the text of a frame by the addresses of host and device."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import Final, Protocol
+from enum import IntEnum
+from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.can_framing import CanFrame
 
 NMT: Final = 0x000
@@ -39,50 +41,42 @@ MOST_WAITING: Final = 20_000
 PDO_OFF: Final = 1 << 31
 NO_RTR: Final = 1 << 30
 
-ABORT_TOGGLE: Final = 0x05030000
-ABORT_TIMEOUT: Final = 0x05040000
-ABORT_COMMAND: Final = 0x05040001
-ABORT_BLOCK_SIZE: Final = 0x05040002
-ABORT_SEQUENCE: Final = 0x05040003
-ABORT_CRC: Final = 0x05040004
-ABORT_ACCESS: Final = 0x06010000
-ABORT_WRITE_ONLY: Final = 0x06010001
-ABORT_READ_ONLY: Final = 0x06010002
-ABORT_NO_OBJECT: Final = 0x06020000
-ABORT_NOT_MAPPABLE: Final = 0x06040041
-ABORT_PDO_LENGTH: Final = 0x06040042
-ABORT_INCOMPATIBLE: Final = 0x06040043
-ABORT_LENGTH: Final = 0x06070010
-ABORT_LENGTH_HIGH: Final = 0x06070012
-ABORT_LENGTH_LOW: Final = 0x06070013
-ABORT_NO_SUBINDEX: Final = 0x06090011
-ABORT_VALUE: Final = 0x06090030
-ABORT_VALUE_HIGH: Final = 0x06090031
-ABORT_VALUE_LOW: Final = 0x06090032
-ABORT_GENERAL: Final = 0x08000000
-ABORT_NOT_STORED: Final = 0x08000020
-ABORT_DEVICE_STATE: Final = 0x08000022
-ABORT_NO_DATA: Final = 0x08000024
 
-VALUE_ABORTS: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
+class Abort(IntEnum):
+    """Abort codes of SDO transfers (CiA 301 7.2.4.3.17)."""
+
+    TOGGLE = 0x05030000
+    TIMEOUT = 0x05040000
+    COMMAND = 0x05040001
+    BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
+    ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    PDO_LENGTH = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    LENGTH = 0x06070010
+    LENGTH_HIGH = 0x06070012
+    LENGTH_LOW = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    VALUE_HIGH = 0x06090031
+    VALUE_LOW = 0x06090032
+    GENERAL = 0x08000000
+    NOT_STORED = 0x08000020
+    DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
+
+
+VALUE_ABORTS: Final = (Abort.VALUE, Abort.VALUE_HIGH, Abort.VALUE_LOW)
 """Abort codes with which a node may refuse a value."""
 RESTRICTED_IDS: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 """CAN-IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
 WATCHED_NODE: Final = 0x05
 """Node-ID of a simulated watched node; no other node on the bus may have it."""
-
-
-class FrameBus(Protocol):
-    """A synchronous CAN bus with its own clock."""
-
-    def send(self, frame: CanFrame) -> None:
-        """Send a frame."""
-
-    def receive(self, timeout_s: float) -> CanFrame | None:
-        """Return the next frame of another node, None if none comes in time."""
-
-    def now(self) -> float:
-        """Time, s."""
 
 
 class CanopenProbe:
@@ -103,7 +97,7 @@ class CanopenProbe:
     """
 
     def __init__(
-        self, bus: FrameBus, node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
+        self, bus: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
     ) -> None:
         self.bus = bus
         self.node = node

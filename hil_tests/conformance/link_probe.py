@@ -119,6 +119,14 @@ class LinkProbe(ABC):
         """Send hexadecimal bytes, or a CAN frame in which HH and DD stand for host and device."""
 
     @abstractmethod
+    def expecting(self, *answers: str) -> None:
+        """Note the answers to raw traffic, in order, before it is sent."""
+
+    @abstractmethod
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next answer to raw traffic: the number of a row on serial, the pattern of a frame on CAN."""
+
+    @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
         """Return the next unread answer; skip unsolicited telemetry."""
 

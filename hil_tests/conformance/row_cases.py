@@ -68,7 +68,6 @@ def unknown_telemetry(probe: LinkProbe) -> None:
 
 @IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
 def unknown_telecommands(probe: LinkProbe) -> None:
-    """With and without data."""
     for identifier in range(128):
         if identifier not in probe.icd.telecommands_by_id:
             probe.expect_refusal(identifier, b"", INVALID_ID)

@@ -69,9 +69,13 @@ class SerialProbe(LinkProbe):
         self.expecting(identifier)
         self.send(framed(identifier, data))
 
-    def expecting(self, *identifiers: int) -> None:
-        """Note what was asked, in order: dialect b does not say what an answer is about."""
-        self._asked.extend(identifiers)
+    def expecting(self, *answers: str | int) -> None:
+        """Note the rows that were asked for, in order: dialect b does not say what an answer is about."""
+        self._asked.extend(map(int, answers))
+
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next answer, which must be the telemetry of the row with that number."""
+        self.expect_telemetry(int(answer))
 
     def send(self, data: bytes) -> None:
         """Send raw bytes."""
