@@ -103,7 +103,7 @@ def make_clock(text: str) -> RealClock | ScaledClock | SteppedClock:
             return ScaledClock(read_number(factor))
         except ValueError:
             pass
-    raise EmulatorError(f"clock: {text!r} is none of real, scaled:FACTOR, stepped")
+    raise EmulatorError(f"clock: must be real, scaled:FACTOR or stepped, not {text!r}")
 
 
 @dataclass

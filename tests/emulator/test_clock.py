@@ -39,7 +39,7 @@ def test_clocks_are_made_by_name(text, name, speed):
 @pytest.mark.parametrize(
     "text", ["", "fast", "scaled:", "scaled:x", "scaled:0", "scaled:-1", "scaled:1e9", "scaled:nan"]
 )
-def test_unknown_clocks_are_refused_in_one_line(text):
+def test_unknown_clocks_are_rejected_in_one_line(text):
     with pytest.raises(EmulatorError) as refusal:
         make_clock(text)
     assert "\n" not in str(refusal.value)
