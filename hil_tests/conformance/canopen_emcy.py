@@ -155,11 +155,11 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
     probe.set(0x1015, 0, 1000, 2)
     error.cause()
     probe.expect(error.emergency, "EMCY")
-    start = probe.bus.now()
+    start = probe.port.now()
     error.clear()
     probe.expect(error.emergency, "EMCY 0000h")
     check(
-        0.08 <= probe.bus.now() - start <= 0.15, "0.1 s between two EMCY", f"{probe.bus.now() - start:.3f} s"
+        0.08 <= probe.port.now() - start <= 0.15, "0.1 s between two EMCY", f"{probe.port.now() - start:.3f} s"
     )
 
 

@@ -20,8 +20,6 @@ from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped
 
 NMT: Final = CaseArea[CanopenProbe]("canopen.nmt", "CiA 301 7.3.2.2", intrusive=True)
 ERROR_CONTROL: Final = CaseArea[CanopenProbe]("canopen.error-control", "CiA 301 7.2.8.3.2", intrusive=True)
-NMT_CLAUSE: Final = "CiA 301 7.3.2.2"
-CONTROL_CLAUSE: Final = "CiA 301 7.2.8.3"
 STATE_OF: Final = {START: 0x05, STOP: 0x04, PRE_OPERATIONAL: 0x7F}
 
 

@@ -33,8 +33,6 @@ NOBODY: Final = -1
 SETTLING_S: Final = 0.05
 """Time in which a node obeys an NMT command, and what was under way has come."""
 
-STATES: Final = {0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL", 0x00: "boot-up"}
-
 MOST_WAITING: Final = 20_000
 """Frames that may wait to be read before a node counts as one that floods the bus."""
 
@@ -84,7 +82,7 @@ class CanopenProbe:
 
     Parameters
     ----------
-    bus
+    port
         The bus that the node is on.
     node
         Its node-ID.
@@ -97,9 +95,9 @@ class CanopenProbe:
     """
 
     def __init__(
-        self, bus: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
+        self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
     ) -> None:
-        self.bus = bus
+        self.port = port
         self.node = node
         self.od = od
         self.eds = eds
@@ -182,14 +180,14 @@ class CanopenProbe:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
         frame = CanFrame(identifier, payload, extended=extended, remote=remote)
-        self.log.append(f"{self.bus.now():.4f} -> {_frame_text(frame)}")
-        self.bus.send(frame)
+        self.log.append(f"{self.port.now():.4f} -> {_frame_text(frame)}")
+        self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, None if none comes in time."""
-        frame = self.bus.receive(timeout_s)
+        frame = self.port.receive(timeout_s)
         if frame is not None:
-            self.log.append(f"{self.bus.now():.4f} <- {_frame_text(frame)}")
+            self.log.append(f"{self.port.now():.4f} <- {_frame_text(frame)}")
         return frame
 
     def drain(self) -> None:
@@ -207,8 +205,8 @@ class CanopenProbe:
     ) -> bytes | None:
         """Return the data of the next accepted frame with one of the CAN IDs, else None."""
         wanted = {identifiers} if isinstance(identifiers, int) else identifiers
-        end = self.bus.now() + (self.timeout_s if timeout_s is None else timeout_s)
-        while (left := end - self.bus.now()) >= 0:
+        end = self.port.now() + (self.timeout_s if timeout_s is None else timeout_s)
+        while (left := end - self.port.now()) >= 0:
             frame = self.receive(left)
             if frame is None:
                 return None
@@ -237,12 +235,12 @@ class CanopenProbe:
 
     def count(self, identifier: int, for_s: float) -> list[tuple[float, bytes]]:
         """Return time and data of the frames with an identifier within a time."""
-        end, found = self.bus.now() + for_s, []
-        while (left := end - self.bus.now()) > 0:
+        end, found = self.port.now() + for_s, []
+        while (left := end - self.port.now()) > 0:
             data = self.wait_for(identifier, left)
             if data is None:
                 break
-            found.append((self.bus.now(), data))
+            found.append((self.port.now(), data))
         return found
 
     # SDO
@@ -393,17 +391,6 @@ class CanopenProbe:
             self.set(0x1017, 0, 0, 2)
         for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):
             self.set(index, 1, self.number(index, 1) | PDO_OFF)
-
-    def expect_state(self, state: int) -> None:
-        """Fail unless the heartbeat reports a state; the heartbeat is switched on if necessary."""
-        if state == 0x04:
-            data = self.wait_for(0x700 + self.node, 2.5)
-        else:
-            self.set(0x1017, 0, 20, 2)
-            self.drain()
-            data = self.wait_for(0x700 + self.node, 1.0)
-        if data is None or data[0] & 0x7F != state:
-            raise CaseFailed(f"state {STATES[state]}", _seen(data))
 
     # What the dictionary has
 

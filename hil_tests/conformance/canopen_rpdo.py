@@ -125,10 +125,10 @@ def deadline(probe: CanopenProbe) -> None:
     probe.drain()
     probe.expect_silence(emergency, "EMCY before the first message", 0.3)
     probe.send(identifier, before)
-    start = probe.bus.now()
+    start = probe.port.now()
     check_equal(probe.expect(emergency, "EMCY 8250h")[:2], b"\x50\x82", "error code")
     check(
-        0.08 <= probe.bus.now() - start <= 0.16, "0.1 s after the message", f"{probe.bus.now() - start:.3f} s"
+        0.08 <= probe.port.now() - start <= 0.16, "0.1 s after the message", f"{probe.port.now() - start:.3f} s"
     )
     probe.send(identifier, before)
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")

@@ -17,7 +17,6 @@ from starhil.hil_tests.conformance.canopen_probe import (
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check_equal
 
 SDO: Final = CaseArea[CanopenProbe]("canopen.sdo", "CiA 301 7.2.4.3.17")
-CLAUSE: Final = "CiA 301 7.2.4.3"
 LONGEST_TIMEOUT_S: Final = 12.0
 
 

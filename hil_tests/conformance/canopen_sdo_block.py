@@ -22,7 +22,6 @@ from starhil.hil_tests.conformance.canopen_sdo import (
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
 SDO_BLOCK: Final = CaseArea[CanopenProbe]("canopen.sdo-block", "CiA 301 7.2.4.3.17")
-CLAUSE: Final = "CiA 301 7.2.4.3"
 SEGMENT: Final = 7
 
 

@@ -135,11 +135,11 @@ def inhibit(probe: CanopenProbe) -> None:
     probe.wait_for(NOBODY, 0.15)
     probe.set(item.index, item.subindex, low)
     check_equal(after_event(probe, identifier, 3.0), low, "data")
-    start = probe.bus.now()
+    start = probe.port.now()
     probe.set(item.index, item.subindex, low)
     probe.set(item.index, item.subindex, high)
     check_equal(probe.expect(identifier, "second TPDO"), high, "data")
-    check(0.08 <= probe.bus.now() - start <= 0.16, "0.1 s between them", f"{probe.bus.now() - start:.3f} s")
+    check(0.08 <= probe.port.now() - start <= 0.16, "0.1 s between them", f"{probe.port.now() - start:.3f} s")
     probe.set(item.index, item.subindex, before)
 
 

@@ -60,7 +60,7 @@ class ConformanceRequest:
 
 
 def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
-    """Return the cases of all links that are asked for, chosen by pattern and safety.
+    """Return the cases of all requested links, selected by pattern and safety.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class ConformanceResult:
 def run_conformance(
     request: ConformanceRequest, on_outcome: Callable[[Outcome], None] = lambda _outcome: None
 ) -> ConformanceResult:
-    """Run the cases on the links that are asked for.
+    """Run the cases on the requested links.
 
     Those that an interruption leaves are marked as not run.
 
@@ -208,7 +208,7 @@ def _fallen(error: EmulatorProcessError) -> Outcome:
 
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
-    """Start an emulator with the links that are asked for."""
+    """Start an emulator with the requested links."""
     folder = stack.enter_context(temporary_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"

@@ -216,30 +216,12 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
                 check(same, f"{parameter.name} {good!r}", f"{seen!r}")
 
     name = parameter.name
-    yield Case(
-        f"parameters.{name}.limits",
-        "parameters",
-        f"{name} reports its number and limits",
-        clause,
-        limits,
-        intrusive=True,
-    )
-    yield Case(
-        f"parameters.{name}.refusals",
-        "parameters",
-        f"{name} outside its limits is refused, and stays",
-        clause,
-        refusals,
-        intrusive=True,
-    )
-    yield Case(
-        f"parameters.{name}.values",
-        "parameters",
-        f"{name} takes its least and greatest value",
-        clause,
-        values,
-        intrusive=True,
-    )
+    for check_name, title, run in (
+        ("limits", f"{name} reports its number and limits", limits),
+        ("refusals", f"{name} outside its limits is refused, and stays", refusals),
+        ("values", f"{name} takes its least and greatest value", values),
+    ):
+        yield Case(f"parameters.{name}.{check_name}", "parameters", title, clause, run, intrusive=True)
 
 
 def _within(value: float, parameter: Parameter) -> bool:
