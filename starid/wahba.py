@@ -85,9 +85,7 @@ def solve_wahba(
     profile = (b * (w / w.sum())[:, None]).T @ r
     singular = np.linalg.svd(profile, compute_uv=False)
     if singular[1] + np.copysign(singular[2], _determinant(profile)) < _LEAST_GAP:
-        raise StaridError(
-            "wahba: the directions do not determine the attitude; use stars that are further apart"
-        )
+        raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     return _SOLVERS[method](profile)
 
 
@@ -117,9 +115,7 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Matrix:
     fisher = information.sum() * np.eye(3) - (b * information[:, None]).T @ b
     smallest = np.linalg.eigvalsh(fisher)[0] if len(b) else 0.0
     if not smallest > _LEAST_GAP * information.sum():
-        raise StaridError(
-            "wahba: the directions do not determine the attitude; use stars that are further apart"
-        )
+        raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     inverse: Matrix = np.linalg.inv(fisher)
     symmetric: Matrix = 0.5 * (inverse + inverse.T)
     return symmetric

@@ -32,7 +32,6 @@ import tty
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-EXIT_USAGE: Final = 2
 EXIT_UNAVAILABLE: Final = 69
 EXIT_TIME_OUT: Final = 124
 EXIT_GUEST_FAILED: Final = 125
