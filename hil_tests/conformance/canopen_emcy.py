@@ -159,7 +159,9 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
     error.clear()
     probe.expect(error.emergency, "EMCY 0000h")
     check(
-        0.08 <= probe.port.now() - start <= 0.15, "0.1 s between two EMCY", f"{probe.port.now() - start:.3f} s"
+        0.08 <= probe.port.now() - start <= 0.15,
+        "0.1 s between two EMCY",
+        f"{probe.port.now() - start:.3f} s",
     )
 
 

@@ -128,7 +128,9 @@ def deadline(probe: CanopenProbe) -> None:
     start = probe.port.now()
     check_equal(probe.expect(emergency, "EMCY 8250h")[:2], b"\x50\x82", "error code")
     check(
-        0.08 <= probe.port.now() - start <= 0.16, "0.1 s after the message", f"{probe.port.now() - start:.3f} s"
+        0.08 <= probe.port.now() - start <= 0.16,
+        "0.1 s after the message",
+        f"{probe.port.now() - start:.3f} s",
     )
     probe.send(identifier, before)
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
