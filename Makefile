@@ -1,8 +1,8 @@
 # make demo        set up and run the product end to end; results in out/demo
-# make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest can be had)
+# make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest is available)
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
-# make reproduce   every experiment of the thesis again; report.md, tables and pictures in out/reproduce
+# make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
 # make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 220 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
@@ -55,7 +55,7 @@ reproduce: $(VENV)/.product
 	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
-	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_serial_stack.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
+	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_composed_faults.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
 
 soak: $(VENV)/.product
 	$(BIN)/python tools/soak.py --minutes $(MINUTES)

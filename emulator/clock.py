@@ -103,7 +103,7 @@ def make_clock(text: str) -> RealClock | ScaledClock | SteppedClock:
             return ScaledClock(read_number(factor))
         except ValueError:
             pass
-    raise EmulatorError(f"clock: {text!r} is none of real, scaled:FACTOR, stepped")
+    raise EmulatorError(f"clock: must be real, scaled:FACTOR or stepped, not {text!r}")
 
 
 @dataclass
@@ -132,12 +132,3 @@ class DeviceTime:
         """Set the present Unix time, nanoseconds."""
         self.offset_ns = unix_ns - self.clock.now_ns()
         self.was_set = True
-
-
-def split_unix(unix_ns: int) -> tuple[int, int, int]:
-    """Split a Unix time into whole seconds, and the milliseconds and microseconds of the second.
-
-    Times before 1970 or after 2106 wrap at 32 bits, as the device's counter does.
-    """
-    seconds, rest = divmod(unix_ns, NANOSECONDS)
-    return seconds & 0xFFFF_FFFF, rest // 1_000_000, rest // 1_000

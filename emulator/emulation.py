@@ -260,7 +260,7 @@ class Emulation:
             head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
 
     def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
-        """Return the truth of this head: at the mount of a configuration, or else of its own profile."""
+        """Return the truth of this head: at the mount of a configuration, or else that of its profile."""
         mount = config.mount or self.profile.truth.mount
         return mounted(truth, None if mount is None else mount.build())
 
@@ -309,7 +309,7 @@ class Emulation:
             return stepped
         if config.lockstep and not stepped:
             raise EmulatorError(
-                f"truth.lockstep: the clock is {self.clock.name}, which runs by itself; run with --clock stepped"
+                f"truth.lockstep: the clock must be stepped, not {self.clock.name}; run with --clock stepped"
             )
         return config.lockstep
 
@@ -383,7 +383,7 @@ class Emulation:
         there = {"serial.port": has.serial is not None, "can.channel": has.can is not None or canopen}
         wanted = [key for key, value in asked.items() if value != "off"]
         if wanted and not links.canopen.node and not any(there[key] for key in wanted):
-            raise EmulatorError(f"links.{wanted[0]}: unit {name} has none of the links that are asked for")
+            raise EmulatorError(f"links.{wanted[0]}: unit {name} has none of the requested links")
         for key in wanted:
             if asked[key] != "auto" and not there[key]:
                 log.warning("links.%s: unit %s has no such link; it is not opened", key, name)

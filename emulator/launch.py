@@ -17,7 +17,6 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
-from starhil.emulator.replay import prepare_recording
 from starhil.emulator.tape import TRUTH_FILE, Recorder
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.source import TruthSource
@@ -163,6 +162,8 @@ class Run:
         if self.options.record is not None:
             if others:
                 raise EmulatorError("--record: records one head; run the others apart, or leave it out")
+            from starhil.emulator.replay import prepare_recording
+
             prepare_recording(self.options.record, profile, self.options.scenario)
             self._recorder = Recorder(self.options.record, make_clock(profile.run.clock))
         self.emulation = Emulation(profile, worker, tape=self._recorder, previews=self.options.watched)

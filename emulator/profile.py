@@ -402,7 +402,7 @@ def _read_extended(path: Path, depth: int) -> dict[str, Any]:
     if base is None:
         return values
     if not isinstance(base, str):
-        raise EmulatorError(f"profile {path}: extends: a name or a path in quotes is needed")
+        raise EmulatorError(f"profile {path}: extends: must be a name or a path, in quotes")
     if depth >= MAX_EXTENDS_DEPTH:
         raise EmulatorError(
             f"profile {path}: extends: more than {MAX_EXTENDS_DEPTH} deep; does a profile extend itself?"

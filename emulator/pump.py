@@ -128,7 +128,7 @@ class StepPump:
             The step is not positive, or above `MAX_STEP_S`.
         """
         if not 0.0 < seconds <= MAX_STEP_S:
-            raise EmulatorError(f"step: {seconds} given, seconds in (0, {MAX_STEP_S:g}] needed")
+            raise EmulatorError(f"step: must be seconds in (0, {MAX_STEP_S:g}], not {seconds}")
         async with self._lock:
             end_ns = self._clock.now_ns() + round(seconds * NANOSECONDS)
             await self._settle()

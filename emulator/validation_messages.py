@@ -41,7 +41,7 @@ def explain(
     where = ".".join(path) or "as a whole"
     context = first.get("ctx", {})
     if first["type"] == "missing":
-        return f"{where}: missing; give it"
+        return f"{where}: missing"
     if first["type"] in {"union_tag_invalid", "union_tag_not_found"}:
         key = str(context["discriminator"]).strip("'")
         given = f" (given: {context['tag']!r})" if "tag" in context else ""

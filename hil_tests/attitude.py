@@ -1,6 +1,6 @@
 """Quaternions (x, y, z, w) from ICRS to the sensor frame, and attitude errors, in plain Python.
 
-The bench has its own quaternion algebra, so that it shares no numerics with the unit under test.
+The bench has its own quaternion algebra, to share no numerics with the unit under test.
 Conventions (roll, sensor axes, scalar last) are those of the interface definition's attitude rows.
 """
 
@@ -15,10 +15,7 @@ from starhil.hil_tests.errors import BenchError
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02
-"""How far a quaternion given as an attitude may be from unit length.
-
-Four 1e-4 steps are well within.
-"""
+"""Largest deviation of an attitude quaternion from unit length; four steps of 1e-4 are well within it."""
 
 
 class Quaternion(NamedTuple):
@@ -32,10 +29,10 @@ class Quaternion(NamedTuple):
 
 @dataclass(frozen=True)
 class AttitudeError:
-    """How a measured attitude differs from the truth, in arcseconds, none of them negative.
+    """How a measured attitude differs from the truth, in arcseconds, all non-negative.
 
-    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rest of the
-    turn about the boresight, `total_arcsec` the angle of the whole rotation.
+    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rotation
+    about the boresight, `total_arcsec` the angle of the whole rotation.
     """
 
     cross_boresight_arcsec: float
@@ -52,7 +49,7 @@ def unit(values: Sequence[float]) -> Quaternion:
         Not four numbers, not finite, or not near unit length.
     """
     if len(values) != 4:
-        raise BenchError(f"a quaternion has four parts (x, y, z, w), {len(values)} given")
+        raise BenchError(f"a quaternion must have four parts (x, y, z, w), not {len(values)}")
     length = math.sqrt(math.fsum(v * v for v in values))
     if not math.isfinite(length) or abs(length - 1.0) > _NORM_TOLERANCE:
         raise BenchError(f"not an attitude quaternion: its length is {length:.6g}, not 1")
@@ -61,10 +58,7 @@ def unit(values: Sequence[float]) -> Quaternion:
 
 
 def from_vector_part(x: float, y: float, z: float) -> Quaternion:
-    """Return the quaternion of which only the vector part is sent.
-
-    Its scalar is taken as not negative.
-    """
+    """Return the unit quaternion with this vector part and a non-negative scalar part."""
     return unit((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
 
 
@@ -86,10 +80,7 @@ def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternio
 
 
 def _from_rows(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> Quaternion:
-    """Turn a rotation matrix, given by rows, into a quaternion.
-
-    The largest part is computed first.
-    """
+    """Return the quaternion of a rotation matrix, by its rows; its largest part is computed first."""
     trace = x[0] + y[1] + z[2]
     squares = (
         1.0 + x[0] - y[1] - z[2],

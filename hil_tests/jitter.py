@@ -52,7 +52,7 @@ class _Arrivals:
             self.times.append(time.perf_counter())
 
     def jitter(self, what: str, end: float = inf) -> Jitter:
-        """Sum up the intervals of what came before `end`.
+        """Sum up the intervals of the messages before `end`.
 
         Raises BenchError if there are too few.
         """

@@ -14,7 +14,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
 from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import CubeSpaceStack, HostEnd, build_serial_stack
+from starhil.protocol.serial_interface import HostEnd
+from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1

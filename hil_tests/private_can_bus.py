@@ -19,7 +19,7 @@ class HubThread:
         self.channel = ""
 
     def start(self, port: int = 0) -> Self:
-        """Start listening; port 0 takes a free one."""
+        """Start listening; port 0 for a free one."""
         hub = CanHub(port=port)
         self._loop.run(hub.start())
         self._hub = hub

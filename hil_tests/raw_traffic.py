@@ -73,7 +73,7 @@ def send_and_listen(
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN).
 
-    Return what came back as one text of bytes, or as frames of the device.
+    Return the answer as one text of bytes, or as frames of the device.
 
     Parameters
     ----------

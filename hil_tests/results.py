@@ -111,8 +111,8 @@ class SessionResult:
 
 def summarize(values: Mapping[str, Value]) -> str:
     """Return the first values of a row as `name=value` pairs."""
-    words = [f"{name}={show(value)}" for name, value in list(values.items())[:SHOWN_VALUES]]
-    return " ".join([*words, "…"] if len(values) > SHOWN_VALUES else words)
+    parts = [f"{name}={show(value)}" for name, value in list(values.items())[:SHOWN_VALUES]]
+    return " ".join([*parts, "…"] if len(values) > SHOWN_VALUES else parts)
 
 
 @dataclass(frozen=True)

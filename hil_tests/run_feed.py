@@ -27,7 +27,7 @@ ENDED_WITHIN_S: Final = 10.0
 
 
 class RunFeed:
-    """Sends results in a thread of its own; a console that fails or ends does not hold up the run.
+    """Sends results in its own thread; a console that fails or ends does not hold up the run.
 
     Parameters
     ----------

@@ -181,7 +181,7 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
         raise BenchError(f"--dialect {options.dialect}: must be a, b or c")
     if options.serial is None and options.can is None:
         if not request.start:
-            raise BenchError("no link given: use --serial DEV, --can CHANNEL, both, or --start")
+            raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
         wanted = {None: ("serial",), "both": ("serial", "can")}.get(script.link, (script.link,))
         options = replace(
             options,

@@ -423,7 +423,7 @@ class Row:
             value = given.get(name)
             if value is None:
                 if self.kind == "telecommand" and item.default is None and item.const is None:
-                    raise FieldError(f"{where}: no value given", index=index)
+                    raise FieldError(f"{where}: missing value", index=index)
                 value = item.empty
             group = raw[item.slot.bits_key] if item.width else raw
             group[name] = item.to_raw(value, where, check=check, saturate=saturate, index=index)

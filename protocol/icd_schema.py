@@ -10,7 +10,6 @@ from starhil.protocol.link_schema import LinkModel
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Provenance = Literal["confirmed", "proxy", "ours"]
-ScalarType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 FieldType = Literal[
     "u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64",
     "enum8", "enum16", "enum32", "bits8", "bits16", "bits32", "bytes", "text",

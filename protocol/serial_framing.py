@@ -433,7 +433,3 @@ class PacingSchedule:
     def release(self) -> None:
         """Free the line: the reserved bytes are not sent."""
         self._free_at = float("-inf")
-
-    def free_at(self, now: float) -> float:
-        """Return when the line is free, at the earliest `now`."""
-        return max(now, self._free_at)

@@ -47,7 +47,7 @@ def checked_beta(velocity_m_s: ArrayLike | None) -> NDArray[np.float64]:
     if velocity.shape != (3,) or not float(np.linalg.norm(velocity)) <= FASTEST_M_S:
         given = " ".join(repr(velocity_m_s).split())
         raise StaridError(
-            f"observer_velocity: {given[:60]} given, three numbers in m/s (ICRS) of at most {FASTEST_M_S:g} needed"
+            f"observer_velocity: must be three numbers in m/s (ICRS) of at most {FASTEST_M_S:g}, not {given[:60]}"
         )
     return velocity / SPEED_OF_LIGHT_M_S
 

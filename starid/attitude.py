@@ -81,7 +81,9 @@ class Attitude:
     def __post_init__(self) -> None:
         values = np.array(self.quaternion_xyzw, dtype=np.float64)
         if values.shape != (4,):
-            raise StaridError(f"attitude quaternion: {values.shape} given, four numbers x, y, z, w needed")
+            raise StaridError(
+                f"attitude quaternion: must be four numbers x, y, z, w, not an array {values.shape}"
+            )
         x, y, z, w = values.tolist()
         norm = math.sqrt(x * x + y * y + z * z + w * w)
         if not (math.isfinite(norm) and norm > 0.0):
@@ -113,7 +115,7 @@ class Attitude:
         """
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape != (3, 3):
-            raise StaridError(f"attitude matrix: shape {m.shape} given, (3, 3) needed")
+            raise StaridError(f"attitude matrix: shape must be (3, 3), not {m.shape}")
         deviation = float(np.max(np.abs(m @ m.T - np.eye(3))))
         if not deviation <= _ROTATION_TOLERANCE or float(np.linalg.det(m)) < 0.0:
             raise StaridError(
@@ -139,7 +141,7 @@ class Attitude:
         """
         if not (math.isfinite(ra_deg) and math.isfinite(roll_deg) and -90.0 <= dec_deg <= 90.0):
             raise StaridError(
-                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: degrees needed, Dec within ±90"
+                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: must be degrees, Dec within ±90"
             )
         north, east, boresight = _local_frame(math.radians(ra_deg % 360.0), math.radians(dec_deg))
         roll = math.radians(roll_deg % 360.0)

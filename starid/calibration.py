@@ -91,11 +91,15 @@ class CalibrationFrame:
         if len(self.reference) != n:
             raise StaridError(f"calibration: {n} positions and {len(self.reference)} directions in one frame")
         if n < _LEAST_STARS:
-            raise StaridError(f"calibration: a frame with {n} matched stars; at least {_LEAST_STARS} needed")
+            raise StaridError(
+                f"calibration: a frame has {n} matched stars, must have at least {_LEAST_STARS}"
+            )
         if self.sigma_px is not None:
             sigma = np.asarray(self.sigma_px, dtype=np.float64)
             if sigma.shape not in ((n,), (n, 2)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-                raise StaridError(f"calibration: {n} positive finite standard deviations needed in a frame")
+                raise StaridError(
+                    f"calibration: standard deviations of a frame must be {n} positive finite numbers"
+                )
             object.__setattr__(self, "sigma_px", sigma)
 
     @property
@@ -179,7 +183,7 @@ def calibrate(
     """
     check_estimate(estimate)
     if not frames:
-        raise StaridError("calibration: no frames given; at least one with matched stars needed")
+        raise StaridError("calibration: no frames; at least one with matched stars is needed")
     bundle = _Bundle(frames, camera, estimate)
     stars = sum(len(frame.xy_px) for frame in frames)
     if 2 * stars <= bundle.freedom.shape[1] + 3 * len(frames):
@@ -202,7 +206,7 @@ def check_estimate(estimate: Sequence[str]) -> None:
     unknown = sorted(set(estimate) - set(GROUPS))
     if unknown or not estimate:
         what = f"{unknown[0]!r}" if unknown else "nothing"
-        raise StaridError(f"calibration: estimate {what} asked for, of {', '.join(GROUPS)} needed")
+        raise StaridError(f"calibration: what to estimate must be of {', '.join(GROUPS)}, not {what}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,7 +86,7 @@ class Camera:
         _check_model(self.model)
         fx, fy = _numbers("focal_px", self.focal_px, 2)
         if not (fx > 0.0 and fy > 0.0):
-            raise StaridError(f"camera focal_px: ({fx}, {fy}) given, two positive numbers of pixels needed")
+            raise StaridError(f"camera focal_px: must be two positive numbers of pixels, not ({fx}, {fy})")
         object.__setattr__(self, "focal_px", (fx, fy))
         object.__setattr__(self, "centre_px", _numbers("centre_px", self.centre_px, 2))
         object.__setattr__(self, "distortion", _terms(self.distortion))
@@ -123,7 +123,7 @@ class Camera:
         widest = _WIDEST_FOV_DEG[model]
         if not _is_number(fov_deg) or not 0.0 < fov_deg <= widest:
             raise StaridError(
-                f"camera fov_deg: {fov_deg!r} given, degrees in (0, {widest:g}] needed for {model}"
+                f"camera fov_deg: must be degrees in (0, {widest:g}] for {model}, not {fov_deg!r}"
             )
         half = math.radians(fov_deg) / 2.0
         reach = math.tan(half) if model == "pinhole" else half
@@ -164,9 +164,7 @@ class Camera:
             return cls.from_fov(**given)
         missing = sorted({"width", "height", "focal_px", "centre_px"} - given.keys())
         if missing:
-            raise StaridError(
-                f"camera: key {missing[0]!r} missing; give it, or fov_deg with width and height"
-            )
+            raise StaridError(f"camera: key {missing[0]!r} missing; set it, or fov_deg with width and height")
         return cls(**given)
 
     def to_dict(self) -> dict[str, Any]:
@@ -282,7 +280,7 @@ def flat_view(camera: Camera, ra_deg: float, dec_deg: float) -> tuple[Camera, At
         Centre of the frame, degrees.
     """
     if camera.model != "flat":
-        raise StaridError(f"camera model: {camera.model!r} given, a flat view needs 'flat'")
+        raise StaridError(f"camera model: must be 'flat' for a flat view, not {camera.model!r}")
     cx, cy = camera.centre_px
     moved = dataclasses.replace(camera, centre_px=(cx, cy + camera.focal_px[1] * math.radians(dec_deg)))
     return moved, Attitude.from_radec_roll(ra_deg, 0.0, 0.0)
@@ -296,14 +294,14 @@ def _is_number(value: object) -> bool:
 def _side(name: str, side: Any) -> int:
     """Return the side of a pixel array, or raise an error that names the field."""
     if isinstance(side, bool) or not isinstance(side, int | np.integer) or not 1 <= side <= _MAX_SIDE:
-        raise StaridError(f"camera {name}: {side!r} given, a whole number 1…{_MAX_SIDE} needed")
+        raise StaridError(f"camera {name}: must be a whole number 1…{_MAX_SIDE}, not {side!r}")
     return int(side)
 
 
 def _check_model(model: Any) -> None:
     """Reject an unknown name of a model."""
     if not isinstance(model, str) or model not in _MODEL_CODES:
-        raise StaridError(f"camera model: {model!r} given, one of {', '.join(_MODEL_CODES)} needed")
+        raise StaridError(f"camera model: must be one of {', '.join(_MODEL_CODES)}, not {model!r}")
 
 
 def _floats(values: Any) -> tuple[float, ...] | None:
@@ -324,7 +322,7 @@ def _numbers(name: str, values: Any, count: int) -> tuple[float, ...]:
     """`count` finite floats, or an error that names the field."""
     numbers = _floats(values)
     if numbers is None or len(numbers) != count:
-        raise StaridError(f"camera {name}: {values!r} given, {count} finite numbers needed")
+        raise StaridError(f"camera {name}: must be {count} finite numbers, not {values!r}")
     return numbers
 
 
@@ -333,8 +331,7 @@ def _terms(values: Any) -> tuple[float, float, float, float, float]:
     terms = _floats(values)
     if terms is None or len(terms) > _DISTORTION_TERMS:
         raise StaridError(
-            f"camera distortion: {values!r} given, at most {_DISTORTION_TERMS} finite numbers, "
-            "k1, k2, p1, p2, k3, needed"
+            f"camera distortion: must be at most {_DISTORTION_TERMS} finite numbers k1, k2, p1, p2, k3, not {values!r}"
         )
     padded = (*terms, *(0.0,) * (_DISTORTION_TERMS - len(terms)))
     return cast("tuple[float, float, float, float, float]", padded)
@@ -352,7 +349,7 @@ def _table(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
     """Contiguous float array (n, columns), or an error that names it."""
     table = np.ascontiguousarray(values, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] != columns:
-        raise StaridError(f"camera: {name} of shape {table.shape} given, (n, {columns}) needed")
+        raise StaridError(f"camera: shape of {name} must be (n, {columns}), not {table.shape}")
     return table
 
 

@@ -56,7 +56,7 @@ def save_camera(path: str | Path, camera: Camera, calibration: Calibration | Non
         write_atomically(target, lambda part: part.write_text(text, encoding="utf-8"))
     except OSError as error:
         raise StaridError(
-            f"camera profile {target}: cannot be written ({error.strerror}); choose another place"
+            f"camera profile {target}: cannot be written ({error.strerror}); choose another path"
         ) from None
 
 
@@ -78,11 +78,11 @@ def load_camera(path: str | Path) -> Camera:
     except OSError as error:
         raise StaridError(f"camera profile {source}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise StaridError(f"camera profile {source}: is no TOML ({error}); correct it") from None
+        raise StaridError(f"camera profile {source}: is not valid TOML ({error}); correct it") from None
     table = content.get("camera")
     if not isinstance(table, dict):
         raise StaridError(
-            f"camera profile {source}: has no table [camera]; add one with width, height and fov_deg"
+            f"camera profile {source}: no table [camera]; add one with width, height and fov_deg"
         )
     try:
         return Camera.from_dict(table)

@@ -107,7 +107,7 @@ class StarCatalog:
     def magnitude(self, band: Band) -> NDArray[np.float64]:
         """Return the magnitudes (n,) of a band, "v" or "hp"."""
         if band not in ("v", "hp"):
-            raise StaridError(f"star catalogue: band {band!r} given, 'v' or 'hp' needed")
+            raise StaridError(f"star catalogue: band must be 'v' or 'hp', not {band!r}")
         return self.v if band == "v" else self.hp
 
     def subset(self, chosen: ArrayLike) -> StarCatalog:
@@ -154,7 +154,7 @@ class StarCatalog:
                 "star catalogue: a cone needs a direction of three finite numbers, not all zero"
             )
         if not radius_rad >= 0.0:
-            raise StaridError(f"star catalogue: cone radius {radius_rad} given, radians ≥ 0 needed")
+            raise StaridError(f"star catalogue: cone radius must be radians ≥ 0, not {radius_rad}")
         axis = axis / norm
         order, dec, vectors = self._by_declination
         centre = math.atan2(axis[2], math.hypot(axis[0], axis[1]))
@@ -189,7 +189,7 @@ class StarCatalog:
         found = ordered[row] == wanted if len(self) else np.zeros(wanted.shape, dtype=np.bool_)
         if not np.all(found):
             missing = np.atleast_1d(wanted)[~np.atleast_1d(found)][0]
-            raise StaridError(f"star catalogue: HIP {missing} is not in it ({len(self)} stars)")
+            raise StaridError(f"star catalogue: has no HIP {missing} ({len(self)} stars)")
         return self._by_hip[row]
 
 
@@ -216,7 +216,7 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
         The file is missing or bad, or the epoch lies outside 1800…2200.
     """
     if not _EPOCH_RANGE[0] <= epoch <= _EPOCH_RANGE[1]:
-        raise StaridError(f"star catalogue: epoch {epoch} given, a Julian year 1800…2200 needed")
+        raise StaridError(f"star catalogue: epoch must be a Julian year 1800…2200, not {epoch}")
     source = default_path() if path is None else Path(path)
     try:
         state = source.resolve().stat()
@@ -320,7 +320,7 @@ def merge_close_stars(
         Again brightest first in V.
     """
     if not separation_rad >= 0.0:
-        raise StaridError(f"star catalogue: separation {separation_rad} given, radians ≥ 0 needed")
+        raise StaridError(f"star catalogue: separation must be radians ≥ 0, not {separation_rad}")
     leader = np.arange(len(catalog))
     pairs = _close_pairs(catalog.vectors, catalog.vectors, separation_rad)
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]

@@ -96,7 +96,7 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, NDArray[np.fl
             where = f"star catalogue {path}: line {number}"
             if number == len(lines):
                 raise StaridError(f"{where} breaks off, the file is truncated; fetch it again from CDS I/311")
-            raise StaridError(f"{where} is {len(line)} characters long, {_RECORD} needed; is it a hip2.dat?")
+            raise StaridError(f"{where} is {len(line)} characters long, must be {_RECORD}; is it a hip2.dat?")
     if len(lines) != expected:
         what = "truncated" if len(lines) < expected else "not the Hipparcos new reduction"
         raise StaridError(
@@ -150,7 +150,7 @@ def _column(path: Path, table: NDArray[np.uint8], field: _Field) -> NDArray[np.f
         number = next(i for i, text in enumerate(texts.tolist(), start=1) if not _is_number(text))
         raise StaridError(
             f"star catalogue {path}: line {number}: {field.name} (columns {field.first}-{field.last}) "
-            f"is {texts[number - 1].decode('latin-1')!r}, a number is needed; fetch the file again"
+            f"is {texts[number - 1].decode('latin-1')!r}, not a number; fetch the file again"
         ) from None
     return values
 
@@ -178,7 +178,7 @@ def _check(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
         if not good.all():
             line = int(np.argmin(good)) + 1
             value = columns[name][line - 1]
-            raise StaridError(f"star catalogue {path}: line {line}: {name} is {value:g}, {need} needed")
+            raise StaridError(f"star catalogue {path}: line {line}: {name} must be {need}, not {value:g}")
     unique, counts = np.unique(hip, return_counts=True)
     if counts.size and counts.max() > 1:
-        raise StaridError(f"star catalogue {path}: HIP {unique[np.argmax(counts)]:.0f} stands in it twice")
+        raise StaridError(f"star catalogue {path}: HIP {unique[np.argmax(counts)]:.0f} appears twice")

@@ -130,7 +130,7 @@ def make_identifier(
         No such algorithm.
     """
     if algorithm not in ALGORITHMS:
-        raise StaridError(f"algorithm: {algorithm!r} given, one of {', '.join(ALGORITHMS)} needed")
+        raise StaridError(f"algorithm: must be one of {', '.join(ALGORITHMS)}, not {algorithm!r}")
     module, name = ALGORITHMS[algorithm]
     factory = getattr(importlib.import_module(module), name)
     return cast("StarIdentifier", factory(camera, catalog, **options))

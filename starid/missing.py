@@ -67,7 +67,7 @@ def missing_stars(
         The solution is invalid.
     """
     if not radius_px > 0.0:
-        raise StaridError(f"missing stars radius_px: {radius_px} given, a positive number of pixels needed")
+        raise StaridError(f"missing stars radius_px: must be a positive number of pixels, not {radius_px}")
     camera = solution.camera or camera
     attitude = solution.attitude
     near = stars.in_cone(attitude.boresight, camera.field_radius_rad)

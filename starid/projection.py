@@ -1,6 +1,6 @@
 """Compiled projection between directions and pixels for every camera model, on plain arrays.
 
-A camera is one array of `PARAMETER_COUNT` numbers (made by `starid.camera.Camera.params`), so that other
+A camera is one array of numbers (made by `starid.camera.Camera.params`), so that other
 compiled kernels can call these without a Python object. Each model maps a direction (x, y, z) of the
 sensor frame, of any length, to the plane:
 
@@ -40,7 +40,6 @@ WIDTH: Final = 10
 HEIGHT: Final = 11
 LIMIT2: Final = 12
 """Squared radius in the plane up to which the distortion is one-to-one."""
-PARAMETER_COUNT: Final = 13
 
 _MAX_ITERATIONS: Final = 60
 _MAX_HALVINGS: Final = 40

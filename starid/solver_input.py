@@ -51,7 +51,7 @@ def checked_detections(
         xy = xy.reshape(0, 2)
     if xy.ndim != 2 or xy.shape[1] != 2 or brightness.shape != (len(xy),):
         raise StaridError(
-            f"detections: positions {xy.shape} and flux {brightness.shape} given, (n, 2) and (n,) needed"
+            f"detections: shapes of positions and flux must be (n, 2) and (n,), not {xy.shape} and {brightness.shape}"
         )
     if not (_all_finite(xy) and _all_finite(brightness)):
         raise StaridError("detections: positions and flux must be finite numbers")
@@ -62,7 +62,7 @@ def checked_detections(
         given = _numbers(xy_sigma_px, "position errors")
         if given.shape not in {(len(xy),), xy.shape}:
             raise StaridError(
-                f"detections: errors {given.shape} given for {len(xy)} positions, (n,) or (n, 2) needed"
+                f"detections: shape of the errors of {len(xy)} positions must be (n,) or (n, 2), not {given.shape}"
             )
         sigmas[:] = given if given.ndim == 2 else given[:, None]
         if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):

@@ -45,7 +45,7 @@ class Tracker:
         window_px: float | None = None,
     ) -> None:
         if not longest_gap_s > 0.0:
-            raise StaridError(f"tracker longest_gap_s: {longest_gap_s} given, seconds > 0 needed")
+            raise StaridError(f"tracker longest_gap_s: must be seconds > 0, not {longest_gap_s}")
         self.identifier = identifier
         self.attitude: Attitude | None = None
         self.rate_rad_s: NDArray[np.float64] | None = None

@@ -72,22 +72,20 @@ def solve_wahba(
         directions that leave the attitude undetermined (all collinear).
     """
     if method not in _SOLVERS:
-        raise StaridError(f"wahba: method {method!r} given, one of {', '.join(METHODS)} needed")
+        raise StaridError(f"wahba: method must be one of {', '.join(METHODS)}, not {method!r}")
     b, r = _directions("body", body), _directions("reference", reference)
     n = len(b)
     if len(r) != n:
-        raise StaridError(f"wahba: {n} body and {len(r)} reference directions given, as many of each needed")
+        raise StaridError(f"wahba: {n} body and {len(r)} reference directions; their numbers must be equal")
     if n < 2:
-        raise StaridError(f"wahba: {n} star given, at least 2 needed for an attitude")
+        raise StaridError(f"wahba: {n} star; an attitude needs at least 2")
     w = np.ones(n) if weights is None else np.asarray(weights, dtype=np.float64)
     if w.shape != (n,) or not (np.isfinite(w).all() and (w > 0.0).all()):
-        raise StaridError(f"wahba: {n} positive finite weights needed")
+        raise StaridError(f"wahba: weights must be {n} positive finite numbers")
     profile = (b * (w / w.sum())[:, None]).T @ r
     singular = np.linalg.svd(profile, compute_uv=False)
     if singular[1] + np.copysign(singular[2], _determinant(profile)) < _LEAST_GAP:
-        raise StaridError(
-            "wahba: the directions leave the attitude undetermined; stars apart from each other needed"
-        )
+        raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     return _SOLVERS[method](profile)
 
 
@@ -112,14 +110,12 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Matrix:
     b = _directions("body", body)
     sigma = np.asarray(sigma_rad, dtype=np.float64)
     if sigma.shape not in ((), (len(b),)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-        raise StaridError(f"wahba: {len(b)} positive finite standard deviations needed")
+        raise StaridError(f"wahba: standard deviations must be {len(b)} positive finite numbers")
     information = np.broadcast_to(sigma**-2.0, (len(b),))
     fisher = information.sum() * np.eye(3) - (b * information[:, None]).T @ b
     smallest = np.linalg.eigvalsh(fisher)[0] if len(b) else 0.0
     if not smallest > _LEAST_GAP * information.sum():
-        raise StaridError(
-            "wahba: the directions leave the attitude undetermined; stars apart from each other needed"
-        )
+        raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     inverse: Matrix = np.linalg.inv(fisher)
     symmetric: Matrix = 0.5 * (inverse + inverse.T)
     return symmetric
@@ -130,11 +126,9 @@ def _directions(name: str, values: ArrayLike) -> Matrix:
     try:
         table = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise StaridError(
-            f"wahba: {name} directions are no table of numbers; an array (n, 3) is needed"
-        ) from None
+        raise StaridError(f"wahba: {name} directions must be an array of numbers, (n, 3)") from None
     if table.ndim != 2 or table.shape[1] != 3:
-        raise StaridError(f"wahba: {name} directions of shape {table.shape} given, (n, 3) needed")
+        raise StaridError(f"wahba: shape of {name} directions must be (n, 3), not {table.shape}")
     norms = np.linalg.norm(table, axis=1)
     if not (np.isfinite(norms).all() and (norms > 0.0).all()):
         raise StaridError(f"wahba: {name} directions must be finite and not zero")

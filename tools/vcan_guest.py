@@ -32,7 +32,6 @@ import tty
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-EXIT_USAGE: Final = 2
 EXIT_UNAVAILABLE: Final = 69
 EXIT_TIME_OUT: Final = 124
 EXIT_GUEST_FAILED: Final = 125
@@ -318,14 +317,14 @@ def main() -> int:
     parser.add_argument("--share", action="append", default=[], type=Path, help="folder that stays writable")
     parser.add_argument("--time-out", type=float, default=300.0, metavar="SECONDS", help="default 300")
     parser.add_argument("--memory", default="3G", help="of the guest, default 3G")
-    parser.add_argument("--check", action="store_true", help="only say whether a guest can be had")
+    parser.add_argument("--check", action="store_true", help="only report whether a guest is available")
     parser.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND")
     arguments = parser.parse_args()
     command = arguments.command[1:] if arguments.command[:1] == ["--"] else arguments.command
     if arguments.check:
         command = ["ip", "link", "show", "vcan0"]
     if not command:
-        parser.error("no command given")
+        parser.error("missing command")
     for share in arguments.share:
         if not share.is_dir():
             parser.error(f"--share {share}: no such folder")

@@ -93,14 +93,14 @@ class CampaignPlan:
 
     def __post_init__(self) -> None:
         if self.frames < 1:
-            raise EmulatorError(f"campaign: frames is {self.frames}: give at least 1")
+            raise EmulatorError(f"campaign: frames must be at least 1, not {self.frames}")
         if not 0 <= self.blocked <= 0.9:
-            raise EmulatorError(f"campaign: blocked is {self.blocked}: give a share from 0 to 0.9")
+            raise EmulatorError(f"campaign: blocked must be a fraction from 0 to 0.9, not {self.blocked}")
         if self.sky not in ("clear", "hard"):
-            raise EmulatorError(f"campaign: sky is {self.sky!r}: give clear or hard")
+            raise EmulatorError(f"campaign: sky must be clear or hard, not {self.sky!r}")
         if self.unknown_field and self.algorithm != "geometric":
             raise EmulatorError(
-                f"campaign: algorithm is {self.algorithm!r}: only geometric identifies with an unknown field"
+                f"campaign: algorithm must be geometric for an unknown field, not {self.algorithm!r}"
             )
 
     @property

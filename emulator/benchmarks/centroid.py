@@ -150,7 +150,7 @@ def measure_centroids(
     """
     if frames < 1 or not rates_deg_s:
         raise EmulatorError(
-            f"bench centroid: {frames} frames at {len(rates_deg_s)} rates; give at least one of each"
+            f"bench centroid: frames and rates must be at least one each, not {frames} and {len(rates_deg_s)}"
         )
     sensor = SensorModel() if sensor is None else sensor
     camera = Camera.from_fov() if camera is None else camera

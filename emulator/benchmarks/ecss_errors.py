@@ -9,7 +9,7 @@ position in several frames, so that the error is
 with a random part for each level. A nested analysis of variance gives their variances without bias (Henderson's method
 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests whether they are there at all: what
 does not stand out from the level below is given as zero with the smallest value that would have been seen. Thermo-elastic
-error and aberration residual come from series of their own, in which fields are repeated at other temperatures and dates.
+error and aberration residual come from separate series, in which fields are repeated at other temperatures and dates.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def coverage_factor(confidence: float) -> float:
     from scipy.stats import norm
 
     if not 0.5 <= confidence < 1.0:
-        raise EmulatorError(f"confidence {confidence}: give a share from 0.5 to below 1, such as 0.997")
+        raise EmulatorError(f"confidence must be at least 0.5 and below 1, such as 0.997, not {confidence}")
     return float(norm.ppf(0.5 * (1.0 + confidence)))
 
 

@@ -67,7 +67,7 @@ def measure_frames(
         Receives one line per step.
     """
     if frames < 1:
-        raise EmulatorError(f"bench frame: {frames} frames given; give at least one")
+        raise EmulatorError(f"bench frame: frames must be at least one, not {frames}")
     sensor = SensorModel() if sensor is None else sensor
     camera = Camera.from_fov() if camera is None else camera
     catalog = load_catalog()

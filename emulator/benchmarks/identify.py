@@ -213,10 +213,10 @@ def run(
         growth of resident memory), `skipped`, `versions`, `seed`.
     """
     if frames < 1:
-        raise EmulatorError(f"--frames {frames}: at least 1 is needed")
+        raise EmulatorError(f"--frames {frames}: must be at least 1")
     for row in rows:
         if row not in ROWS:
-            raise EmulatorError(f"--row {row!r}: one of {'; '.join(ROWS)} is needed")
+            raise EmulatorError(f"--row {row!r}: must be one of {'; '.join(ROWS)}")
     names = list(dict.fromkeys([*own, *peers]))
     for name in names:
         check_name(name)

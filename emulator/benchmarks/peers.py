@@ -163,7 +163,7 @@ def check_name(name: str) -> None:
     """
     known = (*ALL, *VARIANTS)
     if name not in known and ":" not in name:
-        raise EmulatorError(f"solver {name!r}: one of {', '.join(known)}, or MODULE:FUNCTION, is needed")
+        raise EmulatorError(f"solver {name!r}: must be one of {', '.join(known)}, or MODULE:FUNCTION")
 
 
 def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
@@ -176,7 +176,7 @@ def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
     solver = maker(camera, stars)
     if not isinstance(solver, Solver):
         raise EmulatorError(
-            f"solver {name!r}: it returned {type(solver).__name__}, starhil.emulator.benchmarks.peers.Solver needed"
+            f"solver {name!r}: must return a starhil.emulator.benchmarks.peers.Solver, not {type(solver).__name__}"
         )
     return solver
 

@@ -199,7 +199,7 @@ def bus(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Load the links of a device fully and measure losses, errors, latency and jitter.
+    """Load the links of a device to capacity and measure losses, errors, latency and jitter.
 
     Without --can and --serial it starts a CAN hub and an emulator that solves frames at 10 Hz.
     The exit status is 0 only if nothing was lost or wrong and the 99th percentile of the CAN

@@ -55,7 +55,7 @@ def campaigns(
     """
     if context.invoked_subcommand is not None:
         if ecss:
-            raise typer.BadParameter(f"--ecss stands alone; leave out {context.invoked_subcommand}")
+            raise typer.BadParameter(f"--ecss takes no subcommand; leave out {context.invoked_subcommand}")
         return
     if not ecss:
         typer.echo(context.get_help())

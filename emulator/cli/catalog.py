@@ -63,14 +63,16 @@ def command(
 
 def _direction(ra_deg: float, dec_deg: float) -> tuple[float, float, float]:
     if not (math.isfinite(ra_deg) and abs(dec_deg) <= 90.0):
-        raise EmulatorError(f"catalog: --cone {ra_deg} {dec_deg}: degrees needed, Dec within ±90")
+        raise EmulatorError(
+            f"catalog --cone: right ascension and declination must be degrees, Dec within ±90, not {ra_deg} {dec_deg}"
+        )
     ra, dec = math.radians(ra_deg % 360.0), math.radians(dec_deg)
     return math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)
 
 
 def _radius(degrees: float) -> float:
     if not 0.0 < degrees <= 180.0:
-        raise EmulatorError(f"catalog: --cone radius {degrees} given, degrees in (0, 180] needed")
+        raise EmulatorError(f"catalog --cone: radius must be degrees in (0, 180], not {degrees}")
     return math.radians(degrees)
 
 

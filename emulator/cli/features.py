@@ -72,11 +72,11 @@ def command(
         )
     if not -360.0 <= centre[0] <= 360.0:
         raise EmulatorError(
-            f"features: the frame's centre is at right ascension {centre[0]:g}°; −360 to 360 is needed"
+            f"features: right ascension of the frame's centre must be −360° to 360°, not {centre[0]:g}°"
         )
     if not -90.0 <= centre[1] <= 90.0:
         raise EmulatorError(
-            f"features: the frame's centre is at declination {centre[1]}°; −90 to 90 is needed"
+            f"features: declination of the frame's centre must be −90° to 90°, not {centre[1]}°"
         )
     vector = sky_of(frame_catalog(geometry, epoch), parameters).features(centre[0] % 360.0, centre[1])
     values = (vector.n, vector.A, vector.r, vector.sigma_A, vector.sigma_r, vector.theta_deg)

@@ -12,7 +12,7 @@ from starhil.emulator.cli.output import output_help, prepare_output
 
 def command(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")] = 29536,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 for a free one.")] = 29536,
     log: Annotated[
         Path | None, typer.Option(help=output_help("Log all CAN frames to this file in candump format."))
     ] = None,

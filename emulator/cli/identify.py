@@ -51,8 +51,8 @@ def command(
         str | None,
         typer.Option(
             metavar="UTC",
-            help="Date of the image, e.g. 2026-03-20T21:30: correct the aberration of the Earth's orbit, 20″, and "
-            "take the stars' places of that year.",
+            help="Date of the image, e.g. 2026-03-20T21:30: correct the aberration from the Earth's orbit (20″), and "
+            "use the star positions of that year.",
         ),
     ] = None,
     observer_velocity: Annotated[
@@ -139,7 +139,7 @@ def _solve(
     if profile is not None:
         raise EmulatorError("identify: --profile and --fov exclude each other; give one of them")
     if model not in _MODELS:
-        raise EmulatorError(f"identify --model: {model!r} given, {' or '.join(_MODELS)} needed")
+        raise EmulatorError(f"identify --model: must be {' or '.join(_MODELS)}, not {model!r}")
     if fov == _ANY_FIELD:
         if fov_tolerance is not None:
             raise EmulatorError(
@@ -149,7 +149,7 @@ def _solve(
     try:
         width_deg = read_number(fov)
     except ValueError:
-        raise EmulatorError(f"identify --fov: {fov!r} given, degrees or {_ANY_FIELD} needed") from None
+        raise EmulatorError(f"identify --fov: must be degrees or {_ANY_FIELD}, not {fov!r}") from None
     camera = Camera.from_fov(width_deg, pixels.shape[1], pixels.shape[0], _MODELS[model])
     return solve_image(
         pixels,
@@ -186,7 +186,7 @@ def _velocity(unix_s: float | None, given: str | None) -> NDArray[np.float64] | 
         x, y, z = (read_number(part) for part in given.split(","))
     except ValueError:
         raise EmulatorError(
-            f"identify --observer-velocity: {given!r} given, three numbers in m/s as X,Y,Z needed"
+            f"identify --observer-velocity: must be three numbers in m/s as X,Y,Z, not {given!r}"
         ) from None
     own = np.array([x, y, z])
     return own if velocity is None else velocity + own

@@ -54,7 +54,7 @@ ConsoleAddress: TypeAlias = Annotated[
     typer.Option(
         "--view",
         metavar="[ADDRESS]",
-        help="Show the results on a console while they come: the address on the ready line of `starhil run --view`; "
+        help="Show the results on a console as they arrive: the address on the ready line of `starhil run --view`; "
         "without one, and with --start, that of the emulator started here.",
     ),
 ]

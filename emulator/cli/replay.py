@@ -10,7 +10,7 @@ import typer
 
 
 def command(
-    folder: Annotated[Path, typer.Argument(help="Folder that starhil run --record has made.")],
+    folder: Annotated[Path, typer.Argument(help="Folder written by starhil run --record.")],
     json_output: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> int:
     """Play a recorded run on the stepped clock, and compare what the device sends and measures, byte by byte.

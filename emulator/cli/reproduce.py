@@ -74,9 +74,9 @@ def command(
     else:
         for result in results:
             print(f"{result.experiment.name:<24} {result.seconds:7.1f} s")
-        for kind, words in CLASSES.items():
+        for kind, text in CLASSES.items():
             found = figures["classes"][kind]
-            print(f"{found['met']} of {found['of']} {words}")
+            print(f"{found['met']} of {found['of']} {text}")
         for lost in figures["regressions"]:
             print(f"regression: {lost}")
         print(

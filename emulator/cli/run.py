@@ -53,7 +53,7 @@ def command(
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for state kept over restarts, such as saved parameters; default: keep nothing."
+            help="Folder for state kept across restarts, such as saved parameters; default: keep nothing."
         ),
     ] = None,
     symlink: Annotated[

@@ -40,7 +40,7 @@ def list_units(as_json: AsJson = False) -> None:
 def new(
     folder: Annotated[Path, typer.Argument(help="Folder to write; it must hold no TOML file yet.")],
 ) -> None:
-    """Write a commented definition that already runs, to be made yours."""
+    """Write a commented definition that already runs, as a starting point."""
     from starhil.emulator.errors import EmulatorError
     from starhil.protocol.unit_folders import SKELETON
     from starid.files import write_atomically

@@ -306,7 +306,7 @@ def _table(request: dict[str, Any], key: str) -> dict[str, Any]:
     """Return a table of a request."""
     value = request.get(key, {})
     if not isinstance(value, dict):
-        raise EmulatorError(f"{key}: an object is needed")
+        raise EmulatorError(f"{key}: must be an object")
     return value
 
 

@@ -59,7 +59,7 @@ class Runs:
             The report is not one of these.
         """
         if not isinstance(event, dict) or not isinstance(event.get("run"), str):
-            raise EmulatorError("report: an object with `run` and `event` is needed")
+            raise EmulatorError("report: must be an object with `run` and `event`")
         match event.get("event"):
             case "begin":
                 self._begin(event)
@@ -104,6 +104,6 @@ class Runs:
         return run
 
     def messages(self) -> Iterator[str]:
-        """Yield the messages that tell a new page of all runs."""
+        """Yield the messages that describe all runs to a new page."""
         for run in self._runs.values():
             yield json.dumps({"type": "run", **run.head(), "results": run.results})

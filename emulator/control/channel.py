@@ -224,7 +224,7 @@ class ControlServer:
         """Return the head that a request is for."""
         number = request.pop("head", 1)
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(self._targets):
-            raise EmulatorError(f"head: {number!r} given, must be 1 to {len(self._targets)}")
+            raise EmulatorError(f"head: must be 1 to {len(self._targets)}, not {number!r}")
         return self._targets[number - 1]
 
     async def _status(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
@@ -292,7 +292,7 @@ class ControlServer:
     async def _set_truth(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request, "truth")
         if not isinstance(request.get("truth"), dict):
-            raise EmulatorError("truth: an object is needed, with the keys of [truth] in a profile")
+            raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
         async with self._opening:  # reading a file takes time; the last request wins
             await target.emulation.change_truth(config)
@@ -374,5 +374,5 @@ def _check_keys(request: dict[str, Any], *known: str) -> None:
 def _number(request: dict[str, Any], key: str, default: float | None = None) -> float:
     value = request.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e12:
-        raise EmulatorError(f"{key}: a number is needed")
+        raise EmulatorError(f"{key}: must be a number")
     return float(value)

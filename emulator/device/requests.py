@@ -12,10 +12,8 @@ from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.subscriptions import Subscription
-from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, log_internal_error
 from starhil.protocol.codec import Row
-from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import MessageError
 
@@ -37,18 +35,10 @@ class Requests:
     ----------
     unsolicited_receivers
         Called with each unsolicited telemetry message; one per link.
-
-    Raises
-    ------
-    EmulatorError
-        A row of the interface definition is not bound to the device.
     """
 
     def __init__(self, device: Device) -> None:
         icd = device.icd
-        missing = unbound(icd)
-        if missing:
-            raise EmulatorError(missing[0])
         self.device = device
         self.unsolicited_receivers: list[Callable[[Reply], None]] = []
         self.telemetry_bindings = {row.name: TelemetryBinding(row, icd) for row in icd.telemetry.values()}

@@ -92,7 +92,7 @@ class StarIdentifierSetup:
             allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
             if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
                 raise EmulatorError(
-                    f"identifier.{option}: {value!r} given, {known[option].removesuffix(' | None')} needed"
+                    f"identifier.{option}: must be {known[option].removesuffix(' | None')}, not {value!r}"
                 )
 
 

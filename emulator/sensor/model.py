@@ -162,15 +162,15 @@ class SensorModel:
 
     def __post_init__(self) -> None:
         if self.bits not in _BITS or isinstance(self.bits, bool):
-            raise EmulatorError(f"sensor bits: {self.bits!r} given, 8, 12 or 16 needed")
+            raise EmulatorError(f"sensor bits: must be 8, 12 or 16, not {self.bits!r}")
         for name, (low, high, unit) in _RANGES.items():
             value = getattr(self, name)
             whole = isinstance(low, int)
             if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
                 kind = "a whole number" if whole else "a number"
-                raise EmulatorError(f"sensor {name}: {value!r} given, {kind} needed ({unit})")
+                raise EmulatorError(f"sensor {name}: must be {kind} ({unit}), not {value!r}")
             if not low <= value <= high:
-                raise EmulatorError(f"sensor {name}: {value!r} given, {low:g}…{high:g} needed ({unit})")
+                raise EmulatorError(f"sensor {name}: must be {low:g}…{high:g} ({unit}), not {value!r}")
 
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; an unknown name is an error."""

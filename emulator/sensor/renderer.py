@@ -442,7 +442,7 @@ def render(
 def _whole_number(name: str, value: int) -> int:
     """Check a seed or an index."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**63:
-        raise EmulatorError(f"{name}: {value!r} given, a whole number from 0 needed")
+        raise EmulatorError(f"{name}: must be a whole number from 0, not {value!r}")
     return int(value)
 
 
@@ -451,6 +451,6 @@ def _rate(value: npt.ArrayLike) -> npt.NDArray[np.float64]:
     rate = np.asarray(value, dtype=np.float64)
     if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MAX_RATE_RAD_S:
         raise EmulatorError(
-            f"body rate: {value!r} given, three numbers of at most {_MAX_RATE_RAD_S} rad/s needed"
+            f"body rate: must be three numbers of at most {_MAX_RATE_RAD_S} rad/s, not {value!r}"
         )
     return rate

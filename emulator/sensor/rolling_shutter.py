@@ -1,4 +1,4 @@
-"""A rolling shutter: each row of the image shows the sky at a time of its own."""
+"""A rolling shutter: each row of the image shows the sky at its own time."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def at_row_times(
 def turned(
     vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Directions in the frame of a sensor that has turned on, each for a time of its own.
+    """Directions in the frame of a sensor that has turned on, each for its own time.
 
     Parameters
     ----------

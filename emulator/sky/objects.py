@@ -229,9 +229,7 @@ class SkyObjects:
         _check_fields("SkyObjects", self)
         low, high = self.false_star_magnitudes
         if low > high:
-            raise EmulatorError(
-                f"sky false_star_magnitudes: {low} to {high} given; put the brighter one first"
-            )
+            raise EmulatorError(f"sky false_star_magnitudes: {low} to {high}; put the brighter one first")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -248,7 +246,7 @@ class SkyObjects:
         for name, element in (("planets", PointSource), ("obstructions", Obstruction)):
             rows = fields.get(name, ())
             if not isinstance(rows, (list, tuple)):
-                raise EmulatorError(f"sky {name}: a list of tables is needed")
+                raise EmulatorError(f"sky {name}: must be a list of tables")
             fields[name] = tuple(_from_table(name, element, row) for row in rows)
         if share is not None and share != 0:
             edge = _from_table("blocked_share", Obstruction, {"share": share})
@@ -267,7 +265,7 @@ class SkyObjects:
 def _pair(name: str, value: Any) -> tuple[float, float]:
     """Return a list of two numbers as a tuple."""
     if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise EmulatorError(f"sky {name}: {value!r} given, two numbers needed")
+        raise EmulatorError(f"sky {name}: must be two numbers, not {value!r}")
     return (value[0], value[1])
 
 
@@ -277,7 +275,7 @@ def _from_table(name: str, kind: Any, values: Any) -> Any:
     if isinstance(values, kind):
         return values
     if not isinstance(values, Mapping):
-        raise EmulatorError(f"{where}: {values!r} given, a table needed")
+        raise EmulatorError(f"{where}: must be a table, not {values!r}")
     fields = {field.name: field for field in dataclasses.fields(kind)}
     unknown = sorted(values.keys() - fields.keys())
     if unknown:
@@ -308,9 +306,9 @@ def _check_fields(where: str, body: Any) -> None:
     for name, default, low, high in _RULES[type(body)]:
         value = getattr(body, name)
         if type(default) is bool and not isinstance(value, bool):
-            raise EmulatorError(f"sky {where} {name}: {value!r} given, true or false needed")
+            raise EmulatorError(f"sky {where} {name}: must be true or false, not {value!r}")
         if type(default) is str and not isinstance(value, str):
-            raise EmulatorError(f"sky {where} {name}: {value!r} given, a text needed")
+            raise EmulatorError(f"sky {where} {name}: must be a string, not {value!r}")
         if type(value) is float and low <= value <= high and not isinstance(low, int):
             continue
         if low > high or (value is None and default is None):
@@ -320,7 +318,7 @@ def _check_fields(where: str, body: Any) -> None:
             good = isinstance(number, int if whole else (int, float)) and not isinstance(number, bool)
             if not good or not low <= number <= high:
                 kind = "a whole number" if whole else "a number"
-                raise EmulatorError(f"sky {where} {name}: {number!r} given, {kind} {low:g}…{high:g} needed")
+                raise EmulatorError(f"sky {where} {name}: must be {kind} {low:g}…{high:g}, not {number!r}")
 
 
 def _field_rules(kind: Any) -> tuple[tuple[str, Any, float, float], ...]:

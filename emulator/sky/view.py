@@ -71,12 +71,12 @@ class Sky:
         dated = fields.pop("date", None) is not None
         bodies = fields.pop("bodies", BODIES[0])
         if bodies not in BODIES:
-            raise EmulatorError(f"sky bodies: {bodies!r} given, {' or '.join(map(repr, BODIES))} needed")
+            raise EmulatorError(f"sky bodies: must be {' or '.join(map(repr, BODIES))}, not {bodies!r}")
         self.by_date = bodies == BODIES[1]
         """Whether the date places Sun, Moon, Earth and planets."""
         self._moving = fields.pop("aberration", dated or self.by_date)
         if not isinstance(self._moving, bool):
-            raise EmulatorError(f"sky aberration: {self._moving!r} given, true or false needed")
+            raise EmulatorError(f"sky aberration: must be true or false, not {self._moving!r}")
         self._styles = {name: _styled(name, style, fields) for name, style in _STYLES.items() if self.by_date}
         self._fields = fields
         self._typed = SkyObjects.from_dict(fields)

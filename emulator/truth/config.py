@@ -302,7 +302,7 @@ class LiveConfig(Strict):
     host: str = "127.0.0.1"
     """Address to listen at."""
     port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Port to listen at; 0 takes a free one, which the ready line names."""
+    """Port to listen at; 0 for a free one, which the ready line names."""
     convention: Literal["rotation", "attitude"] = "rotation"
     """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42, Basilisk and most textbooks."""
     order: Literal["xyzw", "wxyz"] = "xyzw"

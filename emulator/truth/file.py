@@ -234,7 +234,7 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     for needed in (QUATERNION_COLUMNS, ANGLE_COLUMNS):
         if "t" in columns and all(name in columns for name in needed):
             return needed
-    raise EmulatorError(f"{where}: columns t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg needed")
+    raise EmulatorError(f"{where}: must have column t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg")
 
 
 def _parse_row(where: str, columns: list[str], line: str) -> dict[str, float]:

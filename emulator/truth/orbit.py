@@ -81,7 +81,7 @@ class KeplerOrbit:
     def __post_init__(self) -> None:
         if not 0.0 <= self.eccentricity <= LARGEST_ECCENTRICITY:
             raise EmulatorError(
-                f"orbit: eccentricity {self.eccentricity:g} given, 0…{LARGEST_ECCENTRICITY} needed"
+                f"orbit: eccentricity must be 0…{LARGEST_ECCENTRICITY}, not {self.eccentricity:g}"
             )
         perigee_m = self.semi_major_axis_m * (1.0 - self.eccentricity)
         if not EARTH_RADIUS_M <= perigee_m < math.inf:

@@ -87,7 +87,6 @@ def _counts(probe: LinkProbe) -> tuple[int, int]:
 
 @COUNTERS.case("telemetry", "each request of telemetry counts once, the reading of the counters too")
 def counters_telemetry(probe: LinkProbe) -> None:
-    """The count of telecommands stays the same."""
     commands, before = _counts(probe)
     for _ in range(COUNTED):
         probe.telemetry("identification")
@@ -105,7 +104,6 @@ def counters_refused_telemetry(probe: LinkProbe) -> None:
 
 @COUNTERS.case("telecommands", "each telecommand counts once, accepted or refused", intrusive=True)
 def counters_telecommands(probe: LinkProbe) -> None:
-    """Accepted, wrong length, unknown, out of limits."""
     before, _ = _counts(probe)
     probe.command("select_parameter", parameter=1)
     probe.expect_refusal(60, b"", INVALID_ID)
@@ -192,7 +190,6 @@ def _kept_clock(probe: LinkProbe) -> Iterator[None]:
 
 @TIME.case("runs", "the clock runs as fast as the tester's")
 def time_runs(probe: LinkProbe) -> None:
-    """Over one second, with a tolerance of 2 % and the duration of the requests."""
     begin, first = probe.now(), _clock(probe)
     middle = probe.now()
     probe.sleep(1.0)
@@ -238,7 +235,6 @@ def uptime(probe: LinkProbe) -> None:
 
 @MODES.case("standby", "in standby no attitude is valid, and the rows agree on it")
 def standby(probe: LinkProbe) -> None:
-    """The rows are precise_attitude, device_status and star_performance_2."""
     probe.standby()
     probe.wait_for("device_status", {"attitude_valid": False}, 2.0)
     attitude = probe.telemetry("precise_attitude")
@@ -249,7 +245,6 @@ def standby(probe: LinkProbe) -> None:
 
 @MODES.case("frames", "out of standby frames are made at the update rate, in standby none", rule(12))
 def frames(probe: LinkProbe) -> None:
-    """Two seconds at 5 Hz, with or without stars; the exposure leaves room for that rate."""
     probe.standby()
     with probe.parameters_kept("update_rate", "exposure"):
         probe.set_parameter("exposure", 50.0)
@@ -286,7 +281,6 @@ def changes(probe: LinkProbe) -> None:
 
 @MODES.case("no-tracking", "tracking without an attitude to start from is refused with code 7", rule(14))
 def no_tracking(probe: LinkProbe) -> None:
-    """After a reset there is no attitude to start from."""
     probe.reset()
     row = probe.icd.telecommands["set_mode"]
     probe.expect_refusal(row.id, row.encode({"mode": "tracking"}), SEQUENCE)
@@ -297,7 +291,6 @@ def no_tracking(probe: LinkProbe) -> None:
     "attitude", "with stars in view: valid, of unit length, its time just past, all rows agree", rule(15)
 )
 def attitude(probe: LinkProbe) -> None:
-    """Skipped if no attitude is found within 20 s."""
     probe.standby()
     probe.command("set_mode", mode="lost_in_space")
     end = probe.now() + 20.0
@@ -333,7 +326,6 @@ def reset_magic(probe: LinkProbe) -> None:
 
 @RESET.case("acknowledged", "reset is acknowledged, then the device restarts by command")
 def reset_acknowledged(probe: LinkProbe) -> None:
-    """The runtime and the counters start from zero; boot count and reset cause are updated."""
     before = probe.telemetry("boot_status")
     began = probe.now()
     probe.reset()
@@ -352,7 +344,6 @@ def reset_acknowledged(probe: LinkProbe) -> None:
 
 @STORE.case("reset", "a parameter that is not saved is lost at a reset, a saved one is kept")
 def store_reset(probe: LinkProbe) -> None:
-    """The parameters stored before are stored again afterwards."""
     before = float(probe.parameter("exposure")["value"])
     probe.set_parameter("exposure", TEST_VALUE)
     probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
@@ -377,7 +368,6 @@ def store_restore(probe: LinkProbe) -> None:
 
 @STORE.case("defaults", "default_parameters sets the defaults and leaves the store unchanged", rule(18))
 def store_defaults(probe: LinkProbe) -> None:
-    """The stored value is restored afterwards."""
     save_parameters(probe)
     stored = float(probe.parameter("limiting_magnitude")["value"])
     probe.set_parameter("limiting_magnitude", 4.25)
@@ -397,7 +387,6 @@ def store_defaults(probe: LinkProbe) -> None:
     "CubeComputer TC 37, TLM 202 (AlbertaSat)",
 )
 def star_config(probe: LinkProbe) -> None:
-    """53 bytes there and back; one invalid field changes nothing."""
     row = probe.icd.telecommands["set_star_config"]
     before = probe.telemetry("star_config")
     wanted = {**before, "exposure": 140, "max_stars_matched": 40}

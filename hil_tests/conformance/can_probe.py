@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from starhil.hil_tests.conformance.case import check
 from starhil.hil_tests.conformance.link_probe import (
     BURST_ID,
     FIRST_TELEMETRY,
@@ -13,23 +14,18 @@ from starhil.hil_tests.conformance.link_probe import (
     ProbeTimes,
 )
 from starhil.hil_tests.conformance.ports import Port
-from starhil.hil_tests.raw_traffic import format_frame, parse_frame
+from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
 
 TELECOMMAND: Final = 1
-ACK: Final = 2
-NACK: Final = 3
 TELEMETRY_REQUEST: Final = 4
-TELEMETRY: Final = 5
 TELEMETRY_NACK: Final = 6
 TELECOMMAND_SEGMENT: Final = 7
-TELEMETRY_SEGMENT: Final = 8
 UNSOLICITED_FIRST: Final = 10
 UNSOLICITED_BODY: Final = 11
 UNSOLICITED_LAST: Final = 12
 UNSOLICITED: Final = (9, UNSOLICITED_FIRST, UNSOLICITED_BODY, UNSOLICITED_LAST)
-ANSWERS: Final = (ACK, NACK, TELEMETRY, TELEMETRY_NACK, TELEMETRY_SEGMENT)
 
 
 def identifier_of(kind: int, number: int, source: int, destination: int) -> int:
@@ -67,22 +63,11 @@ class CanProbe(LinkProbe):
         device: int = 4,
         times: ProbeTimes | None = None,
     ) -> None:
-        super().__init__(icd, times or ProbeTimes())
-        self.bus = bus
+        super().__init__(bus, icd, times)
         self.host = host
         self.device = device
         self.unsolicited: list[CanFrame] = []
         self._frames: list[CanFrame] = []
-
-    def now(self) -> float:
-        """Time of the port, s."""
-        return self.bus.now()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass; received data are kept."""
-        end = self.now() + seconds
-        while (left := end - self.now()) > 0:
-            self._receive_into_buffer(left)
 
     def post(self, identifier: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
@@ -100,18 +85,28 @@ class CanProbe(LinkProbe):
     def send(self, frame: CanFrame) -> None:
         """Send a raw frame."""
         self.log.append(f"{self.now():.4f} -> {format_frame(frame)}")
-        self.bus.send(frame)
+        self.port.send(frame)
 
     def send_text(self, text: str) -> None:
         """Send a frame in the format of `cansend`, with HH and DD for the addresses."""
         self.send(parse_frame(self.with_addresses(text)))
 
+    def expecting(self, *answers: str) -> None:
+        """Do nothing: an answer carries its identifier."""
+
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next frame, which must be one with HH, DD, and `..` for any byte."""
+        wanted = pattern(self.with_addresses(answer))
+        frame = self.next_frame()
+        seen = "nothing" if frame is None else format_frame(frame)
+        check(matches(wanted, seen), wanted, seen)
+
     def with_addresses(self, text: str) -> str:
         """Replace HH and DD in the text of a frame by the addresses of host and device."""
         return text.replace("HH", f"{self.host:02X}").replace("DD", f"{self.device:02X}")
 
-    def _receive_into_buffer(self, timeout_s: float) -> bool:
-        frame = self.bus.receive(timeout_s)
+    def _receive(self, timeout_s: float) -> bool:
+        frame = self.port.receive(timeout_s)
         if frame is None:
             return False
         if not frame.extended or frame.remote or frame.id >> 8 & 0xFF != self.device:
@@ -125,8 +120,7 @@ class CanProbe(LinkProbe):
 
     def drain(self) -> None:
         """Discard everything received."""
-        while self.bus.receive(0.0) is not None:
-            pass
+        super().drain()
         self._frames.clear()
         self.unsolicited.clear()
 
@@ -155,7 +149,7 @@ class CanProbe(LinkProbe):
         end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
         while not self._frames:
             left = end - self.now()
-            if left <= 0 or not self._receive_into_buffer(left):
+            if left <= 0 or not self._receive(left):
                 break
         return self._frames.pop(0) if self._frames else None
 

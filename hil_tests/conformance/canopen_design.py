@@ -21,7 +21,6 @@ DESIGN: Final = CaseArea[CanopenProbe]("canopen.design", "interface definition: 
 
 @DESIGN.case("write-event", "a write to a mapped object is an event")
 def write_event(probe: CanopenProbe) -> None:
-    """The event-driven TPDO carries the new value."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
     before = probe.read(item.index, item.subindex)
@@ -35,7 +34,6 @@ def write_event(probe: CanopenProbe) -> None:
 
 @DESIGN.case("attitude", "TPDOs with a sequence number are of one sample")
 def attitude(probe: CanopenProbe) -> None:
-    """All TPDOs that map an object named `sequence` carry the same number after one SYNC."""
     marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
     chosen: list[int] = []
     probe.quiet()

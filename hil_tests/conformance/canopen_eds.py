@@ -45,7 +45,6 @@ def mandatory(probe: CanopenProbe) -> None:
 
 @EDS.case("lists", "object lists and sections agree", "CiA 306 4.6.2")
 def lists(probe: CanopenProbe) -> None:
-    """Each object is listed once, in the list of its range, and has a section."""
     parser = _file(probe)
     listed: list[int] = []
     for name in LISTS:
@@ -66,7 +65,6 @@ def lists(probe: CanopenProbe) -> None:
 
 @EDS.case("types", "every variable has a type, a name and an access", "CiA 306 4.6.3")
 def types(probe: CanopenProbe) -> None:
-    """Data types are those of CiA 301, access types those of CiA 306."""
     known = set(ODVariable.STRUCT_TYPES) | set(datatypes.DATA_TYPES)
     known |= {datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE}
     for item in probe.variables():
@@ -77,7 +75,6 @@ def types(probe: CanopenProbe) -> None:
 
 @EDS.case("limits", "limits and defaults fit each other and their type", "CiA 306 4.6.3")
 def limits(probe: CanopenProbe) -> None:
-    """Low limit, default and high limit are in ascending order and within the range of the type."""
     for item in probe.variables():
         if not is_integer(item):
             continue
@@ -110,7 +107,6 @@ def sub_index_0(probe: CanopenProbe) -> None:
 
 @EDS.case("pdo-count", "number of PDOs agrees with the records")
 def pdo_count(probe: CanopenProbe) -> None:
-    """NrOfRXPDO and NrOfTXPDO count the communication records, and each has its mapping record."""
     information = probe.od.device_information
     for first, stated in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
         indices = probe.pdo_indices(first)
@@ -121,7 +117,6 @@ def pdo_count(probe: CanopenProbe) -> None:
 
 @EDS.case("mapping", "default mappings name objects that can be mapped", "CiA 301 7.5.2.36")
 def mapping(probe: CanopenProbe) -> None:
-    """Existence, length, mappability, direction, and 64 bits at most."""
     for first in (0x1600, 0x1A00):
         for index in probe.pdo_indices(first):
             record = probe.od.indices[index]
@@ -147,7 +142,6 @@ def mapping(probe: CanopenProbe) -> None:
 
 @EDS.case("cob-ids", "default identifiers are free, allowed and distinct", "CiA 301 7.3.5")
 def cob_ids(probe: CanopenProbe) -> None:
-    """Valid PDOs, SYNC, TIME and EMCY use no restricted CAN-ID, and no two of them share one."""
     used: dict[int, str] = {}
     for index in (0x1005, 0x1012, 0x1014, *probe.pdo_indices(0x1400), *probe.pdo_indices(0x1800)):
         item = probe.od.get_variable(index, 0 if index < 0x1400 else 1)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_GENERAL,
-    ABORT_NO_DATA,
-    ABORT_NO_SUBINDEX,
     PDO_OFF,
     PRE_OPERATIONAL,
     STOP,
     VALUE_ABORTS,
     WATCHED_NODE,
+    Abort,
     CanopenProbe,
     multiplexer,
 )
@@ -61,7 +59,6 @@ class ProvokedError:
 
 @EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
 def emcy_format(probe: CanopenProbe) -> None:
-    """The register equals 1001h and has the generic bit set."""
     error = ProvokedError(probe)
     error.cause()
     data = probe.expect(error.emergency, "EMCY")
@@ -72,7 +69,6 @@ def emcy_format(probe: CanopenProbe) -> None:
 
 @EMCY.case("once", "one EMCY per error", "CiA 301 7.2.7.1")
 def emcy_once(probe: CanopenProbe) -> None:
-    """The same error sends nothing while it persists."""
     error = ProvokedError(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
@@ -82,7 +78,6 @@ def emcy_once(probe: CanopenProbe) -> None:
 
 @EMCY.case("gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
-    """The error register is clear again; the history keeps the error."""
     error = ProvokedError(probe)
     error.cause()
     probe.expect(error.emergency, "EMCY")
@@ -97,15 +92,11 @@ def emcy_gone(probe: CanopenProbe) -> None:
 
 @EMCY.case("history", "the error history has the newest first")
 def emcy_history(probe: CanopenProbe) -> None:
-    """The count grows with each error up to the length; sub-index 1 holds the newest code.
-
-    Writing 0 clears it.
-    """
     probe.require(0x1003)
     error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)
     check_equal(probe.number(0x1003, 0), 0, "errors after the clear")
-    probe.expect_abort(b"\x40" + multiplexer(0x1003, 1), ABORT_NO_DATA, ABORT_GENERAL, ABORT_NO_SUBINDEX)
+    probe.expect_abort(b"\x40" + multiplexer(0x1003, 1), Abort.NO_DATA, Abort.GENERAL, Abort.NO_SUBINDEX)
     length = max(probe.od.indices[0x1003].subindices)
     for number in range(1, length + 3):
         error.cause()
@@ -137,14 +128,12 @@ def emcy_history_order(probe: CanopenProbe) -> None:
 
 @EMCY.case("history-write", "the error history takes 0 only")
 def emcy_history_write(probe: CanopenProbe) -> None:
-    """Any other number is refused by 0609 0030h."""
     probe.require(0x1003)
     probe.expect_refusal(0x1003, 0, 1, 1, *VALUE_ABORTS)
 
 
 @EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
-    """A new CAN-ID is refused while EMCY is on; restricted ones always are."""
     error = ProvokedError(probe)
     probe.expect_refusal(0x1014, 0, 0x91, 4, *VALUE_ABORTS)
     probe.set(0x1014, 0, PDO_OFF | error.emergency)
@@ -161,23 +150,23 @@ def emcy_switch(probe: CanopenProbe) -> None:
 
 @EMCY.case("inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16")
 def emcy_inhibit(probe: CanopenProbe) -> None:
-    """With 100 ms the second EMCY follows 100 ms after the first."""
     probe.require(0x1015)
     error = ProvokedError(probe)
     probe.set(0x1015, 0, 1000, 2)
     error.cause()
     probe.expect(error.emergency, "EMCY")
-    start = probe.bus.now()
+    start = probe.port.now()
     error.clear()
     probe.expect(error.emergency, "EMCY 0000h")
     check(
-        0.08 <= probe.bus.now() - start <= 0.15, "0.1 s between two EMCY", f"{probe.bus.now() - start:.3f} s"
+        0.08 <= probe.port.now() - start <= 0.15,
+        "0.1 s between two EMCY",
+        f"{probe.port.now() - start:.3f} s",
     )
 
 
 @EMCY.case("stopped", "no EMCY in STOPPED", "CiA 301 7.3.2.2.5")
 def emcy_stopped(probe: CanopenProbe) -> None:
-    """A missing heartbeat in STOPPED causes no EMCY until the node leaves that state."""
     probe.require(0x1016)
     error = ProvokedError(probe)
     probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)

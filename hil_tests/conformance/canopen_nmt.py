@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_INCOMPATIBLE,
     NOBODY,
     PRE_OPERATIONAL,
     RESET_COMMUNICATION,
@@ -14,14 +13,13 @@ from starhil.hil_tests.conformance.canopen_probe import (
     START,
     STOP,
     WATCHED_NODE,
+    Abort,
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
 NMT: Final = CaseArea[CanopenProbe]("canopen.nmt", "CiA 301 7.3.2.2", intrusive=True)
 ERROR_CONTROL: Final = CaseArea[CanopenProbe]("canopen.error-control", "CiA 301 7.2.8.3.2", intrusive=True)
-NMT_CLAUSE: Final = "CiA 301 7.3.2.2"
-CONTROL_CLAUSE: Final = "CiA 301 7.2.8.3"
 STATE_OF: Final = {START: 0x05, STOP: 0x04, PRE_OPERATIONAL: 0x7F}
 
 
@@ -38,7 +36,6 @@ def _state(probe: CanopenProbe) -> int:
 
 @NMT.case("boot-up", "boot-up message, then PRE-OPERATIONAL without a command", "CiA 301 7.3.2.2.1")
 def boot_up(probe: CanopenProbe) -> None:
-    """After each reset: one frame 700h + node-ID with data 00; then SDO works."""
     for command in (RESET_COMMUNICATION, RESET_NODE):
         probe.drain()
         probe.command(command)
@@ -56,7 +53,6 @@ def boot_up_once(probe: CanopenProbe) -> None:
 
 @NMT.case("commands", "start, stop and enter PRE-OPERATIONAL from every state")
 def commands(probe: CanopenProbe) -> None:
-    """All nine transitions, addressed to the node."""
     _prepare(probe)
     for before in STATE_OF:
         for command, state in STATE_OF.items():
@@ -83,7 +79,6 @@ def other_node(probe: CanopenProbe) -> None:
 
 @NMT.case("malformed", "frames that are no NMT command are ignored")
 def malformed(probe: CanopenProbe) -> None:
-    """Unknown specifier, one byte, three bytes, extended frame."""
     _prepare(probe)
     node = bytes([probe.node])
     for data in (b"\x03" + node, b"\x01", b"\x01" + node + b"\0"):
@@ -95,7 +90,6 @@ def malformed(probe: CanopenProbe) -> None:
 
 @NMT.case("reset-states", "resets work from every state")
 def reset_states(probe: CanopenProbe) -> None:
-    """Reset node and reset communication from OPERATIONAL and STOPPED."""
     for before in (START, STOP):
         for command in (RESET_COMMUNICATION, RESET_NODE):
             probe.command(before)
@@ -106,7 +100,6 @@ def reset_states(probe: CanopenProbe) -> None:
 
 @NMT.case("reset-communication", "reset communication restores the communication profile")
 def reset_communication(probe: CanopenProbe) -> None:
-    """A changed heartbeat time has its stored value again."""
     before = probe.number(0x1017)
     probe.set(0x1017, 0, before ^ 0x55, 2)
     probe.reset_communication()
@@ -126,7 +119,6 @@ def sdo_states(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("heartbeat", "heartbeat at its period with the state")
 def heartbeat(probe: CanopenProbe) -> None:
-    """One byte with bit 7 clear; mean period within 20 % over five heartbeats of 100 ms."""
     _prepare(probe, 100)
     probe.drain()
     found = probe.count(0x700 + probe.node, 0.75)
@@ -167,7 +159,6 @@ def _prepare_guarding(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("guarding", "node guarding with toggle bit", "CiA 301 7.2.8.3.1")
 def guarding(probe: CanopenProbe) -> None:
-    """The toggle bit starts at 0 after a reset and alternates; the state is correct."""
     _prepare_guarding(probe)
     check_equal([_guard(probe) for _ in range(3)], [0x7F, 0xFF, 0x7F], "answers")
     probe.command(START)
@@ -186,7 +177,6 @@ def guarding(probe: CanopenProbe) -> None:
     "guarding-or-heartbeat", "no node guarding while the heartbeat is on", "CiA 301 7.2.8.3.1"
 )
 def guarding_or_heartbeat(probe: CanopenProbe) -> None:
-    """A remote request is not answered while 1017h is not 0."""
     probe.require(0x100C)
     _prepare(probe, 5000)
     probe.drain()
@@ -196,10 +186,6 @@ def guarding_or_heartbeat(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("life-guarding", "life guarding", "CiA 301 7.2.8.3.1")
 def life_guarding(probe: CanopenProbe) -> None:
-    """It starts with the first request.
-
-    When requests stop, EMCY 8130h is sent and the node leaves OPERATIONAL.
-    """
     _prepare_guarding(probe)
     probe.require(0x100D)
     probe.set(0x100C, 0, 50, 2)
@@ -239,10 +225,6 @@ def consumer_start(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("consumer", "the heartbeat of a watched node stops and returns")
 def consumer(probe: CanopenProbe) -> None:
-    """EMCY 8130h after the consumer time, not before; the error register is set.
-
-    EMCY 0000h at the next heartbeat.
-    """
     emergency = _watch(probe)
     for _ in range(3):
         probe.send_watched_heartbeat()
@@ -260,7 +242,6 @@ def consumer(probe: CanopenProbe) -> None:
     "behaviour", "error behaviour when the heartbeat of a watched node stops", "CiA 301 7.5.2.32"
 )
 def behaviour(probe: CanopenProbe) -> None:
-    """1029h:01h = 0 leads to PRE-OPERATIONAL, 1 to no change, 2 to STOPPED."""
     probe.require(0x1029)
     for value, state in ((0, 0x7F), (1, 0x05), (2, 0x04)):
         probe.command(PRE_OPERATIONAL)
@@ -275,18 +256,16 @@ def behaviour(probe: CanopenProbe) -> None:
 
 @ERROR_CONTROL.case("consumer-twice", "one node is watched by one entry", "CiA 301 7.5.2.18")
 def consumer_twice(probe: CanopenProbe) -> None:
-    """A second entry for the same node is refused with 0604 0043h."""
     _watch(probe)
     item = probe.od.get_variable(0x1016, 2)
     if item is None:
         raise CaseSkipped("1016h has one entry")
-    probe.expect_refusal(0x1016, 2, WATCHED_NODE << 16 | 200, 4, ABORT_INCOMPATIBLE)
+    probe.expect_refusal(0x1016, 2, WATCHED_NODE << 16 | 200, 4, Abort.INCOMPATIBLE)
     probe.set(0x1016, 2, (WATCHED_NODE + 1) << 16 | 200)
 
 
 @ERROR_CONTROL.case("consumer-off", "a watch with time 0 is off", "CiA 301 7.5.2.18")
 def consumer_off(probe: CanopenProbe) -> None:
-    """The watch is switched off after the first heartbeat: no EMCY."""
     emergency = _watch(probe)
     probe.send_watched_heartbeat()
     probe.set(0x1016, 1, 0)

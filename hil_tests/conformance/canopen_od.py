@@ -7,20 +7,7 @@ from typing import Final
 from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_DEVICE_STATE,
-    ABORT_GENERAL,
-    ABORT_LENGTH,
-    ABORT_LENGTH_HIGH,
-    ABORT_LENGTH_LOW,
-    ABORT_NO_DATA,
-    ABORT_NO_OBJECT,
-    ABORT_NO_SUBINDEX,
-    ABORT_NOT_STORED,
-    ABORT_READ_ONLY,
-    ABORT_VALUE,
-    ABORT_VALUE_HIGH,
-    ABORT_VALUE_LOW,
-    ABORT_WRITE_ONLY,
+    Abort,
     CanopenProbe,
     is_integer,
     multiplexer,
@@ -29,7 +16,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
 OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
-NOT_NOW = {ABORT_NO_DATA, ABORT_GENERAL, ABORT_DEVICE_STATE, ABORT_NOT_STORED}
+NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
 """Aborts by which a node says that an object exists and has no value now."""
 
 
@@ -115,69 +102,63 @@ def sub_index_0(probe: CanopenProbe) -> None:
 
 @OD.case("write-only", "write-only objects are not read", intrusive=False)
 def write_only(probe: CanopenProbe) -> None:
-    """Abort 0601 0001h for each of them."""
     probe.find("write-only object", lambda item: item.access_type == "wo")
     for item in probe.variables():
         if item.access_type == "wo":
-            probe.expect_abort(b"\x40" + multiplexer(item.index, item.subindex), ABORT_WRITE_ONLY)
+            probe.expect_abort(b"\x40" + multiplexer(item.index, item.subindex), Abort.WRITE_ONLY)
 
 
 @OD.case("read-only", "read-only and constant objects are not written")
 def read_only(probe: CanopenProbe) -> None:
-    """Abort 0601 0002h for each of them."""
     for item in probe.variables():
         if item.access_type in {"ro", "const"}:
             size = min(size_of(item) or 1, 4)
             command = bytes([0x23 | (4 - size) << 2])
             if size_of(item) in {1, 2, 4}:
-                probe.expect_abort(command + multiplexer(item.index, item.subindex), ABORT_READ_ONLY)
+                probe.expect_abort(command + multiplexer(item.index, item.subindex), Abort.READ_ONLY)
 
 
 @OD.case("no-object", "objects that are not in the EDS do not exist")
 def no_object(probe: CanopenProbe) -> None:
-    """The gaps at both ends of each run of objects: abort 0602 0000h for reading and writing."""
     present = {index for index in probe.od.indices if index >= 0x1000}
     gaps = sorted({near for index in present for near in (index - 1, index + 1) if near >= 0x1000} - present)
     for index in [0x0000, 0x0005, *gaps, 0xFFFF]:
         if index not in present:
-            probe.expect_abort(b"\x40" + multiplexer(index, 0), ABORT_NO_OBJECT)
-            probe.expect_abort(b"\x2f" + multiplexer(index, 0), ABORT_NO_OBJECT)
+            probe.expect_abort(b"\x40" + multiplexer(index, 0), Abort.NO_OBJECT)
+            probe.expect_abort(b"\x2f" + multiplexer(index, 0), Abort.NO_OBJECT)
 
 
 @OD.case("no-sub-index", "sub-indices that are not in the EDS do not exist")
 def no_sub_index(probe: CanopenProbe) -> None:
-    """The first beyond each record, and sub-index 1 of each variable: abort 0609 0011h."""
     for index in sorted(probe.od.indices):
         if index < 0x1000:
             continue
         item = probe.od.indices[index]
         beyond = 1 if isinstance(item, ODVariable) else max(item.subindices) + 1
         if beyond < 0xFF:
-            probe.expect_abort(b"\x40" + multiplexer(index, beyond), ABORT_NO_SUBINDEX)
-            probe.expect_abort(b"\x2f" + multiplexer(index, beyond), ABORT_NO_SUBINDEX)
+            probe.expect_abort(b"\x40" + multiplexer(index, beyond), Abort.NO_SUBINDEX)
+            probe.expect_abort(b"\x2f" + multiplexer(index, beyond), Abort.NO_SUBINDEX)
 
 
 @OD.case("length-high", "too long a value is refused")
 def length_high(probe: CanopenProbe) -> None:
-    """Expedited writes with one byte too many: abort 0607 0010h or 0607 0012h."""
     for item in probe.variables():
         size = size_of(item)
         if item.writable and size is not None and size < 4 and item.index not in {0x1010, 0x1011}:
             command = bytes([0x23 | (3 - size) << 2])
             probe.expect_abort(
-                command + multiplexer(item.index, item.subindex), ABORT_LENGTH, ABORT_LENGTH_HIGH
+                command + multiplexer(item.index, item.subindex), Abort.LENGTH, Abort.LENGTH_HIGH
             )
 
 
 @OD.case("length-low", "too short a value is refused")
 def length_low(probe: CanopenProbe) -> None:
-    """Expedited writes with one byte too few: abort 0607 0010h or 0607 0013h."""
     for item in probe.variables():
         size = size_of(item)
         if item.writable and size is not None and 1 < size <= 5:
             command = bytes([0x23 | (5 - size) << 2])
             probe.expect_abort(
-                command + multiplexer(item.index, item.subindex), ABORT_LENGTH, ABORT_LENGTH_LOW
+                command + multiplexer(item.index, item.subindex), Abort.LENGTH, Abort.LENGTH_LOW
             )
 
 
@@ -192,31 +173,28 @@ def _bounded(probe: CanopenProbe) -> list[ODVariable]:
 
 @OD.case("value-high", "values above the limit are refused")
 def value_high(probe: CanopenProbe) -> None:
-    """One above each high limit that the type can hold: abort 0609 0031h or 0609 0030h."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
         highest = (1 << 8 * size - signed) - 1
         if item.max is not None and item.max < highest:
             data = (int(item.max) + 1).to_bytes(size, "little", signed=signed)
-            probe.expect_refusal(item.index, item.subindex, data, size, ABORT_VALUE_HIGH, ABORT_VALUE)
+            probe.expect_refusal(item.index, item.subindex, data, size, Abort.VALUE_HIGH, Abort.VALUE)
 
 
 @OD.case("value-low", "values below the limit are refused")
 def value_low(probe: CanopenProbe) -> None:
-    """One below each low limit that the type can hold: abort 0609 0032h or 0609 0030h."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
         lowest = -(1 << 8 * size - 1) if signed else 0
         if item.min is not None and item.min > lowest:
             data = (int(item.min) - 1).to_bytes(size, "little", signed=signed)
-            probe.expect_refusal(item.index, item.subindex, data, size, ABORT_VALUE_LOW, ABORT_VALUE)
+            probe.expect_refusal(item.index, item.subindex, data, size, Abort.VALUE_LOW, Abort.VALUE)
 
 
 @OD.case("write-back", "what is written is read back", "CiA 301 7.2.4.3")
 def write_back(probe: CanopenProbe) -> None:
-    """Both limits of each writable application object, then its previous value."""
     found = 0
     for item in probe.variables():
         size = size_of(item)

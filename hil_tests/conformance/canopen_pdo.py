@@ -8,19 +8,17 @@ from typing import Final
 from canopen.objectdictionary import ODVariable
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_ACCESS,
-    ABORT_DEVICE_STATE,
-    ABORT_VALUE,
     FIRST_OWN_OBJECT,
     NO_RTR,
     PDO_OFF,
+    Abort,
     CanopenProbe,
     is_integer,
     size_of,
 )
 from starhil.hil_tests.conformance.case import CaseSkipped
 
-FIXED: Final = (ABORT_ACCESS, ABORT_DEVICE_STATE, ABORT_VALUE)
+FIXED: Final = (Abort.ACCESS, Abort.DEVICE_STATE, Abort.VALUE)
 """Aborts by which stacks refuse a change of the mapping of a PDO in use; CiA 301 names none."""
 SYNCHRONOUS: Final = 1
 EVENT: Final = 255

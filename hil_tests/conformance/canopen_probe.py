@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import Final, Protocol
+from enum import IntEnum
+from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.can_framing import CanFrame
 
 NMT: Final = 0x000
@@ -31,40 +33,43 @@ NOBODY: Final = -1
 SETTLING_S: Final = 0.05
 """Time in which a node obeys an NMT command, and what was under way has come."""
 
-STATES: Final = {0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL", 0x00: "boot-up"}
-
 MOST_WAITING: Final = 20_000
 """Frames that may wait to be read before a node counts as one that floods the bus."""
 
 PDO_OFF: Final = 1 << 31
 NO_RTR: Final = 1 << 30
 
-ABORT_TOGGLE: Final = 0x05030000
-ABORT_TIMEOUT: Final = 0x05040000
-ABORT_COMMAND: Final = 0x05040001
-ABORT_BLOCK_SIZE: Final = 0x05040002
-ABORT_SEQUENCE: Final = 0x05040003
-ABORT_CRC: Final = 0x05040004
-ABORT_ACCESS: Final = 0x06010000
-ABORT_WRITE_ONLY: Final = 0x06010001
-ABORT_READ_ONLY: Final = 0x06010002
-ABORT_NO_OBJECT: Final = 0x06020000
-ABORT_NOT_MAPPABLE: Final = 0x06040041
-ABORT_PDO_LENGTH: Final = 0x06040042
-ABORT_INCOMPATIBLE: Final = 0x06040043
-ABORT_LENGTH: Final = 0x06070010
-ABORT_LENGTH_HIGH: Final = 0x06070012
-ABORT_LENGTH_LOW: Final = 0x06070013
-ABORT_NO_SUBINDEX: Final = 0x06090011
-ABORT_VALUE: Final = 0x06090030
-ABORT_VALUE_HIGH: Final = 0x06090031
-ABORT_VALUE_LOW: Final = 0x06090032
-ABORT_GENERAL: Final = 0x08000000
-ABORT_NOT_STORED: Final = 0x08000020
-ABORT_DEVICE_STATE: Final = 0x08000022
-ABORT_NO_DATA: Final = 0x08000024
 
-VALUE_ABORTS: Final = (ABORT_VALUE, ABORT_VALUE_HIGH, ABORT_VALUE_LOW)
+class Abort(IntEnum):
+    """Abort codes of SDO transfers (CiA 301 7.2.4.3.17)."""
+
+    TOGGLE = 0x05030000
+    TIMEOUT = 0x05040000
+    COMMAND = 0x05040001
+    BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
+    ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    PDO_LENGTH = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    LENGTH = 0x06070010
+    LENGTH_HIGH = 0x06070012
+    LENGTH_LOW = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    VALUE_HIGH = 0x06090031
+    VALUE_LOW = 0x06090032
+    GENERAL = 0x08000000
+    NOT_STORED = 0x08000020
+    DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
+
+
+VALUE_ABORTS: Final = (Abort.VALUE, Abort.VALUE_HIGH, Abort.VALUE_LOW)
 """Abort codes with which a node may refuse a value."""
 RESTRICTED_IDS: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
 """CAN-IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
@@ -72,25 +77,12 @@ WATCHED_NODE: Final = 0x05
 """Node-ID of a simulated watched node; no other node on the bus may have it."""
 
 
-class FrameBus(Protocol):
-    """A synchronous CAN bus with its own clock."""
-
-    def send(self, frame: CanFrame) -> None:
-        """Send a frame."""
-
-    def receive(self, timeout_s: float) -> CanFrame | None:
-        """Return the next frame of another node, None if none comes in time."""
-
-    def now(self) -> float:
-        """Time, s."""
-
-
 class CanopenProbe:
     """Talks to one node.
 
     Parameters
     ----------
-    bus
+    port
         The bus that the node is on.
     node
         Its node-ID.
@@ -103,9 +95,9 @@ class CanopenProbe:
     """
 
     def __init__(
-        self, bus: FrameBus, node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
+        self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
     ) -> None:
-        self.bus = bus
+        self.port = port
         self.node = node
         self.od = od
         self.eds = eds
@@ -188,14 +180,14 @@ class CanopenProbe:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
         frame = CanFrame(identifier, payload, extended=extended, remote=remote)
-        self.log.append(f"{self.bus.now():.4f} -> {_frame_text(frame)}")
-        self.bus.send(frame)
+        self.log.append(f"{self.port.now():.4f} -> {_frame_text(frame)}")
+        self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, None if none comes in time."""
-        frame = self.bus.receive(timeout_s)
+        frame = self.port.receive(timeout_s)
         if frame is not None:
-            self.log.append(f"{self.bus.now():.4f} <- {_frame_text(frame)}")
+            self.log.append(f"{self.port.now():.4f} <- {_frame_text(frame)}")
         return frame
 
     def drain(self) -> None:
@@ -213,8 +205,8 @@ class CanopenProbe:
     ) -> bytes | None:
         """Return the data of the next accepted frame with one of the CAN IDs, else None."""
         wanted = {identifiers} if isinstance(identifiers, int) else identifiers
-        end = self.bus.now() + (self.timeout_s if timeout_s is None else timeout_s)
-        while (left := end - self.bus.now()) >= 0:
+        end = self.port.now() + (self.timeout_s if timeout_s is None else timeout_s)
+        while (left := end - self.port.now()) >= 0:
             frame = self.receive(left)
             if frame is None:
                 return None
@@ -243,12 +235,12 @@ class CanopenProbe:
 
     def count(self, identifier: int, for_s: float) -> list[tuple[float, bytes]]:
         """Return time and data of the frames with an identifier within a time."""
-        end, found = self.bus.now() + for_s, []
-        while (left := end - self.bus.now()) > 0:
+        end, found = self.port.now() + for_s, []
+        while (left := end - self.port.now()) > 0:
             data = self.wait_for(identifier, left)
             if data is None:
                 break
-            found.append((self.bus.now(), data))
+            found.append((self.port.now(), data))
         return found
 
     # SDO
@@ -399,17 +391,6 @@ class CanopenProbe:
             self.set(0x1017, 0, 0, 2)
         for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):
             self.set(index, 1, self.number(index, 1) | PDO_OFF)
-
-    def expect_state(self, state: int) -> None:
-        """Fail unless the heartbeat reports a state; the heartbeat is switched on if necessary."""
-        if state == 0x04:
-            data = self.wait_for(0x700 + self.node, 2.5)
-        else:
-            self.set(0x1017, 0, 20, 2)
-            self.drain()
-            data = self.wait_for(0x700 + self.node, 1.0)
-        if data is None or data[0] & 0x7F != state:
-            raise CaseFailed(f"state {STATES[state]}", _seen(data))
 
     # What the dictionary has
 

@@ -14,13 +14,13 @@ from starhil.hil_tests.conformance.canopen_pdo import (
     writable,
 )
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_NOT_MAPPABLE,
     PDO_OFF,
     PRE_OPERATIONAL,
     RESTRICTED_IDS,
     START,
     STOP,
     VALUE_ABORTS,
+    Abort,
     CanopenProbe,
     size_of,
 )
@@ -44,7 +44,6 @@ def rpdo_event(probe: CanopenProbe) -> None:
 
 @RPDO.case("gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def rpdo_gate(probe: CanopenProbe) -> None:
-    """The object keeps its value in PRE-OPERATIONAL and in STOPPED."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     data = next(
@@ -62,7 +61,6 @@ def rpdo_gate(probe: CanopenProbe) -> None:
 
 @RPDO.case("synchronous", "synchronous RPDO acts at the next SYNC")
 def rpdo_synchronous(probe: CanopenProbe) -> None:
-    """The object keeps its value until the SYNC, then takes the last one received."""
     item = writable(probe)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
     low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
@@ -78,7 +76,6 @@ def rpdo_synchronous(probe: CanopenProbe) -> None:
 
 @RPDO.case("short", "too short an RPDO is reported and not processed", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_short(probe: CanopenProbe) -> None:
-    """EMCY 8210h; the object keeps its value."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item), entry(item)], 255)
@@ -92,7 +89,6 @@ def rpdo_short(probe: CanopenProbe) -> None:
 
 @RPDO.case("long", "too long an RPDO is reported", "CiA 301 7.2.2.3, 7.2.7.1")
 def rpdo_long(probe: CanopenProbe) -> None:
-    """EMCY 8220h, then EMCY 0000h after a PDO of the correct length."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
@@ -107,7 +103,6 @@ def rpdo_long(probe: CanopenProbe) -> None:
 
 @RPDO.case("place-holder", "dummy entries skip bytes of an RPDO", "CiA 301 7.4.7")
 def place_holder(probe: CanopenProbe) -> None:
-    """A dummy UNSIGNED16 is mapped before the object."""
     if 0x0006 not in probe.od:
         raise CaseSkipped("the EDS allows no dummy entry of 16 bits")
     item = writable(probe)
@@ -122,7 +117,6 @@ def place_holder(probe: CanopenProbe) -> None:
 
 @RPDO.case("deadline", "deadline of an RPDO", "CiA 301 7.5.2.35")
 def deadline(probe: CanopenProbe) -> None:
-    """EMCY 8250h comes 100 ms (event timer) after the last message, not before the first."""
     item = writable(probe)
     before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255, event_ms=100)
@@ -131,10 +125,12 @@ def deadline(probe: CanopenProbe) -> None:
     probe.drain()
     probe.expect_silence(emergency, "EMCY before the first message", 0.3)
     probe.send(identifier, before)
-    start = probe.bus.now()
+    start = probe.port.now()
     check_equal(probe.expect(emergency, "EMCY 8250h")[:2], b"\x50\x82", "error code")
     check(
-        0.08 <= probe.bus.now() - start <= 0.16, "0.1 s after the message", f"{probe.bus.now() - start:.3f} s"
+        0.08 <= probe.port.now() - start <= 0.16,
+        "0.1 s after the message",
+        f"{probe.port.now() - start:.3f} s",
     )
     probe.send(identifier, before)
     check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
@@ -142,7 +138,6 @@ def deadline(probe: CanopenProbe) -> None:
 
 @RPDO.case("refused", "configurations that an RPDO refuses", "CiA 301 7.5.2.35")
 def rpdo_refused(probe: CanopenProbe) -> None:
-    """Restricted CAN-IDs, another CAN-ID while in use, types 241 to 253, read-only objects."""
     index, item = first(probe, 0x1400), writable(probe)
     set_up(probe, index, [entry(item)], 255)
     probe.expect_refusal(index, 1, 0x3F3, 4, *FIXED)
@@ -156,7 +151,7 @@ def rpdo_refused(probe: CanopenProbe) -> None:
     constant_ = probe.find(
         "mappable read-only object", lambda item: item.pdo_mappable and item.access_type == "ro"
     )
-    probe.expect_refusal(index + 0x200, 1, entry(constant_), 4, ABORT_NOT_MAPPABLE)
+    probe.expect_refusal(index + 0x200, 1, entry(constant_), 4, Abort.NOT_MAPPABLE)
 
 
 CASES: Final = (*RPDO.cases,)

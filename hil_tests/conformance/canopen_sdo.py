@@ -7,13 +7,8 @@ from typing import Final
 from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_COMMAND,
-    ABORT_LENGTH,
-    ABORT_LENGTH_HIGH,
-    ABORT_LENGTH_LOW,
-    ABORT_TIMEOUT,
-    ABORT_TOGGLE,
     STOP,
+    Abort,
     CanopenProbe,
     is_integer,
     multiplexer,
@@ -22,7 +17,6 @@ from starhil.hil_tests.conformance.canopen_probe import (
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check_equal
 
 SDO: Final = CaseArea[CanopenProbe]("canopen.sdo", "CiA 301 7.2.4.3.17")
-CLAUSE: Final = "CiA 301 7.2.4.3"
 LONGEST_TIMEOUT_S: Final = 12.0
 
 
@@ -60,12 +54,11 @@ def mux(item: ODVariable) -> str:
 
 def expect_no_transfer(probe: CanopenProbe) -> None:
     """Fail unless a segment request finds no transfer under way."""
-    probe.check_abort(probe.ask("60"), ABORT_COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("60"), Abort.COMMAND, multiplexer="")
 
 
 @SDO.case("expedited-upload", "expedited upload states its size", "CiA 301 7.2.4.3.6")
 def expedited_upload(probe: CanopenProbe) -> None:
-    """Objects of 1, 2 and 4 bytes: e and s are set, n is correct."""
     for size, command in ((1, 0x4F), (2, 0x4B), (4, 0x43)):
         fitting = [
             item for item in probe.variables() if item.readable and is_integer(item) and size_of(item) == size
@@ -78,7 +71,6 @@ def expedited_upload(probe: CanopenProbe) -> None:
 
 @SDO.case("expedited-download", "expedited download is confirmed", "CiA 301 7.2.4.3.3", intrusive=True)
 def expedited_download(probe: CanopenProbe) -> None:
-    """The answer is 60h, the multiplexer and four zeros; the value has changed."""
     item = writable_number(probe)
     probe.expect_answer(
         b"\x2b" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
@@ -88,7 +80,6 @@ def expedited_download(probe: CanopenProbe) -> None:
 
 @SDO.case("no-size", "expedited download without a size", "CiA 301 7.2.4.3.3", intrusive=True)
 def no_size(probe: CanopenProbe) -> None:
-    """With s = 0 the size of the object counts."""
     item = writable_number(probe)
     probe.expect_answer(
         b"\x22" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
@@ -98,10 +89,6 @@ def no_size(probe: CanopenProbe) -> None:
 
 @SDO.case("segmented-upload", "segmented upload: size, toggle, last segment", "CiA 301 7.2.4.3.7")
 def segmented_upload(probe: CanopenProbe) -> None:
-    """The first answer has the size; the toggle bit starts at 0; c is set in the last segment only.
-
-    N is correct.
-    """
     item, value = long_text(probe)
     probe.expect_answer(upload(item), f"41 {mux(item)} {len(value).to_bytes(4, 'little').hex()}")
     toggle, data = 0, b""
@@ -118,20 +105,18 @@ def segmented_upload(probe: CanopenProbe) -> None:
 
 @SDO.case("upload-toggle", "toggle bit not alternated in an upload")
 def upload_toggle(probe: CanopenProbe) -> None:
-    """Abort 0503 0000h at the first and at a later segment; the transfer has ended."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
-    probe.check_abort(probe.ask("70"), ABORT_TOGGLE, multiplexer=mux(item))
+    probe.check_abort(probe.ask("70"), Abort.TOGGLE, multiplexer=mux(item))
     expect_no_transfer(probe)
     probe.ask(upload(item))
     probe.ask("60")
-    probe.check_abort(probe.ask("60"), ABORT_TOGGLE, multiplexer=mux(item))
+    probe.check_abort(probe.ask("60"), Abort.TOGGLE, multiplexer=mux(item))
     expect_no_transfer(probe)
 
 
 @SDO.case("segmented-download", "segmented download of a number", "CiA 301 7.2.4.3.4", intrusive=True)
 def segmented_download(probe: CanopenProbe) -> None:
-    """A 16-bit number in one segment, with and without an announced size."""
     item = writable_number(probe)
     for command, size, value in ((0x21, 2, b"\x39\x30"), (0x20, 0, b"\x38\x30")):
         request = bytes([command]) + multiplexer(item.index, item.subindex) + size.to_bytes(4, "little")
@@ -142,7 +127,6 @@ def segmented_download(probe: CanopenProbe) -> None:
 
 @SDO.case("download-in-parts", "segmented download in two segments", "CiA 301 7.2.4.3.4", intrusive=True)
 def download_in_parts(probe: CanopenProbe) -> None:
-    """One byte per segment: the toggle bit is echoed, nothing is written before the end."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     value = bytes([before[0] ^ 0x55, before[1] ^ 0x01])
@@ -154,82 +138,73 @@ def download_in_parts(probe: CanopenProbe) -> None:
 
 @SDO.case("download-toggle", "toggle bit not alternated in a download", intrusive=True)
 def download_toggle(probe: CanopenProbe) -> None:
-    """Abort 0503 0000h; the object keeps its value and the transfer has ended."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
-    probe.check_abort(probe.ask(bytes([0x10 | 5 << 1 | 1, 0x11, 0x11])), ABORT_TOGGLE, multiplexer=mux(item))
-    probe.check_abort(probe.ask("01"), ABORT_COMMAND, multiplexer="")
+    probe.check_abort(probe.ask(bytes([0x10 | 5 << 1 | 1, 0x11, 0x11])), Abort.TOGGLE, multiplexer=mux(item))
+    probe.check_abort(probe.ask("01"), Abort.COMMAND, multiplexer="")
     probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
     probe.ask(bytes([6 << 1, 0x11]))
-    probe.check_abort(probe.ask(bytes([6 << 1 | 1, 0x11])), ABORT_TOGGLE, multiplexer=mux(item))
+    probe.check_abort(probe.ask(bytes([6 << 1 | 1, 0x11])), Abort.TOGGLE, multiplexer=mux(item))
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
 @SDO.case("announced-high", "announced size above the object's", intrusive=True)
 def announced_high(probe: CanopenProbe) -> None:
-    """Abort 0607 0010h or 0607 0012h, at once or at the end."""
     item = writable_number(probe)
     answer = probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x03\0\0\0")
     if answer is not None and answer[0] == 0x60:
         answer = probe.ask(bytes([4 << 1 | 1, 1, 1, 1]))
-    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
+    probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 
 @SDO.case("sent-high", "more bytes sent than the object takes", intrusive=True)
 def sent_high(probe: CanopenProbe) -> None:
-    """Abort 0607 0010h or 0607 0012h."""
     item = writable_number(probe)
     probe.ask(b"\x20" + multiplexer(item.index, item.subindex))
     answer = probe.ask(bytes([4 << 1 | 1, 1, 1, 1]))
-    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
+    probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 
 @SDO.case("sent-low", "fewer bytes sent than the object takes", intrusive=True)
 def sent_low(probe: CanopenProbe) -> None:
-    """Abort 0607 0010h or 0607 0013h; the object keeps its value."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     probe.ask(b"\x20" + multiplexer(item.index, item.subindex))
     answer = probe.ask(bytes([6 << 1 | 1, before[0] ^ 1]))
-    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_LOW, multiplexer=mux(item))
+    probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_LOW, multiplexer=mux(item))
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
 @SDO.case("announced-differs", "fewer bytes sent than announced", intrusive=True)
 def announced_differs(probe: CanopenProbe) -> None:
-    """Abort 0607 0010h, 0607 0012h or 0607 0013h."""
     item = writable_number(probe)
     probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
     answer = probe.ask(bytes([6 << 1 | 1, 1]))
-    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, ABORT_LENGTH_LOW, multiplexer=mux(item))
+    probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, Abort.LENGTH_LOW, multiplexer=mux(item))
 
 
 @SDO.case("unknown-command", "unknown command specifier")
 def unknown_command(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for specifier 7."""
-    probe.check_abort(probe.ask("e0 00 10 00"), ABORT_COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("e0 00 10 00"), Abort.COMMAND, multiplexer="")
 
 
 @SDO.case("no-transfer", "segments without a transfer")
 def no_transfer(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for an upload segment, a download segment and ends of blocks."""
     for request in ("60", "70", "00", "01", "a1", "a2 01 7f", "a3", "c1"):
-        probe.check_abort(probe.ask(request), ABORT_COMMAND, multiplexer="")
+        probe.check_abort(probe.ask(request), Abort.COMMAND, multiplexer="")
 
 
 @SDO.case("wrong-segment", "download segment within an upload")
 def wrong_segment(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h; the transfer has ended."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
-    probe.check_abort(probe.ask("00"), ABORT_COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("00"), Abort.COMMAND, multiplexer="")
     expect_no_transfer(probe)
 
 
 @SDO.case("client-abort", "an abort of the client ends the transfer, unanswered")
 def client_abort(probe: CanopenProbe) -> None:
-    """After 80h nothing is sent, and the next segment finds no transfer."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.send(
@@ -250,18 +225,16 @@ def new_request(probe: CanopenProbe) -> None:
 
 @SDO.case("time-out", "a transfer whose client stops sending times out")
 def time_out(probe: CanopenProbe) -> None:
-    """Abort 0504 0000h within 12 s."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.check_abort(
-        probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), ABORT_TIMEOUT, multiplexer=mux(item)
+        probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), Abort.TIMEOUT, multiplexer=mux(item)
     )
     expect_no_transfer(probe)
 
 
 @SDO.case("wrong-length", "frames of other than 8 bytes are no SDO", "CiA 301 7.2.4.3.2")
 def wrong_length(probe: CanopenProbe) -> None:
-    """No answer to 0, 4 and 7 bytes."""
     for length in (0, 4, 7):
         probe.send(0x600 + probe.node, bytes.fromhex("40001000000000")[:length])
         probe.expect_silence(0x580 + probe.node, f"answer to {length} bytes")
@@ -287,7 +260,6 @@ def other_node(probe: CanopenProbe) -> None:
 
 @SDO.case("stopped", "no SDO in STOPPED", "CiA 301 7.3.2.2.5", intrusive=True)
 def stopped(probe: CanopenProbe) -> None:
-    """No answer to a new request, nor to a segment of a transfer in progress."""
     item, _ = long_text(probe)
     probe.ask(upload(item))
     probe.command(STOP)
@@ -297,7 +269,6 @@ def stopped(probe: CanopenProbe) -> None:
 
 @SDO.case("server-parameter", "1200h holds the identifiers in use", "CiA 301 7.5.2.33")
 def server_parameter(probe: CanopenProbe) -> None:
-    """600h and 580h plus the node-ID."""
     probe.require(0x1200)
     check_equal(probe.number(0x1200, 1), 0x600 + probe.node, "1200h:01h")
     check_equal(probe.number(0x1200, 2), 0x580 + probe.node, "1200h:02h")

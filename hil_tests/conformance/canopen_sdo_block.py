@@ -8,17 +8,7 @@ from typing import Final
 from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_BLOCK_SIZE,
-    ABORT_COMMAND,
-    ABORT_CRC,
-    ABORT_LENGTH,
-    ABORT_LENGTH_HIGH,
-    ABORT_LENGTH_LOW,
-    ABORT_NO_OBJECT,
-    ABORT_READ_ONLY,
-    ABORT_SEQUENCE,
-    ABORT_TIMEOUT,
-    ABORT_WRITE_ONLY,
+    Abort,
     CanopenProbe,
     multiplexer,
 )
@@ -32,7 +22,6 @@ from starhil.hil_tests.conformance.canopen_sdo import (
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
 SDO_BLOCK: Final = CaseArea[CanopenProbe]("canopen.sdo-block", "CiA 301 7.2.4.3.17")
-CLAUSE: Final = "CiA 301 7.2.4.3"
 SEGMENT: Final = 7
 
 
@@ -111,10 +100,6 @@ def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: boo
 
 @SDO_BLOCK.case("upload", "block upload with CRC", "CiA 301 7.2.4.3.13")
 def upload_with_crc(probe: CanopenProbe) -> None:
-    """Segment numbers from 1, last bit, unused bytes, size and CRC.
-
-    The same data as a segmented upload.
-    """
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127), value, "value")
     expect_no_transfer(probe)
@@ -122,7 +107,6 @@ def upload_with_crc(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-sizes", "block upload in blocks of 1, 2 and 5 segments", "CiA 301 7.2.4.3.13")
 def upload_sizes(probe: CanopenProbe) -> None:
-    """The client sets the block size."""
     item, value = long_text(probe)
     for block in (1, 2, 5):
         check_equal(upload_blocks(probe, item, block), value, "value")
@@ -130,14 +114,12 @@ def upload_sizes(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-without-crc", "block upload without CRC", "CiA 301 7.2.4.3.13")
 def upload_without_crc(probe: CanopenProbe) -> None:
-    """For a client that does not support the CRC."""
     item, value = long_text(probe)
     check_equal(upload_blocks(probe, item, 127, crc=False), value, "value")
 
 
 @SDO_BLOCK.case("upload-big", "block upload of many blocks", "CiA 301 7.2.4.3.13")
 def upload_big(probe: CanopenProbe) -> None:
-    """The longest object up to 200 kB, with size and CRC."""
     item, _ = _big(probe)
     if len(upload_blocks(probe, item, 100)) <= SEGMENT * 100:
         raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
@@ -145,7 +127,6 @@ def upload_big(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-repeat", "segments that were not confirmed are sent again", "CiA 301 7.2.4.3.14")
 def upload_repeat(probe: CanopenProbe) -> None:
-    """Confirm the first of three segments, then none, then all."""
     item, value = long_text(probe)
     _begin(probe, item, 3)
     first = _segments(probe, b"\xa3", 3)
@@ -159,40 +140,36 @@ def upload_repeat(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-block-size", "block size 0 and above 127")
 def upload_block_size(probe: CanopenProbe) -> None:
-    """Abort 0504 0002h at the start and in a confirmation."""
     item, _ = long_text(probe)
     for size in (0, 128):
-        probe.check_abort(_begin(probe, item, size), ABORT_BLOCK_SIZE, multiplexer=mux(item))
+        probe.check_abort(_begin(probe, item, size), Abort.BLOCK_SIZE, multiplexer=mux(item))
     for size in (0, 128):
         _begin(probe, item, 1)
         _segments(probe, b"\xa3", 1)
-        probe.check_abort(probe.ask(bytes([0xA2, 1, size])), ABORT_BLOCK_SIZE, multiplexer=mux(item))
+        probe.check_abort(probe.ask(bytes([0xA2, 1, size])), Abort.BLOCK_SIZE, multiplexer=mux(item))
 
 
 @SDO_BLOCK.case("upload-sequence", "more segments confirmed than were sent")
 def upload_sequence(probe: CanopenProbe) -> None:
-    """Abort 0504 0003h."""
     item, _ = long_text(probe)
     _begin(probe, item, 2)
     _segments(probe, b"\xa3", 2)
-    probe.check_abort(probe.ask("a2 03 02"), ABORT_SEQUENCE, multiplexer=mux(item))
+    probe.check_abort(probe.ask("a2 03 02"), Abort.SEQUENCE, multiplexer=mux(item))
 
 
 @SDO_BLOCK.case("upload-order", "requests of a block upload out of order")
 def upload_order(probe: CanopenProbe) -> None:
-    """Abort 0504 0001h for a confirmation before the start, an early end, a segment request."""
     item, _ = long_text(probe)
     for request in ("a2 01 01", "a1", "60"):
         _begin(probe, item, 1)
-        probe.check_abort(probe.ask(request), ABORT_COMMAND, multiplexer="")
+        probe.check_abort(probe.ask(request), Abort.COMMAND, multiplexer="")
     _begin(probe, item, 1)
     _segments(probe, b"\xa3", 1)
-    probe.check_abort(probe.ask("a1"), ABORT_COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("a1"), Abort.COMMAND, multiplexer="")
 
 
 @SDO_BLOCK.case("threshold", "protocol switch threshold", "CiA 301 7.2.4.3.13")
 def threshold(probe: CanopenProbe) -> None:
-    """At most as long as the threshold: segmented or block upload; longer: block upload."""
     item, value = long_text(probe)
     answer = _begin(probe, item, 127, threshold=min(255, len(value)))
     check(answer[0] in {0x41, 0xC6, 0xC4, 0xC2, 0xC0}, "answer 41h or C6h", answer)
@@ -204,20 +181,18 @@ def threshold(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-refused", "block upload of objects that cannot be read")
 def upload_refused(probe: CanopenProbe) -> None:
-    """Abort 0602 0000h and 0601 0001h."""
-    probe.expect_abort("a4 05 00 00 7f 00", ABORT_NO_OBJECT)
+    probe.expect_abort("a4 05 00 00 7f 00", Abort.NO_OBJECT)
     item = probe.find("write-only object", lambda item: item.access_type == "wo")
-    probe.expect_abort(b"\xa4" + multiplexer(item.index, item.subindex) + b"\x7f\0", ABORT_WRITE_ONLY)
+    probe.expect_abort(b"\xa4" + multiplexer(item.index, item.subindex) + b"\x7f\0", Abort.WRITE_ONLY)
 
 
 @SDO_BLOCK.case("upload-time-out", "a block upload whose client stops sending times out")
 def upload_time_out(probe: CanopenProbe) -> None:
-    """Abort 0504 0000h within 12 s."""
     item, _ = long_text(probe)
     _begin(probe, item, 2)
     _segments(probe, b"\xa3", 2)
     probe.check_abort(
-        probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), ABORT_TIMEOUT, multiplexer=mux(item)
+        probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), Abort.TIMEOUT, multiplexer=mux(item)
     )
 
 
@@ -239,10 +214,6 @@ def _end(probe: CanopenProbe, unused: int, crc: int) -> bytes | None:
 
 @SDO_BLOCK.case("download", "block download with CRC", "CiA 301 7.2.4.3.9", intrusive=True)
 def download(probe: CanopenProbe) -> None:
-    """A 16-bit number in one segment: A4h, A2h with number 1, A1h.
-
-    With and without size and CRC.
-    """
     item = writable_number(probe)
     for size, crc, value in ((2, True, b"\x39\x30"), (None, True, b"\x38\x30"), (2, False, b"\x37\x30")):
         _begin_download(probe, item, size, crc=crc)
@@ -256,22 +227,17 @@ def download(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-crc", "wrong CRC of a block download", intrusive=True)
 def download_crc(probe: CanopenProbe) -> None:
-    """Abort 0504 0004h; the object keeps its value."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     value = bytes([before[0] ^ 1, before[1]])
     _begin_download(probe, item, 2)
     probe.ask(b"\x81" + value)
-    probe.check_abort(_end(probe, 5, crc_hqx(value, 0) ^ 0x0100), ABORT_CRC, multiplexer=mux(item))
+    probe.check_abort(_end(probe, 5, crc_hqx(value, 0) ^ 0x0100), Abort.CRC, multiplexer=mux(item))
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
 @SDO_BLOCK.case("download-gap", "a lost segment is requested again", "CiA 301 7.2.4.3.11", intrusive=True)
 def download_gap(probe: CanopenProbe) -> None:
-    """The block begins with number 2: confirmation A2h with number 0.
-
-    Then the block is repeated.
-    """
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x82\x39\x30")
@@ -284,12 +250,11 @@ def download_gap(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-zero", "segment number 0", intrusive=True)
 def download_zero(probe: CanopenProbe) -> None:
-    """Abort 0504 0003h, or no answer; afterwards the node serves requests."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
     answer = probe.ask(b"\x00\x39\x30")
     if answer is not None:
-        probe.check_abort(answer, ABORT_SEQUENCE, multiplexer=mux(item))
+        probe.check_abort(answer, Abort.SEQUENCE, multiplexer=mux(item))
     else:
         probe.abandon_transfer()
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
@@ -297,27 +262,25 @@ def download_zero(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-length", "lengths of block downloads", intrusive=True)
 def download_length(probe: CanopenProbe) -> None:
-    """One byte too many, too few, and not as announced: each is refused."""
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     for size, unused in ((None, 4), (None, 6), (2, 6)):
         _begin_download(probe, item, size, crc=False)
         probe.ask(b"\x81\x39\x30\x01")
         probe.check_abort(
-            _end(probe, unused, 0), ABORT_LENGTH, ABORT_LENGTH_HIGH, ABORT_LENGTH_LOW, multiplexer=mux(item)
+            _end(probe, unused, 0), Abort.LENGTH, Abort.LENGTH_HIGH, Abort.LENGTH_LOW, multiplexer=mux(item)
         )
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
 @SDO_BLOCK.case("download-announced", "announced size that differs from the object's", intrusive=True)
 def download_announced(probe: CanopenProbe) -> None:
-    """Refused at once or at the end."""
     item = writable_number(probe)
     answer = probe.ask(b"\xc2" + multiplexer(item.index, item.subindex) + b"\x03\0\0\0")
     if answer is not None and answer[0] != 0x80:
         probe.ask(b"\x81\x39\x30\x01")
         answer = _end(probe, 4, 0)
-    probe.check_abort(answer, ABORT_LENGTH, ABORT_LENGTH_HIGH, multiplexer=mux(item))
+    probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 
 @SDO_BLOCK.case("download-abort", "an abort of the client ends a block download", intrusive=True)
@@ -334,9 +297,8 @@ def download_abort(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("download-refused", "block download to objects that cannot be written", intrusive=True)
 def download_refused(probe: CanopenProbe) -> None:
-    """Abort 0601 0002h and 0602 0000h."""
-    probe.expect_abort("c2 00 10 00 04 00 00 00", ABORT_READ_ONLY)
-    probe.expect_abort("c2 05 00 00 04 00 00 00", ABORT_NO_OBJECT)
+    probe.expect_abort("c2 00 10 00 04 00 00 00", Abort.READ_ONLY)
+    probe.expect_abort("c2 05 00 00 04 00 00 00", Abort.NO_OBJECT)
 
 
 CASES: Final = (*SDO_BLOCK.cases,)

@@ -5,20 +5,20 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_NOT_STORED,
     LSS_FROM_SLAVE,
     LSS_TO_SLAVE,
     RESET_COMMUNICATION,
     RESET_NODE,
     START,
     STOP,
+    Abort,
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
 STORE: Final = CaseArea[CanopenProbe]("canopen.store", "CiA 301 7.5.2.11", intrusive=True)
 LSS: Final = CaseArea[CanopenProbe]("canopen.lss", "CiA 305 states", intrusive=True)
-SIGNATURE_REFUSED: Final = (ABORT_NOT_STORED, 0x08000021, 0x08000022)
+SIGNATURE_REFUSED: Final = (Abort.NOT_STORED, 0x08000021, 0x08000022)
 
 
 def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
@@ -29,7 +29,6 @@ def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
 
 @STORE.case("ability", "1010h and 1011h describe their abilities", intrusive=False)
 def ability(probe: CanopenProbe) -> None:
-    """Bit 0: on command; bit 1: autonomously; all others are 0."""
     for index in (0x1010, 0x1011):
         if index in probe.od:
             check(probe.number(index, 1) & ~0x03 == 0, f"{index:04X}h:01h 0 to 3", probe.number(index, 1))
@@ -47,7 +46,6 @@ def signature(probe: CanopenProbe) -> None:
 
 @STORE.case("save", "stored parameters are back after a reset")
 def save(probe: CanopenProbe) -> None:
-    """After reset node and reset communication; later changes are lost."""
     probe.require(0x1010)
     probe.set(0x1017, 0, 777, 2)
     probe.set(0x1010, 1, b"save")
@@ -65,7 +63,6 @@ def _restore(probe: CanopenProbe) -> None:
 
 @STORE.case("restore", "defaults take effect at the next reset", "CiA 301 7.5.2.12")
 def restore(probe: CanopenProbe) -> None:
-    """`load` changes nothing until then."""
     probe.require(0x1010)
     probe.require(0x1011)
     default = probe.od.get_variable(0x1017)
@@ -79,7 +76,6 @@ def restore(probe: CanopenProbe) -> None:
 
 @STORE.case("groups", "communication and application parameters are stored separately")
 def groups(probe: CanopenProbe) -> None:
-    """Storing the application parameters does not store the communication parameters."""
     probe.require(0x1010)
     if probe.od.get_variable(0x1010, 3) is None:
         raise CaseSkipped("1010h has no sub-index 3")
@@ -93,7 +89,6 @@ def groups(probe: CanopenProbe) -> None:
 
 @STORE.case("pdo", "a stored PDO configuration is back after a reset")
 def pdo(probe: CanopenProbe) -> None:
-    """The transmission type of the first TPDO."""
     probe.require(0x1010)
     probe.require(0x1800)
     probe.set(0x1800, 2, 17, 1)
@@ -134,7 +129,6 @@ def _wait(probe: CanopenProbe) -> None:
 
 @LSS.case("selective", "switch state selective", "CiA 305 switch state selective")
 def selective(probe: CanopenProbe) -> None:
-    """The identity selects the node; no other identity does."""
     identity = _select(probe)
     check(_lss(probe, "5e") is not None, "configuration state", "waiting")
     _wait(probe)
@@ -148,7 +142,6 @@ def selective(probe: CanopenProbe) -> None:
 
 @LSS.case("global", "switch state global", "CiA 305 switch state global")
 def global_(probe: CanopenProbe) -> None:
-    """To configuration and back, without an answer."""
     _select(probe)
     check(_lss(probe, "04 00", 0.1) is None, "no answer to switch state global", "one")
     check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
@@ -159,7 +152,6 @@ def global_(probe: CanopenProbe) -> None:
 
 @LSS.case("inquire", "inquire identity and node-ID", "CiA 305 inquire")
 def inquire(probe: CanopenProbe) -> None:
-    """The four numbers of 1018h, and the node-ID in use."""
     identity = _select(probe)
     for command, number in enumerate(identity, 0x5A):
         answer = _lss(probe, bytes([command]))
@@ -170,7 +162,6 @@ def inquire(probe: CanopenProbe) -> None:
 
 @LSS.case("waiting", "a waiting node obeys no configuration command")
 def waiting(probe: CanopenProbe) -> None:
-    """Node-ID, bit timing, store and inquiries are not answered."""
     _select(probe)
     _wait(probe)
     for data in ("11 05", "13 00 02", "17", "5a", "5e"):
@@ -208,10 +199,6 @@ def node_id(probe: CanopenProbe) -> None:
 
 @LSS.case("bit-timing", "configure bit timing", "CiA 305 configure bit timing")
 def bit_timing(probe: CanopenProbe) -> None:
-    """The bit rates of the EDS are accepted, indices 5 and 255 and other tables refused.
-
-    Nothing is activated.
-    """
     _select(probe)
     table = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
     rates = probe.od.device_information.allowed_baudrates
@@ -228,7 +215,6 @@ def bit_timing(probe: CanopenProbe) -> None:
 
 @LSS.case("identify", "identify remote slave", "CiA 305 identify remote slave")
 def identify(probe: CanopenProbe) -> None:
-    """Answered with 4Fh only if the identity is within the ranges."""
     _select(probe)
     _wait(probe)
     vendor, product, revision, serial = _identity(probe)
@@ -254,7 +240,6 @@ def identify(probe: CanopenProbe) -> None:
 
 @LSS.case("configured", "a configured node takes no part in fastscan", "CiA 305 fastscan")
 def configured(probe: CanopenProbe) -> None:
-    """Neither fastscan nor identify non-configured is answered."""
     _select(probe)
     _wait(probe)
     for data in ("51 00 00 00 00 80 00 00", "4c"):
@@ -308,7 +293,6 @@ def _scan(probe: CanopenProbe) -> list[int]:
 
 @LSS.case("states", "LSS works in every NMT state")
 def states(probe: CanopenProbe) -> None:
-    """The node is selected in OPERATIONAL and in STOPPED."""
     _select(probe)
     _wait(probe)
     for command in (START, STOP):

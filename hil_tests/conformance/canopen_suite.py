@@ -1,4 +1,4 @@
-"""CANopen conformance: the cases of all areas, and how one is run."""
+"""CANopen conformance: the cases of all areas."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from starhil.hil_tests.conformance import (
 )
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.case import Case
-from starhil.hil_tests.conformance.runner import Outcome, run_case
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_eds.CASES,
@@ -34,8 +33,3 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_store_lss.CASES,
     *canopen_design.CASES,
 )
-
-
-def run_canopen_case(probe: CanopenProbe, case: Case[CanopenProbe]) -> Outcome:
-    """Run one case; an intrusive one begins and ends with the communication reset."""
-    return run_case(probe, case)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_DEVICE_STATE,
-    ABORT_VALUE,
     NO_RTR,
     RESTRICTED_IDS,
     STOP,
     VALUE_ABORTS,
+    Abort,
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
@@ -29,7 +28,6 @@ def _quiet(probe: CanopenProbe) -> None:
 
 @SYNC.case("identifier", "identifiers that SYNC may not have")
 def sync_identifier(probe: CanopenProbe) -> None:
-    """Restricted CAN-IDs and the extended format are refused with 0609 0030h."""
     probe.require(0x1005)
     for identifier in (*RESTRICTED_IDS, 0x2000_0080):
         probe.expect_refusal(0x1005, 0, identifier, 4, *VALUE_ABORTS)
@@ -38,7 +36,6 @@ def sync_identifier(probe: CanopenProbe) -> None:
 
 @SYNC.case("counter-range", "values of the counter overflow", "CiA 301 7.5.2.22")
 def sync_counter_range(probe: CanopenProbe) -> None:
-    """1 and 241 to 255 are refused with 0609 0030h, 2 to 240 accepted."""
     probe.require(0x1019)
     for value in (1, 241, 255):
         probe.expect_refusal(0x1019, 0, value, 1, *VALUE_ABORTS)
@@ -48,18 +45,16 @@ def sync_counter_range(probe: CanopenProbe) -> None:
 
 @SYNC.case("counter-fixed", "counter overflow is fixed while a period is set", "CiA 301 7.5.2.22")
 def sync_counter_fixed(probe: CanopenProbe) -> None:
-    """Abort 0800 0022h while 1006h is not 0."""
     probe.require(0x1019)
     probe.require(0x1006)
     probe.set(0x1006, 0, 100_000)
-    probe.expect_refusal(0x1019, 0, 10, 1, ABORT_DEVICE_STATE)
+    probe.expect_refusal(0x1019, 0, 10, 1, Abort.DEVICE_STATE)
     probe.set(0x1006, 0, 0)
     probe.set(0x1019, 0, 10, 1)
 
 
 @SYNC.case("length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3")
 def sync_length(probe: CanopenProbe) -> None:
-    """EMCY 8240h for a counter that is not configured, and for one that is missing."""
     probe.require(0x1014)
     _quiet(probe)
     emergency = probe.number(0x1014) & 0x7FF
@@ -75,7 +70,6 @@ def sync_length(probe: CanopenProbe) -> None:
 
 @SYNC.case("producer", "SYNC producer")
 def sync_producer(probe: CanopenProbe) -> None:
-    """Bit 30 of 1005h starts SYNCs with the period 1006h, counted from 1; else abort 0609 0030h."""
     probe.require(0x1006)
     _quiet(probe)
     if 0x1019 in probe.od:
@@ -83,13 +77,13 @@ def sync_producer(probe: CanopenProbe) -> None:
     probe.set(0x1006, 0, 20_000)
     code = probe.write(0x1005, 0, NO_RTR | 0x80)
     if code:
-        check_equal(code, ABORT_VALUE, "abort")
+        check_equal(code, Abort.VALUE, "abort")
         return
     found = probe.count(0x080, 0.15)
     check(5 <= len(found) <= 8, "SYNC every 20 ms", f"{len(found)} in 150 ms")
     if 0x1019 in probe.od:
         check_equal([data[0] for _, data in found[:5]], [1, 2, 3, 1, 2], "counters")
-    probe.expect_refusal(0x1005, 0, NO_RTR | 0x81, 4, ABORT_VALUE)
+    probe.expect_refusal(0x1005, 0, NO_RTR | 0x81, 4, Abort.VALUE)
     probe.command_and_settle(STOP)
     probe.expect_silence(0x080, "SYNC in STOPPED")
 
@@ -99,7 +93,6 @@ def sync_producer(probe: CanopenProbe) -> None:
 
 @TIME.case("identifier", "identifiers that TIME may not have")
 def time_identifier(probe: CanopenProbe) -> None:
-    """Restricted CAN-IDs, the extended format, and a change while in use: abort 0609 0030h."""
     probe.require(0x1012)
     probe.set(0x1012, 0, 0x100)
     for identifier in (*RESTRICTED_IDS, 0x2000_0100):
@@ -110,7 +103,6 @@ def time_identifier(probe: CanopenProbe) -> None:
 
 @TIME.case("malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3")
 def time_malformed(probe: CanopenProbe) -> None:
-    """Five and seven bytes, and more milliseconds than a day has."""
     for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
         probe.send(0x100, data)
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")

@@ -19,10 +19,6 @@ from starhil.hil_tests.conformance.canopen_pdo import (
     writable,
 )
 from starhil.hil_tests.conformance.canopen_probe import (
-    ABORT_NO_OBJECT,
-    ABORT_NO_SUBINDEX,
-    ABORT_NOT_MAPPABLE,
-    ABORT_PDO_LENGTH,
     NO_RTR,
     NOBODY,
     PDO_OFF,
@@ -31,6 +27,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     START,
     STOP,
     VALUE_ABORTS,
+    Abort,
     CanopenProbe,
     is_integer,
     size_of,
@@ -42,7 +39,6 @@ TPDO: Final = CaseArea[CanopenProbe]("canopen.tpdo", "CiA 301 7.5.2.37", intrusi
 
 @TPDO.case("cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2")
 def cyclic(probe: CanopenProbe) -> None:
-    """Types 1 and 3: the mapped value at every nth SYNC, and at no other."""
     index, item = first(probe, 0x1800), constant(probe)
     value = probe.read(item.index, item.subindex)
     for kind in (1, 3):
@@ -60,7 +56,6 @@ def cyclic(probe: CanopenProbe) -> None:
 
 @TPDO.case("not-without-sync", "synchronous TPDO waits for SYNC", "CiA 301 7.2.2.2")
 def not_without_sync(probe: CanopenProbe) -> None:
-    """Nothing in half a second without a SYNC."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
     probe.command(START)
     probe.expect_silence(identifier, "TPDO without SYNC", 0.5)
@@ -68,10 +63,6 @@ def not_without_sync(probe: CanopenProbe) -> None:
 
 @TPDO.case("acyclic", "acyclic TPDO at the SYNC after an event only")
 def acyclic(probe: CanopenProbe) -> None:
-    """Type 0: a write to the mapped object is the event.
-
-    The next SYNC sends the TPDO, the one after does not.
-    """
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
     probe.command(START)
@@ -94,7 +85,6 @@ def acyclic(probe: CanopenProbe) -> None:
 
 @TPDO.case("sync-start", "SYNC start value")
 def sync_start(probe: CanopenProbe) -> None:
-    """Type 2 with start value 3 is sent at counters 3, 5 and 7."""
     probe.require(0x1019)
     probe.set(0x1019, 0, 8, 1)
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], 2, start=3)
@@ -110,7 +100,6 @@ def sync_start(probe: CanopenProbe) -> None:
 
 @TPDO.case("event", "event-driven TPDO after a change", "CiA 301 7.2.2.2")
 def event(probe: CanopenProbe) -> None:
-    """A write to the mapped object sends it; SYNC does not."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
     before = probe.read(item.index, item.subindex)
@@ -126,7 +115,6 @@ def event(probe: CanopenProbe) -> None:
 
 @TPDO.case("event-timer", "event timer")
 def event_timer(probe: CanopenProbe) -> None:
-    """With 50 ms, a mean period within 20 %."""
     identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
     probe.command(START)
     probe.wait_for(identifier, 0.1)
@@ -138,7 +126,6 @@ def event_timer(probe: CanopenProbe) -> None:
 
 @TPDO.case("inhibit", "inhibit time")
 def inhibit(probe: CanopenProbe) -> None:
-    """The second of two events is sent after the 100 ms, with the newest value."""
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
     before, size = probe.read(item.index, item.subindex), size_of(item) or 1
@@ -148,17 +135,16 @@ def inhibit(probe: CanopenProbe) -> None:
     probe.wait_for(NOBODY, 0.15)
     probe.set(item.index, item.subindex, low)
     check_equal(after_event(probe, identifier, 3.0), low, "data")
-    start = probe.bus.now()
+    start = probe.port.now()
     probe.set(item.index, item.subindex, low)
     probe.set(item.index, item.subindex, high)
     check_equal(probe.expect(identifier, "second TPDO"), high, "data")
-    check(0.08 <= probe.bus.now() - start <= 0.16, "0.1 s between them", f"{probe.bus.now() - start:.3f} s")
+    check(0.08 <= probe.port.now() - start <= 0.16, "0.1 s between them", f"{probe.port.now() - start:.3f} s")
     probe.set(item.index, item.subindex, before)
 
 
 @TPDO.case("gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def gate(probe: CanopenProbe) -> None:
-    """By SYNC and by timer: not in PRE-OPERATIONAL and STOPPED, again in OPERATIONAL."""
     index, item = first(probe, 0x1800), constant(probe)
     for kind, event_ms in ((SYNCHRONOUS, 0), (EVENT, 20)):
         identifier = set_up(probe, index, [entry(item)], kind, event_ms=event_ms)
@@ -174,7 +160,6 @@ def gate(probe: CanopenProbe) -> None:
 
 @TPDO.case("mapping", "remapping while the node runs", "CiA 301 7.5.2.38")
 def mapping(probe: CanopenProbe) -> None:
-    """Two objects in both orders."""
     index = first(probe, 0x1800)
     fitting = [
         item
@@ -196,7 +181,6 @@ def mapping(probe: CanopenProbe) -> None:
 
 @TPDO.case("identifier", "a TPDO under another identifier")
 def identifier_moves(probe: CanopenProbe) -> None:
-    """It is sent with the new CAN-ID and not with the old one."""
     index, item = first(probe, 0x1800), constant(probe)
     old = set_up(probe, index, [entry(item)], SYNCHRONOUS)
     new = set_up(probe, index, [entry(item)], SYNCHRONOUS, identifier=0x3F1)
@@ -209,7 +193,6 @@ def identifier_moves(probe: CanopenProbe) -> None:
 
 @TPDO.case("forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5")
 def forbidden(probe: CanopenProbe) -> None:
-    """Restricted CAN-IDs and the extended format: abort 0609 0030h."""
     index = first(probe, 0x1800)
     set_up(probe, index, [entry(constant(probe))], SYNCHRONOUS)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
@@ -219,7 +202,6 @@ def forbidden(probe: CanopenProbe) -> None:
 
 @TPDO.case("fixed", "settings of a TPDO in use that cannot be changed")
 def fixed(probe: CanopenProbe) -> None:
-    """CAN-ID, inhibit time, SYNC start value, mapping."""
     index, item = first(probe, 0x1800), constant(probe)
     set_up(probe, index, [entry(item)], SYNCHRONOUS)
     record = probe.od.indices[index]
@@ -238,7 +220,6 @@ def fixed(probe: CanopenProbe) -> None:
 
 @TPDO.case("types", "reserved transmission types")
 def types(probe: CanopenProbe) -> None:
-    """241 to 251 are reserved: abort 0609 0030h."""
     index = first(probe, 0x1800)
     for value in (241, 251):
         probe.expect_refusal(index, 2, value, 1, *VALUE_ABORTS)
@@ -248,35 +229,32 @@ def types(probe: CanopenProbe) -> None:
 
 @TPDO.case("reserved", "sub-index 4 of a TPDO is not served", intrusive=False)
 def reserved(probe: CanopenProbe) -> None:
-    """Abort 0609 0011h."""
     index = first(probe, 0x1800)
     if probe.od.get_variable(index, 4) is not None:
         raise CaseSkipped("the EDS has it")
-    probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), ABORT_NO_SUBINDEX)
+    probe.expect_abort(bytes([0x40, index & 0xFF, index >> 8, 4]), Abort.NO_SUBINDEX)
 
 
 @TPDO.case("mapping-refused", "mapping of objects that cannot be mapped", "CiA 301 7.5.2.38")
 def mapping_refused(probe: CanopenProbe) -> None:
-    """Missing object, not mappable, wrong length, write-only."""
     index, item = first(probe, 0x1800), constant(probe)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
     probe.set(index + 0x200, 0, 0, 1)
-    probe.expect_refusal(index + 0x200, 1, 0x1FFF_0008, 4, ABORT_NO_OBJECT, ABORT_NOT_MAPPABLE)
+    probe.expect_refusal(index + 0x200, 1, 0x1FFF_0008, 4, Abort.NO_OBJECT, Abort.NOT_MAPPABLE)
     probe.expect_refusal(
-        index + 0x200, 1, item.index << 16 | 0xFE08, 4, ABORT_NO_OBJECT, ABORT_NO_SUBINDEX, ABORT_NOT_MAPPABLE
+        index + 0x200, 1, item.index << 16 | 0xFE08, 4, Abort.NO_OBJECT, Abort.NO_SUBINDEX, Abort.NOT_MAPPABLE
     )
-    probe.expect_refusal(index + 0x200, 1, 0x1000_0020, 4, ABORT_NOT_MAPPABLE)
-    probe.expect_refusal(index + 0x200, 1, entry(item) + 8, 4, ABORT_NOT_MAPPABLE, ABORT_PDO_LENGTH)
+    probe.expect_refusal(index + 0x200, 1, 0x1000_0020, 4, Abort.NOT_MAPPABLE)
+    probe.expect_refusal(index + 0x200, 1, entry(item) + 8, 4, Abort.NOT_MAPPABLE, Abort.PDO_LENGTH)
     hidden = next(
         (other for other in probe.variables() if other.access_type == "wo" and other.pdo_mappable), None
     )
     if hidden is not None:
-        probe.expect_refusal(index + 0x200, 1, entry(hidden), 4, ABORT_NOT_MAPPABLE)
+        probe.expect_refusal(index + 0x200, 1, entry(hidden), 4, Abort.NOT_MAPPABLE)
 
 
 @TPDO.case("mapping-length", "mapping of more than 64 bits", "CiA 301 7.5.2.38")
 def mapping_length(probe: CanopenProbe) -> None:
-    """Abort 0604 0042h for the sum and for the number of objects."""
     index = first(probe, 0x1800)
     wide = probe.find(
         "mappable object of 4 bytes", lambda item: item.pdo_mappable and item.readable and size_of(item) == 4
@@ -285,8 +263,8 @@ def mapping_length(probe: CanopenProbe) -> None:
     probe.set(index + 0x200, 0, 0, 1)
     for position in (1, 2, 3):
         probe.set(index + 0x200, position, entry(wide))
-    probe.expect_refusal(index + 0x200, 0, 3, 1, ABORT_PDO_LENGTH)
-    probe.expect_refusal(index + 0x200, 0, 65, 1, ABORT_PDO_LENGTH, *VALUE_ABORTS)
+    probe.expect_refusal(index + 0x200, 0, 3, 1, Abort.PDO_LENGTH)
+    probe.expect_refusal(index + 0x200, 0, 65, 1, Abort.PDO_LENGTH, *VALUE_ABORTS)
     probe.set(index + 0x200, 0, 2, 1)
 
 

@@ -12,7 +12,14 @@ from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.ports import Port, live_can, live_serial
-from starhil.hil_tests.conformance.runner import Outcome, not_run, run_cases, select_cases
+from starhil.hil_tests.conformance.runner import (
+    Outcome,
+    Verdict,
+    case_of_run,
+    not_run,
+    run_cases,
+    select_cases,
+)
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, is_cubestar, serial_suite
 from starhil.hil_tests.conformance.unit_probe import UnitProbe
@@ -53,7 +60,7 @@ class ConformanceRequest:
 
 
 def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
-    """Return the cases of all links that are asked for, chosen by pattern and safety.
+    """Return the cases of all requested links, selected by pattern and safety.
 
     Raises
     ------
@@ -70,7 +77,7 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
 
         cases += CANOPEN_CASES
     if not cases:
-        raise BenchError("no link given: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
+        raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
     return select_cases(cases, request.patterns, safe_only=request.safe_only)
 
 
@@ -85,7 +92,7 @@ class ConformanceResult:
 def run_conformance(
     request: ConformanceRequest, on_outcome: Callable[[Outcome], None] = lambda _outcome: None
 ) -> ConformanceResult:
-    """Run the cases on the links that are asked for.
+    """Run the cases on the requested links.
 
     Those that an interruption leaves are marked as not run.
 
@@ -194,22 +201,14 @@ def _fallen(error: EmulatorProcessError) -> Outcome:
 
     What was found until then stays.
     """
-    return Outcome(
-        "emulator.end",
-        "emulator",
-        "the emulator lasts until it is ended, and ends in good order",
-        "starhil run",
-        intrusive=False,
-        status=FAILED,
-        expected="an end with status 0, when it is asked for",
-        seen=str(error),
-        seconds=0.0,
-        log=(),
+    case = case_of_run(
+        "emulator.end", "the emulator lasts until it is ended, and ends in good order", "starhil run"
     )
+    return Outcome.of(case, Verdict(FAILED, "an end with status 0, when it is asked for", str(error)))
 
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
-    """Start an emulator with the links that are asked for."""
+    """Start an emulator with the requested links."""
     folder = stack.enter_context(temporary_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"

@@ -30,7 +30,6 @@ def _save(probe: LinkProbe) -> None:
 
 @IMAGES.case("none", "without a stored image a download is refused with code 7")
 def no_image(probe: LinkProbe) -> None:
-    """The device has just been reset."""
     probe.reset()
     for name, values in (("init_image_download", {"image_size": "size_64"}), ("advance_image_download", {"next_frame": 0}), ("start_burst", {})):  # fmt: skip
         row = probe.icd.telecommands[name]
@@ -39,7 +38,6 @@ def no_image(probe: LinkProbe) -> None:
 
 @IMAGES.case("other-camera", "only the star camera exists", "CubeComputer TC 80, TLM 233 (AlbertaSat, CTS)")
 def other_camera(probe: LinkProbe) -> None:
-    """Cameras 1 and 2 are refused with code 3."""
     row = probe.icd.telecommands["save_image"]
     for camera in ("camera_1", "camera_2"):
         probe.expect_refusal(
@@ -49,7 +47,6 @@ def other_camera(probe: LinkProbe) -> None:
 
 @IMAGES.case("frames", "an image comes in frames of 128 bytes, each with its number and checksum")
 def frames(probe: LinkProbe) -> None:
-    """All 32 frames of 64 x 64 pixels; reading a frame twice gives the same data."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     for number in range(EDGE * EDGE // FRAME):
@@ -65,7 +62,6 @@ def frames(probe: LinkProbe) -> None:
 
 @IMAGES.case("beyond", "a frame beyond the last is refused with code 3")
 def beyond(probe: LinkProbe) -> None:
-    """The loaded frame stays the same."""
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
     probe.command("advance_image_download", next_frame=31)
@@ -115,7 +111,6 @@ def _burst(probe: LinkProbe, count: int, *, everything: bool) -> list[tuple[int,
 
 @BURSTS.case("block", "a block comes in numbered packets of 20 bytes with the right checksum")
 def block(probe: LinkProbe) -> None:
-    """990 bytes: 50 packets, the last one padded."""
     _save(probe)
     _load(probe, 0, 990)
     wanted = probe.telemetry("file_block")["checksum"]
@@ -128,7 +123,6 @@ def block(probe: LinkProbe) -> None:
 
 @BURSTS.case("holes", "with a hole map only what is missing comes")
 def holes(probe: LinkProbe) -> None:
-    """Packets 0, 7 and 49 of 50."""
     _save(probe)
     _load(probe, 0, 1000)
     whole = dict(_burst(probe, 50, everything=True))
@@ -152,7 +146,6 @@ def whole_file(probe: LinkProbe) -> None:
 
 @BURSTS.case("range", "a block outside the file is refused with code 3 and flagged")
 def out_of_range(probe: LinkProbe) -> None:
-    """A burst without a block is refused too."""
     _save(probe)
     row = probe.icd.telecommands["load_file_block"]
     values: dict[str, Value] = {"file_type": "bmp", "file_counter": 0, "offset": 1 << 24, "length": 100}

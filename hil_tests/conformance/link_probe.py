@@ -10,9 +10,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
-from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.case import CaseFailed
+from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.conformance.unit_settings import UnitSettings
 from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
@@ -102,9 +103,10 @@ class LinkProbe(ABC):
     link: str
     """`serial` or `can`."""
 
-    def __init__(self, icd: InterfaceDefinition, times: ProbeTimes) -> None:
+    def __init__(self, port: Port[Any], icd: InterfaceDefinition, times: ProbeTimes | None) -> None:
+        self.port = port
         self.icd = icd
-        self.times = times
+        self.times = times or ProbeTimes()
         self.log: list[str] = []
         self._found: UnitSettings | None = None
 
@@ -119,6 +121,14 @@ class LinkProbe(ABC):
         """Send hexadecimal bytes, or a CAN frame in which HH and DD stand for host and device."""
 
     @abstractmethod
+    def expecting(self, *answers: str) -> None:
+        """Note the answers to raw traffic, in order, before it is sent."""
+
+    @abstractmethod
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next answer to raw traffic: the number of a row on serial, the pattern of a frame on CAN."""
+
+    @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
         """Return the next unread answer; skip unsolicited telemetry."""
 
@@ -130,17 +140,24 @@ class LinkProbe(ABC):
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
         """Return the messages of unsolicited telemetry that come within a time."""
 
-    @abstractmethod
     def drain(self) -> None:
         """Discard everything received."""
+        while self.port.receive(0.0) is not None:
+            pass
 
     @abstractmethod
+    def _receive(self, timeout_s: float) -> bool:
+        """Keep what arrives next; return whether anything came in time."""
+
     def now(self) -> float:
-        """Time, s."""
+        """Time of the port, s."""
+        return self.port.now()
 
-    @abstractmethod
     def sleep(self, seconds: float) -> None:
         """Let time pass; received data are kept."""
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0:
+            self._receive(left)
 
     # --- requests ---
 
@@ -250,12 +267,6 @@ class LinkProbe(ABC):
         finally:
             for name, value in before.items():
                 self.set_parameter(name, value)
-
-    def needs_row(self, name: str) -> Row:
-        """Return a telemetry row; the case is skipped if the definition has none of that name."""
-        if name not in self.icd.telemetry:
-            raise CaseSkipped(f"the interface definition has no telemetry '{name}'")
-        return self.icd.telemetry[name]
 
     # --- around a run ---
 

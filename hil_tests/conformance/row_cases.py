@@ -68,7 +68,6 @@ def unknown_telemetry(probe: LinkProbe) -> None:
 
 @IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
 def unknown_telecommands(probe: LinkProbe) -> None:
-    """With and without data."""
     for identifier in range(128):
         if identifier not in probe.icd.telecommands_by_id:
             probe.expect_refusal(identifier, b"", INVALID_ID)
@@ -217,30 +216,12 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
                 check(same, f"{parameter.name} {good!r}", f"{seen!r}")
 
     name = parameter.name
-    yield Case(
-        f"parameters.{name}.limits",
-        "parameters",
-        f"{name} reports its number and limits",
-        clause,
-        limits,
-        intrusive=True,
-    )
-    yield Case(
-        f"parameters.{name}.refusals",
-        "parameters",
-        f"{name} outside its limits is refused, and stays",
-        clause,
-        refusals,
-        intrusive=True,
-    )
-    yield Case(
-        f"parameters.{name}.values",
-        "parameters",
-        f"{name} takes its least and greatest value",
-        clause,
-        values,
-        intrusive=True,
-    )
+    for check_name, title, run in (
+        ("limits", f"{name} reports its number and limits", limits),
+        ("refusals", f"{name} outside its limits is refused, and stays", refusals),
+        ("values", f"{name} takes its least and greatest value", values),
+    ):
+        yield Case(f"parameters.{name}.{check_name}", "parameters", title, clause, run, intrusive=True)
 
 
 def _within(value: float, parameter: Parameter) -> bool:

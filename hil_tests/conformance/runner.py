@@ -15,6 +15,16 @@ from starhil.protocol.errors import ProtocolError
 
 
 @dataclass(frozen=True)
+class Verdict:
+    """Outcome of one part of a case."""
+
+    status: str
+    expected: str = ""
+    seen: str = ""
+    link_lost: bool = False
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Outcome of a case.
 
@@ -40,6 +50,12 @@ class Outcome:
     seen: str
     seconds: float
     log: tuple[str, ...]
+
+    @classmethod
+    def of(cls, case: Case[Any], verdict: Verdict, seconds: float = 0.0, log: Sequence[str] = ()) -> Outcome:
+        """Return the outcome of a case."""
+        about = (case.id, case.area, case.title, case.clause, case.intrusive)
+        return cls(*about, verdict.status, verdict.expected, verdict.seen, seconds, tuple(log))
 
     def to_json(self) -> dict[str, Any]:
         """Return the outcome as JSON data, with the log of a failed case only."""
@@ -123,31 +139,10 @@ def run_case(probe: Probe, case: Case[Any]) -> Outcome:
     log = tuple(probe.log)
     if verdict.status == FAILED and not verdict.link_lost:
         _attempt(probe, probe.recover)
-    return Outcome(
-        case.id,
-        case.area,
-        case.title,
-        case.clause,
-        case.intrusive,
-        verdict.status,
-        verdict.expected,
-        verdict.seen,
-        seconds,
-        log,
-    )
+    return Outcome.of(case, verdict, seconds, log)
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    """Outcome of one part of a case."""
-
-    status: str
-    expected: str = ""
-    seen: str = ""
-    link_lost: bool = False
-
-
-def _attempt(probe: Probe, act: Callable[[], None]) -> _Verdict:
+def _attempt(probe: Probe, act: Callable[[], None]) -> Verdict:
     """Do a part of a case.
 
     Frames that no case has thought of, such as an empty heartbeat, show as errors of the code that
@@ -156,17 +151,17 @@ def _attempt(probe: Probe, act: Callable[[], None]) -> _Verdict:
     try:
         act()
     except CaseFailed as failure:
-        return _Verdict(FAILED, failure.expected, failure.seen)
+        return Verdict(FAILED, failure.expected, failure.seen)
     except CaseSkipped as reason:
-        return _Verdict(SKIPPED, seen=str(reason))
+        return Verdict(SKIPPED, seen=str(reason))
     except (BenchError, ProtocolError) as error:
         lost = isinstance(error, LinkLostError)
-        return _Verdict(FAILED, "a case that can be carried out", str(error), link_lost=lost)
+        return Verdict(FAILED, "a case that can be carried out", str(error), link_lost=lost)
     except (LookupError, ValueError) as error:
         last = next((line for line in reversed(probe.log) if " <- " in line), "nothing")
         seen = f"{last.partition(' <- ')[2] or last} ({type(error).__name__}: {error})"
-        return _Verdict(FAILED, "an answer that can be read", seen)
-    return _Verdict(PASSED)
+        return Verdict(FAILED, "an answer that can be read", seen)
+    return Verdict(PASSED)
 
 
 def run_cases(
@@ -193,7 +188,7 @@ def run_cases(
     def report_trouble(what: str, title: str, act: Callable[[], None]) -> None:
         verdict = _attempt(probe, act)
         if verdict.status == FAILED:
-            record(_outcome_of_run(link, what, title, verdict, tuple(probe.log)))
+            record(Outcome.of(case_of_run(f"{link}.{what}", title), verdict, log=probe.log))
 
     if not waiting:
         return outcomes
@@ -214,7 +209,7 @@ def run_cases(
             probe.log.clear()
             report_trouble("settings.kept", "the settings are put back after the last case", probe.restore)
     if mute is not None:
-        record(_outcome_of_run(link, "answers", "the device answers", mute, tuple(probe.log)))
+        record(Outcome.of(case_of_run(f"{link}.answers", "the device answers"), mute, log=probe.log))
         for item in waiting:
             record(not_run(item, mute.seen))
     return outcomes
@@ -222,29 +217,15 @@ def run_cases(
 
 def not_run(item: Case[Any], reason: str) -> Outcome:
     """Return the outcome of a case that the run did not come to."""
-    text = f"not run: {reason}"
-    return Outcome(item.id, item.area, item.title, item.clause, item.intrusive, NOT_RUN, "", text, 0.0, ())
+    return Outcome.of(item, Verdict(NOT_RUN, seen=f"not run: {reason}"))
 
 
-def _outcome_of_run(link: str, what: str, title: str, verdict: _Verdict, log: tuple[str, ...]) -> Outcome:
-    """Return an outcome that is about the run and not about one case."""
-    identifier = f"{link}.{what}"
-    area = identifier.rpartition(".")[0]
-    return Outcome(
-        identifier,
-        area,
-        title,
-        "starhil conformance",
-        intrusive=False,
-        status=FAILED,
-        expected=verdict.expected,
-        seen=verdict.seen,
-        seconds=0.0,
-        log=log,
-    )
+def case_of_run(identifier: str, title: str, clause: str = "starhil conformance") -> Case[Any]:
+    """Return a case that stands for something about the run, and is never run itself."""
+    return Case(identifier, identifier.rpartition(".")[0], title, clause, lambda _probe: None)
 
 
-def _mute(probe: Probe, port: str, *, booting: bool) -> _Verdict | None:
+def _mute(probe: Probe, port: str, *, booting: bool) -> Verdict | None:
     """Return the verdict on a device that does not answer.
 
     None if it answers, or if the link itself is gone.
@@ -259,6 +240,6 @@ def _mute(probe: Probe, port: str, *, booting: bool) -> _Verdict | None:
     if seen is None:
         return None
     if seen == "nothing":
-        return _Verdict(FAILED, "an answer to a request", f"nothing answers on {port}")
+        return Verdict(FAILED, "an answer to a request", f"nothing answers on {port}")
     remedy = "check --dialect, --baud and the addresses"
-    return _Verdict(FAILED, "an answer to a request", f"no star sensor answers on {port}: {seen}; {remedy}")
+    return Verdict(FAILED, "an answer to a request", f"no star sensor answers on {port}: {seen}; {remedy}")

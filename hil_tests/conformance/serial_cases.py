@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 from starhil.hil_tests.conformance.case import (
@@ -13,14 +12,20 @@ from starhil.hil_tests.conformance.case import (
     check_equal,
     rule,
 )
-from starhil.hil_tests.conformance.error_flags import FlagRow, add_flag_cases, check_flags
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
     INVALID_PARAMETER,
     LONG_PAUSE_S,
 )
-from starhil.hil_tests.conformance.serial_probe import SerialProbe, framed
+from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.wire_tables import (
+    Exchange,
+    FlagRow,
+    add_exchange_cases,
+    add_flag_cases,
+    check_flags,
+)
 
 REPLIES: Final = "forms of the replies: a AlbertaSat, b RADSAT, c libCubeObc"
 
@@ -45,72 +50,44 @@ READ: Final = "1F 7F 80 1F FF"
 """Request of identification."""
 
 
-@dataclass(frozen=True)
-class Line:
-    """A row of the framing table: pieces to send, a pause after each, and expected rows."""
-
-    id: str
-    title: str
-    pieces: tuple[str, ...]
-    answers: tuple[int, ...] = ()
-    pause_s: float = 0.0
-    clause: str | None = None
-
-
-LINES: Final = (
-    Line("one", "a request is answered once", (READ,), (128,)),
-    Line("two-at-once", "two requests in one piece are both answered, in order", (READ + "1F 7F E6 1F FF",), (128, 230)),
-    Line("twenty-at-once", "twenty requests in one piece are all answered", (READ * 20,), (128,) * 20),
-    Line("byte-by-byte", "a request may come byte by byte", ("1F", "7F", "80", "1F", "FF"), (128,), 0.005),
-    Line("cut-in-escape", "a request may be cut between 1F and what follows it", ("1F", "7F 80 1F", "FF"), (128,), 0.02),
-    Line("pause", "a pause of 0.1 s within a request does no harm", ("1F 7F", "80 1F FF"), (128,), SHORT_PAUSE_S, clause=rule(1)),
-    Line("junk-before", "bytes before a request are passed over", ("00 55 AA FF" + READ,), (128,)),
-    Line("junk-between", "bytes between requests are passed over", (READ + "00 FF 7F" + READ,), (128, 128)),
-    Line("junk-after", "bytes after a request do not spoil the next", (READ + "42", READ), (128, 128), 0.02),
-    Line("escape-before", "a lone 1F before a request is passed over", ("1F" + READ,), (128,)),
-    Line("escapes-before", "several 1F before a request are passed over", ("1F 1F 1F" + READ,), (128,)),
-    Line("junk-escape", "1F and a byte that means nothing, then a request", ("1F 00" + READ,), (128,)),
-    Line("end-alone", "an end mark without a start is no message", ("1F FF",)),
-    Line("end-before", "an end mark before a request is passed over", ("1F FF" + READ,), (128,)),
-    Line("start-alone", "a start mark alone is no message", ("1F 7F",)),
-    Line("starts", "a second start mark restarts the message", ("1F 7F" + READ,), (128,)),
-    Line("cut-off", "a message cut off by another is dropped, the other one answered", ("1F 7F E6" + READ,), (128,)),
-    Line("cut-off-data", "a message with data cut off by another is dropped", ("1F 7F 02 11 22 33" + READ,), (128,)),
-    Line("empty", "a message without an identifier is no request", ("1F 7F 1F FF",)),
-    Line("empty-then-good", "a request after an empty message is answered", ("1F 7F 1F FF" + READ,), (128,)),
-    Line("bad-escape", "1F before another byte within a message ends it without effect", ("1F 7F 80 1F 00",), clause=rule(3)),
-    Line("bad-escape-then-good", "a request after a bad escape is answered", ("1F 7F 80 1F 00" + READ,), (128,), clause=rule(3)),
-    Line("start-of-ack", "1F 07 is the start of a reply, not of a request", ("1F 07 80 1F FF",), clause=REPLIES),
-    Line("start-of-nack", "1F 0F is the start of a reply, not of a request", ("1F 0F 80 1F FF",), clause=REPLIES),
-    Line("start-of-event", "1F 2F is the start of an event, not of a request", ("1F 2F 80 1F FF",), clause=REPLIES),
-    Line("start-of-unsolicited", "1F 4F is the start of unsolicited telemetry, not of a request", ("1F 4F 80 1F FF",), clause=REPLIES),
-    Line("noise", "noise is not answered", ("FF" * 64 + "00" * 64 + "7F" * 64,)),
-    Line("escapes", "a run of 1F is not answered", ("1F" * 200,)),
-    Line("ends", "a run of end marks is not answered", ("1F FF" * 100,)),
+EXCHANGES: Final = (
+    Exchange("one", "a request is answered once", (READ,), ("128",)),
+    Exchange("two-at-once", "two requests in one piece are both answered, in order", (READ + "1F 7F E6 1F FF",), ("128", "230")),
+    Exchange("twenty-at-once", "twenty requests in one piece are all answered", (READ * 20,), ("128",) * 20),
+    Exchange("byte-by-byte", "a request may come byte by byte", ("1F", "7F", "80", "1F", "FF"), ("128",), pause_s=0.005),
+    Exchange("cut-in-escape", "a request may be cut between 1F and what follows it", ("1F", "7F 80 1F", "FF"), ("128",), pause_s=0.02),
+    Exchange("pause", "a pause of 0.1 s within a request does no harm", ("1F 7F", "80 1F FF"), ("128",), pause_s=SHORT_PAUSE_S, clause=rule(1)),
+    Exchange("junk-before", "bytes before a request are passed over", ("00 55 AA FF" + READ,), ("128",)),
+    Exchange("junk-between", "bytes between requests are passed over", (READ + "00 FF 7F" + READ,), ("128", "128")),
+    Exchange("junk-after", "bytes after a request do not spoil the next", (READ + "42", READ), ("128", "128"), pause_s=0.02),
+    Exchange("escape-before", "a lone 1F before a request is passed over", ("1F" + READ,), ("128",)),
+    Exchange("escapes-before", "several 1F before a request are passed over", ("1F 1F 1F" + READ,), ("128",)),
+    Exchange("junk-escape", "1F and a byte that means nothing, then a request", ("1F 00" + READ,), ("128",)),
+    Exchange("end-alone", "an end mark without a start is no message", ("1F FF",)),
+    Exchange("end-before", "an end mark before a request is passed over", ("1F FF" + READ,), ("128",)),
+    Exchange("start-alone", "a start mark alone is no message", ("1F 7F",)),
+    Exchange("starts", "a second start mark restarts the message", ("1F 7F" + READ,), ("128",)),
+    Exchange("cut-off", "a message cut off by another is dropped, the other one answered", ("1F 7F E6" + READ,), ("128",)),
+    Exchange("cut-off-data", "a message with data cut off by another is dropped", ("1F 7F 02 11 22 33" + READ,), ("128",)),
+    Exchange("empty", "a message without an identifier is no request", ("1F 7F 1F FF",)),
+    Exchange("empty-then-good", "a request after an empty message is answered", ("1F 7F 1F FF" + READ,), ("128",)),
+    Exchange("bad-escape", "1F before another byte within a message ends it without effect", ("1F 7F 80 1F 00",), clause=rule(3)),
+    Exchange("bad-escape-then-good", "a request after a bad escape is answered", ("1F 7F 80 1F 00" + READ,), ("128",), clause=rule(3)),
+    Exchange("start-of-ack", "1F 07 is the start of a reply, not of a request", ("1F 07 80 1F FF",), clause=REPLIES),
+    Exchange("start-of-nack", "1F 0F is the start of a reply, not of a request", ("1F 0F 80 1F FF",), clause=REPLIES),
+    Exchange("start-of-event", "1F 2F is the start of an event, not of a request", ("1F 2F 80 1F FF",), clause=REPLIES),
+    Exchange("start-of-unsolicited", "1F 4F is the start of unsolicited telemetry, not of a request", ("1F 4F 80 1F FF",), clause=REPLIES),
+    Exchange("half", "an incomplete message is dropped after a time-out", ("1F 7F 80", "1F FF"), pause_s=LONG_PAUSE_S, clause=rule(2)),
+    Exchange("overlong", "a message that is too long is dropped, the next one answered", ("1F 7F 80" + "00" * 4 * LONGEST_MESSAGE + "1F FF",), clause=rule(4)),
+    Exchange("noise", "noise is not answered", ("FF" * 64 + "00" * 64 + "7F" * 64,)),
+    Exchange("escapes", "a run of 1F is not answered", ("1F" * 200,)),
+    Exchange("ends", "a run of end marks is not answered", ("1F FF" * 100,)),
 )  # fmt: skip
-
-
-def _add_line_case(line: Line) -> None:
-    @FRAMING.case(line.id, line.title, line.clause)
-    def run(probe: SerialProbe) -> None:
-        probe.expecting(*line.answers)
-        for piece in line.pieces:
-            probe.send_text(piece)
-            probe.sleep(line.pause_s)
-        for identifier in line.answers:
-            probe.expect_telemetry(identifier)
-        probe.expect_silence("no more was asked for")
-        # a message that was left open ends at the start of the next one
-        probe.expect_alive()
-
-
-for _line in LINES:
-    _add_line_case(_line)
+add_exchange_cases(FRAMING, EXCHANGES)
 
 
 @FRAMING.case("reply-form", "an answer has the form of its dialect, byte for byte", REPLIES)
 def reply_form(probe: SerialProbe) -> None:
-    """Start, row ID if the dialect has one, 8 bytes of data, end."""
     probe.send(bytes.fromhex(READ))
     probe.expecting(128)
     data = probe.expect_telemetry(128)
@@ -121,27 +98,8 @@ def reply_form(probe: SerialProbe) -> None:
     check_equal(seen, whole.hex().upper(), "bytes")
 
 
-@FRAMING.case("half", "an incomplete message is dropped after a time-out", rule(2))
-def half(probe: SerialProbe) -> None:
-    """The rest of it arrives too late; the next request is answered."""
-    probe.send(bytes.fromhex("1F 7F 80"))
-    probe.sleep(LONG_PAUSE_S)
-    probe.send(bytes.fromhex("1F FF"))
-    probe.expect_silence("the message has timed out")
-    probe.expect_alive()
-
-
-@FRAMING.case("overlong", "a message that is too long is dropped, the next one answered", rule(4))
-def overlong(probe: SerialProbe) -> None:
-    """Longer than the 512 bytes of the published host's buffer."""
-    probe.send(framed(0x80, bytes(4 * LONGEST_MESSAGE)))
-    probe.expect_silence("the message was too long")
-    probe.expect_alive()
-
-
 @FRAMING.case("longest", "a message of 512 bytes is still taken, and refused for its length", rule(4))
 def longest(probe: SerialProbe) -> None:
-    """Row ID and 511 bytes."""
     probe.expect_refusal(0x80, bytes(LONGEST_MESSAGE - 1), INVALID_LENGTH)
 
 
@@ -203,7 +161,6 @@ add_flag_cases(ERRORS, FLAGS)
 
 @ERRORS.case("none", "good requests set no flag")
 def no_flag(probe: SerialProbe) -> None:
-    """In one piece and with pauses."""
     probe.command("clear_counters")
     for _ in range(20):
         probe.expect_alive()
@@ -219,7 +176,6 @@ def no_flag(probe: SerialProbe) -> None:
 
 @TIMING.case("pace", "a long reply takes its time on the line")
 def pace(probe: SerialProbe) -> None:
-    """Telemetry 211 has 54 bytes."""
     if probe.baud is None:
         raise CaseSkipped("the pace is not checked without --baud, the bit rate of the line")
     begin = probe.now()

@@ -47,31 +47,24 @@ class SerialProbe(LinkProbe):
         baud: int | None = None,
         times: ProbeTimes | None = None,
     ) -> None:
-        super().__init__(icd, times or ProbeTimes())
-        self.port = port
+        super().__init__(port, icd, times)
         self.dialect = dialect
         self.baud = baud
         self._buffer = bytearray()
         self._asked: list[int] = []
-
-    def now(self) -> float:
-        """Time of the port, s."""
-        return self.port.now()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass; received data are kept."""
-        end = self.now() + seconds
-        while (left := end - self.now()) > 0:
-            self._receive_into_buffer(left)
 
     def post(self, identifier: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
         self.expecting(identifier)
         self.send(framed(identifier, data))
 
-    def expecting(self, *identifiers: int) -> None:
-        """Note what was asked, in order: dialect b does not say what an answer is about."""
-        self._asked.extend(identifiers)
+    def expecting(self, *answers: str | int) -> None:
+        """Note the rows that were asked for, in order: dialect b does not say what an answer is about."""
+        self._asked.extend(map(int, answers))
+
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next answer, which must be the telemetry of the row with that number."""
+        self.expect_telemetry(int(answer))
 
     def send(self, data: bytes) -> None:
         """Send raw bytes."""
@@ -86,7 +79,7 @@ class SerialProbe(LinkProbe):
         more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
         self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
 
-    def _receive_into_buffer(self, timeout_s: float) -> bool:
+    def _receive(self, timeout_s: float) -> bool:
         data = self.port.receive(timeout_s)
         if data is None:
             return False
@@ -96,8 +89,7 @@ class SerialProbe(LinkProbe):
 
     def drain(self) -> None:
         """Discard everything received."""
-        while self.port.receive(0.0) is not None:
-            pass
+        super().drain()
         self._buffer.clear()
         self._asked.clear()
 
@@ -136,7 +128,7 @@ class SerialProbe(LinkProbe):
             if len(self._buffer) >= 2 and not self._starts_well():
                 return self._malformed()
             left = end - self.now()
-            if left <= 0 or not self._receive_into_buffer(left):
+            if left <= 0 or not self._receive(left):
                 self._asked.clear()
                 return self._malformed() if self._buffer else Answer("none")
 

@@ -28,7 +28,6 @@ RECOVERY: Final = CaseArea[LinkProbe]("recovery", rule(9))
 
 @TIMING.case("reply", "fifty requests are each answered within 300 ms")
 def reply_time(probe: LinkProbe) -> None:
-    """The slowest of them counts."""
     worst = 0.0
     for _ in range(50):
         begin = probe.now()
@@ -52,7 +51,6 @@ def _unsolicited_rows(probe: LinkProbe, name: str, rate: float, seconds: float) 
 
 @UNSOLICITED.case("rate", "unsolicited telemetry comes at its rate, and stops")
 def unsolicited(probe: LinkProbe) -> None:
-    """identification, 8 bytes, at 10 Hz for two seconds."""
     row = probe.icd.telemetry["identification"]
     seen = _unsolicited_rows(probe, "identification", 10.0, 2.0)
     if isinstance(probe, SerialProbe) and probe.dialect != "c":
@@ -66,7 +64,6 @@ def unsolicited(probe: LinkProbe) -> None:
 
 @UNSOLICITED.case("long", "a long row comes unsolicited as a whole")
 def unsolicited_long(probe: LinkProbe) -> None:
-    """star_tracker, 54 bytes, with all values within their limits."""
     row = probe.icd.telemetry["star_tracker"]
     seen = _unsolicited_rows(probe, "star_tracker", 5.0, 1.0)
     if isinstance(probe, SerialProbe) and probe.dialect != "c":
@@ -91,7 +88,6 @@ def unsolicited_refused(probe: LinkProbe) -> None:
 
 @RECOVERY.case("noise", "after noise the next good request is answered")
 def noise(probe: LinkProbe) -> None:
-    """Serial: 4000 random bytes; CAN: 400 random frames that are no requests."""
     rng = random.Random(7)  # noqa: S311 -- noise, not a secret
     if isinstance(probe, SerialProbe):
         for _ in range(20):
@@ -109,7 +105,6 @@ def noise(probe: LinkProbe) -> None:
 
 @RECOVERY.case("flood", "a flood of requests is answered whole and in order", rule(10))
 def flood(probe: LinkProbe) -> None:
-    """Two rows in turn, a hundred times."""
     rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]
     for _ in range(100):
         for row in rows:

@@ -12,11 +12,12 @@ from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_e
 from starhil.hil_tests.conformance.row_cases import bad_values
 from starhil.hil_tests.conformance.unit_probe import UnitProbe
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import HeaderField
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, FixedFraming, SlipFraming
 from starhil.protocol.messages import DEFAULT_MAX_SIZE, ErrorCode, Request
-from starhil.protocol.serial_stack import ComposedStack, build_serial_stack
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.values import Value
 
 FLOOD: Final = 50

@@ -10,10 +10,11 @@ from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.link_probe import RECOVERY_S, ProbeTimes, checked_values
 from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.codec import Row
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import ComposedStack, build_serial_stack
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.values import Value
 
 SHOWN_BYTES: Final = 48

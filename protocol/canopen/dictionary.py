@@ -80,10 +80,6 @@ class Entry:
         """Return the value of an unsigned entry without a reader."""
         return int.from_bytes(self.value, "little")
 
-    def set_number(self, value: int) -> None:
-        """Set the value of an unsigned entry without a reader, without checks."""
-        self.value = value.to_bytes(self.size or 4, "little")
-
 
 def type_size(data_type: int | None) -> int | None:
     """Return the bytes of a CANopen data type, or None if the length varies (strings, DOMAIN)."""

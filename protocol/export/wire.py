@@ -163,7 +163,7 @@ def _objects(layout: CanopenModel) -> Section:
         "CANopen objects",
         (
             (
-                "The rows, fields and parameters of this definition as objects; types, sub-indices and limits are in the electronic data sheet. "
+                "The rows, fields and parameters of this definition as objects; types, sub-indices and limits are in the EDS. "
                 "Objects below 2000h are those of CiA 301."
             ),
         ),

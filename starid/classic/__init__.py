@@ -1,1 +1,1 @@
-"""Published star identification algorithms, each in a module of its own, behind the interface of all identifiers."""
+"""Published star identification algorithms, each in its own module, behind the interface of all identifiers."""

@@ -90,7 +90,7 @@ def pair_table(vectors: NDArray[np.float64], longest: float) -> PairTable:
     """
     if len(vectors) > MOST_STARS:
         raise StaridError(
-            f"pair table: {len(vectors)} stars given, at most {MOST_STARS} can be held; take a brighter limit"
+            f"pair table: {len(vectors)} stars, at most {MOST_STARS} allowed; use a brighter limit"
         )
     by_z = np.argsort(vectors[:, 2], kind="stable")
     chord, low, high = _close_pairs(np.ascontiguousarray(vectors[by_z]), longest)

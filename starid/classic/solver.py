@@ -86,7 +86,7 @@ class ClassicOptions:
         for name in ("stars_per_field", "tolerance_px"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
-                raise StaridError(f"classic {name}: {value} given, a positive number needed")
+                raise StaridError(f"classic {name}: must be a positive number, not {value}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +231,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         magnitudes = np.sort(self._catalog.v)
         if magnitudes.size < LEAST_GUIDE_STARS:
             raise StaridError(
-                f"classic catalog: {magnitudes.size} stars given, at least {LEAST_GUIDE_STARS} needed"
+                f"classic catalog: {magnitudes.size} stars, at least {LEAST_GUIDE_STARS} needed"
             )
         limit = float(magnitudes[min(wanted, magnitudes.size) - 1])
         if self.options.limiting_magnitude is not None:

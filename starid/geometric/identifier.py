@@ -104,9 +104,9 @@ class Effort:
             value = getattr(self, field.name)
             if field.name == "part_stars":
                 if not 0 <= value <= MOST_PART_STARS:
-                    raise StaridError(f"identifier part_stars: {value} given, 0…{MOST_PART_STARS} needed")
+                    raise StaridError(f"identifier part_stars: must be 0…{MOST_PART_STARS}, not {value}")
             elif not 0.0 < value < math.inf:
-                raise StaridError(f"identifier {field.name}: {value} given, a positive number needed")
+                raise StaridError(f"identifier {field.name}: must be a positive number, not {value}")
 
     def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
         """Settings of the kernels (`starid.geometric.settings`) for a camera of known focal length."""
@@ -168,11 +168,11 @@ class Identifier:
     ) -> None:
         if not 0.0 <= fov_tolerance <= WIDEST_TOLERANCE:
             raise StaridError(
-                f"identifier fov_tolerance: {fov_tolerance} given, 0…{WIDEST_TOLERANCE:g} needed"
+                f"identifier fov_tolerance: must be 0…{WIDEST_TOLERANCE:g}, not {fov_tolerance}"
             )
         self._catalog = load_catalog() if catalog is None else catalog
         if len(self._catalog) == 0:
-            raise StaridError("identifier catalog: it holds no star")
+            raise StaridError("identifier catalog: contains no stars")
         effort = effort or Effort()
         typical = camera if index_camera is None else index_camera
         if limiting_magnitude is None:
@@ -360,7 +360,7 @@ class Identifier:
         begin = time.perf_counter()
         xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
         if not 0.0 < window_px < math.inf:
-            raise StaridError(f"tracking window_px: {window_px} given, a positive number of pixels needed")
+            raise StaridError(f"tracking window_px: must be a positive number of pixels, not {window_px}")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         numbers = self._numbers_for(xy_sigma_px, observer_velocity)
         window = window_px / self._px_per_rad

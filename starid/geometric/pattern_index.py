@@ -130,8 +130,8 @@ class IndexSettings:
         (bright_low, bright_high), (deep_low, deep_high) = self.bright_sides_rad, self.deep_sides_rad
         if not 0.0 < bright_low <= deep_low < deep_high <= bright_high < math.pi:
             raise StaridError(
-                f"index sides: bright {self.bright_sides_rad}, deep {self.deep_sides_rad} rad given; "
-                "0 < shortest < longest < π needed, the deep range within the bright one"
+                f"index sides: bright {self.bright_sides_rad}, deep {self.deep_sides_rad} rad; "
+                "must be 0 < shortest < longest < π, the deep range within the bright one"
             )
         if not (
             self.deep_quota >= self.bright_quota >= 3 and self.cells_per_edge >= 1 and self.side_bins >= 1

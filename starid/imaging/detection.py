@@ -127,7 +127,7 @@ class DetectionSettings:
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise StaridError(f"detection {name}: {value!r} given, {low:g}…{high:g} needed")
+                raise StaridError(f"detection {name}: must be {low:g}…{high:g}, not {value!r}")
 
 
 @dataclass(frozen=True)
@@ -231,16 +231,14 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
 def _checked_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
     """Validate a grey image of counts; return it contiguous and in native byte order."""
     if not isinstance(image, np.ndarray):
-        raise StaridError(f"image: a {type(image).__name__} given, an array (h, w) of uint8 or uint16 needed")
+        raise StaridError(f"image: must be an array (h, w) of uint8 or uint16, not a {type(image).__name__}")
     if image.ndim != 2:
         colour = " (colour: convert it to grey first)" if image.ndim == 3 else ""
-        raise StaridError(f"image: shape {image.shape} given, (h, w) needed{colour}")
+        raise StaridError(f"image: shape must be (h, w), not {image.shape}{colour}")
     if image.dtype.kind != "u" or image.dtype.itemsize > 2:
-        raise StaridError(
-            f"image: type {image.dtype} given, uint8 or uint16 needed; scale it to counts first"
-        )
+        raise StaridError(f"image: type must be uint8 or uint16, not {image.dtype}; scale it to counts first")
     if min(image.shape) < LEAST_SIDE_PX:
-        raise StaridError(f"image: {image.shape[1]}×{image.shape[0]} pixels given, at least 16×16 needed")
+        raise StaridError(f"image: must be at least 16×16 pixels, not {image.shape[1]}×{image.shape[0]}")
     return np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
 
 

@@ -64,7 +64,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.ui
             )
         pixels = grey_of(pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise StaridError(f"image {source}: pixels of type {pixels.dtype}; 8 or 16 bit whole numbers needed")
+        raise StaridError(f"image {source}: pixels must be whole numbers of 8 or 16 bit, not {pixels.dtype}")
     low, high = int(pixels.min()), int(pixels.max())
     if low == high:
         appearance = {0: "all black", 256**pixels.dtype.itemsize - 1: "all white"}.get(
@@ -94,7 +94,7 @@ def image_suffix(path: Path) -> str:
         raise StaridError(f"image {path}: is a folder; name a file in it")
     suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
     if suffix not in SUFFIXES:
-        raise StaridError(f"image {path}: suffix {suffix!r} given, one of {', '.join(SUFFIXES)} needed")
+        raise StaridError(f"image {path}: suffix must be one of {', '.join(SUFFIXES)}, not {suffix!r}")
     return suffix
 
 
@@ -131,7 +131,7 @@ def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16])
         write_atomically(target, lambda part: part.write_bytes(packed.tobytes()))
     except OSError as error:
         raise StaridError(
-            f"image {target}: cannot be written ({error.strerror}); choose another place"
+            f"image {target}: cannot be written ({error.strerror}); choose another path"
         ) from None
 
 

@@ -88,7 +88,7 @@ class RoughSearch:
     def __init__(self, camera: Camera, catalog: StarCatalog, *, fov_tolerance: float) -> None:
         if camera.fov_deg < NARROWEST_DEG:
             raise StaridError(
-                f"camera fov_deg: {camera.fov_deg:g} given, at least {NARROWEST_DEG:g} needed: a narrower field has too few stars"
+                f"camera fov_deg: must be at least {NARROWEST_DEG:g}, not {camera.fov_deg:g}; a narrower field has too few stars"
             )
         self._tolerance = fov_tolerance
         self._scale = max(math.sqrt(camera.width * camera.height) / SIZE_PX, 0.75)

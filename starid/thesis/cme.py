@@ -333,7 +333,7 @@ def estimate_motion(
         If there are fewer than two matches (affine: three), or all of them fall together (affine: in a line).
     """
     if model not in ("rigid", "affine"):
-        raise FilterError(f"motion: model {model!r} is unknown; one of rigid, affine is needed")
+        raise FilterError(f"motion: model must be rigid or affine, not {model!r}")
     first = np.ascontiguousarray(before, dtype=np.float64)
     second = np.ascontiguousarray(now, dtype=np.float64)
     matrix = np.empty((2, 3))

@@ -111,7 +111,7 @@ class DatabaseParameters:
         names = {field.name for field in dataclasses.fields(cls)}
         if set(values) != names:
             raise DatabaseError(
-                f"database: header has the parameters {sorted(values)}, needed are {sorted(names)}"
+                f"database: header must have the parameters {sorted(names)}, not {sorted(values)}"
             )
         return cls(**values)
 

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from starid.errors import StaridError
 from starid.jit import compiled
 
-FEATURE_NAMES: Final = ("n", "A", "r", "sigma_A", "sigma_r")
-"""Order of the components of a feature vector."""
-
 FEATURE_COUNT: Final = 5
 """Components of a feature vector; the polar angle is kept beside it."""
 
@@ -64,7 +61,7 @@ class FeatureVector:
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The five features in the order of `FEATURE_NAMES`, (5,)."""
+        """The five features n, A, r, σ_A, σ_r, (5,)."""
         return np.array([self.n, self.A, self.r, self.sigma_A, self.sigma_r], dtype=np.float64)
 
 

@@ -183,7 +183,7 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
         ra_step = np.asarray(_FULL_TURN / row_columns, dtype=np.float64)
         first_ra = 0.0
     else:
-        raise GridError(f"grid: geometry {geometry!r} is unknown; one of planar, spherical is needed")
+        raise GridError(f"grid: geometry must be planar or spherical, not {geometry!r}")
     if rows < DICTIONARY_SIDE or int(row_columns.min()) < DICTIONARY_SIDE:
         raise GridError(f"grid: overlap {overlap} leaves {rows} rows of frames; at least three are needed")
     row_dec = np.asarray(dec, dtype=np.float64)

@@ -316,9 +316,7 @@ def make_frame_sky(
         If no star is left or the frame makes no sense.
     """
     if direction not in ("faintest", "brightest"):
-        raise SkyError(
-            f"sky: brightness direction {direction!r} is unknown; one of faintest, brightest is needed"
-        )
+        raise SkyError(f"sky: brightness direction must be faintest or brightest, not {direction!r}")
     if geometry == "spherical" and not focal_px > 0.0:
         raise SkyError("sky: the spherical geometry needs the camera's focal length in pixels")
     if not half_width > 0.0:

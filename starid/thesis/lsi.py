@@ -462,11 +462,9 @@ class LostInSpace:
         self, database: FeatureDatabase, *, precision: Precision = "exact", solver: Solver = "exact"
     ) -> None:
         if precision not in ("exact", "stored"):
-            raise DatabaseError(f"LSI: precision {precision!r} is unknown; one of exact, stored is needed")
+            raise DatabaseError(f"LSI: precision must be exact or stored, not {precision!r}")
         if solver not in get_args(Solver):
-            raise DatabaseError(
-                f"LSI: solver {solver!r} is unknown; one of {', '.join(get_args(Solver))} is needed"
-            )
+            raise DatabaseError(f"LSI: solver must be one of {', '.join(get_args(Solver))}, not {solver!r}")
         self.database = database
         self.index = make_cell_index(database)
         self.arrays = cell_arrays(database)

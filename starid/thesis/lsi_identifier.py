@@ -131,7 +131,7 @@ class LsiOptions:
 
     def __post_init__(self) -> None:
         if self.neighbours < 1:
-            raise StaridError(f"lsi neighbours: {self.neighbours} given, at least 1 needed")
+            raise StaridError(f"lsi neighbours: must be at least 1, not {self.neighbours}")
 
 
 class LsiIdentifier(VerifiedIdentifier):
@@ -166,7 +166,7 @@ class LsiIdentifier(VerifiedIdentifier):
         options = dataclasses.replace(options or LsiOptions(), **changes)
         self._catalog = load_catalog() if catalog is None else catalog
         if len(self._catalog) == 0:
-            raise StaridError("identifier catalog: it holds no star")
+            raise StaridError("identifier catalog: contains no stars")
         self._camera = camera
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))

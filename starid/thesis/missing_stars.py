@@ -3,7 +3,7 @@
 The thesis names both as what is to be done, and does neither; this is our form of it. One missing star changes all five
 features of a frame. A star that the frame before had, and that the camera's motion carries to a place inside the field
 where nothing is seen now, is missing: it is put back there. Lost in space there is no frame before; there the field is
-divided into smaller overlapping circles, each with a database of its own width, and the circles whose answers agree
+divided into smaller overlapping circles, each with a database of that width, and the circles whose answers agree
 about the boresight of the whole field are believed: those that the missing stars belong to agree with nothing.
 """
 

@@ -200,7 +200,7 @@ class RsiIdentifier:
         begin = time.perf_counter()
         xy, brightness, _ = checked_detections(xy_px, flux)
         if window_px is not None and not 0.0 < window_px < math.inf:
-            raise StaridError(f"tracking window_px: {window_px} given, a positive number of pixels needed")
+            raise StaridError(f"tracking window_px: must be a positive number of pixels, not {window_px}")
         attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
         true_stars, side = self._follow(xy, brightness)
         if window_px is not None:
@@ -221,7 +221,7 @@ class RsiIdentifier:
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
 
     def _follow(self, xy: NDArray[np.float64], flux: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float]:
-        """Which detections are stars, as far as the frames before tell, and the side of the region of search."""
+        """Which detections are stars, as far as the previous frames show, and the side of the region of search."""
         everything = np.ones(flux.size, dtype=np.bool_)
         if self._filter is None:
             return everything, self._settings.gamma_min_deg

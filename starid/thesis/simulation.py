@@ -164,7 +164,7 @@ def moved_frames(
 ) -> Iterator[SimulatedFrame]:
     """Frames of the false-star experiments: the first one still and clean of noise, the others moved from it.
 
-    Every frame has false stars of its own. The later ones get noise, are shifted by U(−shift, shift) pixels per axis
+    Every frame has its own false stars. The later ones get noise, are shifted by U(−shift, shift) pixels per axis
     and turned by U(−rotation, rotation) about the centre, and lose what leaves the circular field. With the
     published seven stars and a radius of 21° this makes 6.6 true stars a frame, as the published tables have it.
 

@@ -279,7 +279,7 @@ class SubcellSearch:
 
     def __init__(self, lost_in_space: LostInSpace, *, neighbours: int = 16, reach_steps: float = 2.0) -> None:
         if neighbours < 1 or not reach_steps > 0.0:
-            raise DatabaseError("LSI: at least one neighbour and a positive reach are needed")
+            raise DatabaseError("LSI: must have at least one neighbour and a positive reach")
         self._lsi = lost_in_space
         self._reach = reach_steps * lost_in_space.database.grid.step_deg
         self._neighbours = neighbours

@@ -8,8 +8,8 @@ from typing import Any
 
 from starhil.emulator.device.device import Device
 from starhil.protocol.codec import Row
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import ComposedStack
 from tests.conformance.mutant_seams import Damage, handling, incoming, outgoing
 from tests.conformance.simulated import SimulatedUnit
 

@@ -55,7 +55,7 @@ def lost(*_arguments: object) -> None:
 def test_a_lost_link_fails_all_that_is_left_at_once(link, monkeypatch):
     with SimulatedUnit("can" if link == "canopen" else link) as unit:
         probe = simulated_probe() if link == "canopen" else unit.probe
-        port = probe.port if link == "serial" else probe.bus
+        port = probe.port
         cases = CANOPEN_CASES if link == "canopen" else SUITES[link]
         monkeypatch.setattr(port, "send", lost)
         begin = port.now()

@@ -20,7 +20,7 @@ IN_USE = {"exposure": 450}
 
 
 def link_of(unit: SimulatedUnit):
-    return unit.probe.port if unit.kind == "serial" else unit.probe.bus
+    return unit.probe.port
 
 
 def mute(unit: SimulatedUnit, monkeypatch, echo: bytes | None = None) -> None:

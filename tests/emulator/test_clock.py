@@ -1,6 +1,6 @@
 import pytest
 
-from starhil.emulator.clock import DeviceTime, RealClock, ScaledClock, SteppedClock, make_clock, split_unix
+from starhil.emulator.clock import DeviceTime, RealClock, ScaledClock, SteppedClock, make_clock
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 
@@ -39,7 +39,7 @@ def test_clocks_are_made_by_name(text, name, speed):
 @pytest.mark.parametrize(
     "text", ["", "fast", "scaled:", "scaled:x", "scaled:0", "scaled:-1", "scaled:1e9", "scaled:nan"]
 )
-def test_unknown_clocks_are_refused_in_one_line(text):
+def test_unknown_clocks_are_rejected_in_one_line(text):
     with pytest.raises(EmulatorError) as refusal:
         make_clock(text)
     assert "\n" not in str(refusal.value)
@@ -61,18 +61,6 @@ def test_real_clock_passes_with_the_wall_clock(monkeypatch):
     clock = RealClock()
     wall[0] += 42
     assert clock.now_ns() == 42
-
-
-@pytest.mark.parametrize(
-    ("unix_ns", "parts"),
-    [
-        (0, (0, 0, 0)),
-        (1_767_225_600_999_999_999, (1_767_225_600, 999, 999_999)),
-        ((2**32) * 10**9 + 1_000_000, (0, 1, 1_000)),
-    ],
-)
-def test_unix_time_splits_as_the_bus_carries_it(unix_ns, parts):
-    assert split_unix(unix_ns) == parts
 
 
 def run_due(scheduler, now_ns):

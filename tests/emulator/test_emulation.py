@@ -166,7 +166,7 @@ def test_a_scenario_happens_at_its_run_times(run, tmp_path):
         ('truth = { kind = "file", path = "gone.csv" }', "gone.csv: cannot be read"),
     ],
 )
-def test_what_a_scenario_cannot_do_is_refused_at_the_start_and_not_counted(run, tmp_path, event, said):
+def test_what_a_scenario_cannot_do_is_rejected_at_the_start_and_not_counted(run, tmp_path, event, said):
     path = tmp_path / "day.toml"
     path.write_text(f"[[at]]\nrun_time_s = 90.0\n{event}\n")
     started = []
@@ -215,7 +215,7 @@ def test_every_scenario_of_the_product_is_valid(name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "at: missing; give it"),
+        ("", "at: missing"),
         ("[[at]]\nrun_time_s = 1.0\n", "give fault, truth or clear_faults"),
         (
             "[[at]]\nrun_time_s = 1.0\nfault = { optical = { false_star = 1 } }\n",
@@ -267,7 +267,7 @@ def test_what_cannot_be_had_is_said_in_one_line(run, options, overrides, said):
     assert "\n" not in str(refusal.value)
 
 
-def test_a_start_that_is_refused_is_not_counted(run, tmp_path, monkeypatch):
+def test_a_start_that_is_rejected_is_not_counted(run, tmp_path, monkeypatch):
     state = {"clock": "stepped", "state_dir": str(tmp_path)}
     bad_port = {"can": {"channel": "off"}, "serial": {"port": "/dev/no_such"}}
 
@@ -291,7 +291,7 @@ def test_a_start_that_is_refused_is_not_counted(run, tmp_path, monkeypatch):
     assert run(scenario, run=state) == 3
 
 
-def test_a_camera_beyond_its_parameters_is_refused_and_all_is_given_back(run, tmp_path, monkeypatch):
+def test_a_camera_beyond_its_parameters_is_rejected_and_all_is_given_back(run, tmp_path, monkeypatch):
     link = tmp_path / "tty"
     links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
     state = {"clock": "stepped", "state_dir": str(tmp_path)}
@@ -310,7 +310,7 @@ def test_a_camera_beyond_its_parameters_is_refused_and_all_is_given_back(run, tm
     assert run(scenario, run=state, links=links) == 1
 
 
-def test_a_symlink_in_use_is_refused_and_stays(run, tmp_path):
+def test_a_symlink_in_use_is_rejected_and_stays(run, tmp_path):
     link = tmp_path / "tty"
     links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
 
@@ -326,7 +326,7 @@ def test_a_symlink_in_use_is_refused_and_stays(run, tmp_path):
     assert not link.is_symlink()
 
 
-def test_a_truth_log_that_cannot_be_written_is_refused(run, tmp_path):
+def test_a_truth_log_that_cannot_be_written_is_rejected(run, tmp_path):
     async def scenario(_emulation, _line):
         pytest.fail("started")
 

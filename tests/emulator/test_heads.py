@@ -73,7 +73,7 @@ def test_the_control_channel_commands_each_head_and_changes_the_truth_of_all(run
     )
     assert (first["heads"], first["faults"], second["faults"]) == (2, {}, {"device": {"stuck": True}})
     assert np.abs(np.array(truths)) == pytest.approx(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), abs=1e-9)
-    assert bad == {"ok": False, "error": "head: 3 given, must be 1 to 2"}
+    assert bad == {"ok": False, "error": "head: must be 1 to 2, not 3"}
 
 
 def test_heads_on_the_real_clock_expose_by_themselves(run):

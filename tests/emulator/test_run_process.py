@@ -1,4 +1,4 @@
-"""`starhil run` as a process of its own: ready line, end, bad input, and the same bytes for the same run."""
+"""`starhil run` as a separate process: ready line, end, bad input, and the same bytes for the same run."""
 
 import json
 import math

@@ -23,7 +23,7 @@ SETTINGS = {
 
 
 class Peer:
-    """Reads a port in a thread of its own, slowly."""
+    """Reads a port in its own thread, slowly."""
 
     def __init__(self, path):
         self.fd = os.open(path, os.O_RDWR | os.O_NOCTTY)

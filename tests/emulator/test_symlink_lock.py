@@ -11,7 +11,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.symlink_lock import lock_symlink
 
 
-def test_a_claimed_path_is_refused_by_every_spelling_and_free_again_after(tmp_path):
+def test_a_claimed_path_is_rejected_by_every_spelling_and_free_again_after(tmp_path):
     path = tmp_path / "tty"
     (tmp_path / "folder").mkdir()
     with lock_symlink(path):

@@ -100,7 +100,7 @@ def test_the_vector_part_alone_gives_the_attitude(ra, dec, roll):
 @pytest.mark.parametrize(
     "values", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)]
 )
-def test_what_is_no_attitude_is_refused(values):
+def test_what_is_no_attitude_is_rejected(values):
     with pytest.raises(BenchError, match="quaternion"):
         unit(values)
 

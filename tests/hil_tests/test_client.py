@@ -58,7 +58,7 @@ def test_a_telecommand_reaches_the_device_as_it_was_given(pair):
 
 
 @pytest.mark.parametrize("code", [ErrorCode.INVALID_PARAMETER, ErrorCode.BUSY, ErrorCode.SEQUENCE])
-def test_a_refusal_is_an_error_of_its_own_with_the_published_code(pair, code):
+def test_a_refusal_is_an_error_with_the_published_code(pair, code):
     device, client = pair
     device.refuse["save_image"] = code
     device.refuse["rates"] = code
@@ -71,7 +71,7 @@ def test_a_refusal_is_an_error_of_its_own_with_the_published_code(pair, code):
     assert client.transactions[-1].outcome == code.name.lower()
 
 
-def test_names_that_are_not_in_the_definition_are_refused_before_anything_is_sent(pair):
+def test_names_that_are_not_in_the_definition_are_rejected_before_anything_is_sent(pair):
     device, client = pair
     with pytest.raises(ProtocolError, match="set_mode"):
         client.command("set_mod", mode="standby")
@@ -214,7 +214,7 @@ def test_bytes_and_frames_can_be_sent_as_they_stand(pair):
         assert send_and_listen(client, ("1F7F", "811FFF"), 0.0, answer, PATIENCE_S) == answer
 
 
-def test_ports_that_cannot_be_had_are_refused_in_one_line():
+def test_ports_that_are_not_available_are_rejected_in_one_line():
     with pytest.raises(ProtocolError, match="/dev/no-such-port"):
         ObcClient.open(serial="/dev/no-such-port")
     with pytest.raises(ProtocolError, match="starhil hub"):

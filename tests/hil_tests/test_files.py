@@ -32,7 +32,7 @@ def test_an_image_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_an_image_of_another_size_is_refused():
+def test_an_image_of_another_size_is_rejected():
     with pytest.raises(BenchError, match="4096 bytes, not 10"):
         encode_png(bytes(10), 64, 64)
 
@@ -46,7 +46,7 @@ def test_a_bmp_file_is_read_as_opencv_wrote_it(width):
 
 
 @pytest.mark.parametrize("data", [b"", b"BM", b"PNG" * 50, b"BM" + bytes(100)])
-def test_what_is_no_bmp_is_refused(data):
+def test_what_is_no_bmp_is_rejected(data):
     with pytest.raises(BenchError):
         decode_bmp(data)
 
@@ -125,7 +125,7 @@ def test_frames_are_written_as_they_are_read(text):
 @pytest.mark.parametrize(
     "text", ["", "07360104", "#00", "12#00", "123#0", "123#000102030405060708", "GGG#00", "FFFFFFFF#"]
 )
-def test_what_is_no_frame_is_refused(text):
+def test_what_is_no_frame_is_rejected(text):
     with pytest.raises(BenchError):
         parse_frame(text)
 

@@ -30,7 +30,7 @@ def run_command(*words: object):
 @pytest.mark.parametrize(
     "words", [("conformance", "--junit"), ("conformance", "--html"), ("session", "first_light", "--junit")]
 )
-def test_a_report_that_cannot_be_written_is_refused_before_the_run(words, tmp_path, monkeypatch):
+def test_a_report_that_cannot_be_written_is_rejected_before_the_run(words, tmp_path, monkeypatch):
     def never(*_arguments, **_options):
         raise AssertionError("the run began")
 

@@ -203,12 +203,12 @@ def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
     assert expectation.mismatch(ones, {"map": ones}) is not None
 
 
-def test_values_that_a_honest_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):
+def test_values_that_a_correct_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):
     script = load("[[step]]\ncommand = 'set_mode'\nwith = { mode = 77 }\nrefused = 'invalid_parameter'")
     assert script.steps[0].action.refused == "invalid_parameter"
 
 
-def test_a_missing_file_is_refused_with_near_names(tmp_path):
+def test_a_missing_file_is_rejected_with_near_names(tmp_path):
     with pytest.raises(ScriptError, match="first_light"):
         find_script(Path("first_lite"))
     with pytest.raises(ScriptError, match="cannot be read"):

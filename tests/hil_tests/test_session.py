@@ -325,7 +325,7 @@ def test_only_an_emulator_of_its_own_can_be_restarted(play):
     assert "use --start" in result.results[0].detail
 
 
-def test_a_link_that_the_bench_lacks_is_refused(device):
+def test_a_link_that_the_bench_lacks_is_rejected(device):
     with (
         Bench(LinkOptions(serial=device.open_serial()), ICD) as bench,
         pytest.raises(BenchError, match="no can link"),
@@ -378,12 +378,12 @@ def test_the_command_prints_json_alone_and_exits_1_when_a_step_fails(device, tmp
     ("words", "message"),
     [
         (["nothing"], "no such session script"),
-        (["first_light"], "no link given"),
+        (["first_light"], "no link: use"),
         (["first_light", "--serial", "auto"], "needs --start"),
         (["first_light", "--serial", "/dev/ttyS77", "--dialect", "d"], "must be a, b or c"),
     ],
 )
-def test_bad_input_is_refused(words, message, tmp_path):
+def test_bad_input_is_rejected(words, message, tmp_path):
     outcome = run_command(*words, "--log", tmp_path / "log")
     assert isinstance(outcome.exception, BenchError)
     assert message in str(outcome.exception)

@@ -94,7 +94,7 @@ def test_safe_cases_change_nothing(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "no link given"),
+        ([], "no link: use"),
         (["nothing.such", "--serial", "/dev/null"], "no conformance case matches 'nothing.such'"),
         (["--serial", "/dev/no-such-tty"], "/dev/no-such-tty"),
         (["--serial", "auto"], "needs --start"),

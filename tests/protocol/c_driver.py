@@ -15,10 +15,12 @@ from typing import Any, Self
 import pytest
 
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.export.c import files, prefix_of
 from starhil.protocol.export.c.rows import member_name
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.serial_stack import ComposedStack, SerialStack, build_serial_stack
+from starhil.protocol.serial_interface import SerialStack
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.values import Value
 
 FLAGS = [

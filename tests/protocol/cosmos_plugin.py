@@ -58,7 +58,7 @@ class Plugin:
         return next(words[1:] for words in self.lines if words[0] == keyword)
 
     def protocol(self) -> Any:
-        """Return the protocol that plugin.txt asks for; without COSMOS on a base class of its own."""
+        """Return the protocol that plugin.txt asks for; without COSMOS on a stand-in for its base class."""
         direction, file, *arguments = self.arguments("PROTOCOL")
         assert direction == "READ_WRITE"
         return self.protocol_class(file)(*arguments)

@@ -108,7 +108,7 @@ def test_segments_of_any_size_are_full_but_the_last(size: int) -> None:
         assert len(parts[-1]) == (size - 1) % 7 + 2
 
 
-def test_what_the_counter_cannot_tell_is_refused() -> None:
+def test_what_the_counter_cannot_express_is_rejected() -> None:
     with pytest.raises(ProtocolError, match="does not fit"):
         segment(bytes(MAX_MESSAGE + 1))
 
@@ -301,7 +301,7 @@ def test_identifiers_come_apart_and_together(raw: int) -> None:
 
 
 @pytest.mark.parametrize("parts", [(32, 0, 0, 0), (0, 256, 0, 0), (0, 0, -1, 0), (0, 0, 0, 300)])
-def test_parts_that_do_not_fit_an_identifier_are_refused(parts: tuple[int, int, int, int]) -> None:
+def test_parts_that_do_not_fit_an_identifier_are_rejected(parts: tuple[int, int, int, int]) -> None:
     with pytest.raises(ProtocolError):
         CanId(*parts).pack()
 
@@ -316,7 +316,7 @@ def test_parts_that_do_not_fit_an_identifier_are_refused(parts: tuple[int, int, 
         ({"id": 1, "data": b"x", "remote": True}, "remote frame with data"),
     ],
 )
-def test_what_cannot_be_a_frame_is_refused(arguments: dict[str, object], message: str) -> None:
+def test_what_cannot_be_a_frame_is_rejected(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ProtocolError, match=message):
         CanFrame(**arguments)  # type: ignore[arg-type]
 
@@ -359,6 +359,6 @@ def test_candump_lines_come_back(one: CanFrame) -> None:
         "(1.0) can0 123##0",
     ],
 )
-def test_other_lines_are_refused(line: str) -> None:
+def test_other_lines_are_rejected(line: str) -> None:
     with pytest.raises(ProtocolError):
         parse_candump(line)

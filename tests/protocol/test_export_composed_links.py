@@ -10,15 +10,16 @@ from typing import Any
 
 import pytest
 
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export.cosmos_plugin.composed import link_text
 from starhil.protocol.export.row_key import row_key
 from starhil.protocol.icd import Names, load_unit
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import ComposedStack, build_stack
+from starhil.protocol.serial_stack import build_stack
 from tests.protocol.c_driver import CDriver, hex_or_none
-from tests.protocol.test_serial_stack import REPLIES, REQUESTS, STACKS
+from tests.protocol.composed_links import REPLIES, REQUESTS, STACKS
 
 
 def python_link(name: str) -> Any:
@@ -190,7 +191,7 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
         {"framing": {"kind": "slip"}, "check": {"kind": "custom", "name": "mine"}},
     ],
 )
-def test_code_of_a_plugin_is_refused(link: dict[str, Any]) -> None:
+def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     model = SerialLinkModel.model_validate({**link, "request_header": [{"role": "id", "type": "u8"}]})
     custom: Any = {"mine": STACKS["nsp"].framing}
     stack = build_stack(model, framings=custom, checks={"mine": lambda _data: b""})

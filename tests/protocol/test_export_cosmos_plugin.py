@@ -95,6 +95,6 @@ def test_a_command_waits_for_the_reply_to_the_one_before_but_not_for_ever(tmp_pa
     assert link.answered.is_set()
 
 
-def test_an_unknown_dialect_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_dialect_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="dialect d: must be a, b or c"):
         Plugin(ICD, tmp_path, dialect="d").protocol()

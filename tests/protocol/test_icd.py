@@ -243,7 +243,7 @@ REFUSED: list[tuple[str, dict[str, Value], str]] = [
     ("set_unix_time", {"seconds": 1, "milliseconds": 1000}, "milliseconds: 1000 is outside 0 to 999 ms"),
     ("set_unix_time", {"seconds": -1}, "seconds: -1 is outside"),
     ("set_unix_time", {"seconds": 1.5}, "not a whole number"),
-    ("set_unix_time", {}, "set_unix_time.seconds: no value given"),
+    ("set_unix_time", {}, "set_unix_time.seconds: missing value"),
     ("set_mode", {"mode": "error"}, "not one of standby"),
     ("set_mode", {"mode": 9}, "not one of standby"),
     ("set_mode", {"mood": "standby"}, "set_mode.mood: no such field"),
@@ -257,7 +257,7 @@ REFUSED: list[tuple[str, dict[str, Value], str]] = [
 
 
 @pytest.mark.parametrize(("name", "values", "text"), REFUSED)
-def test_values_against_the_definition_are_refused_by_row_and_field(
+def test_values_against_the_definition_are_rejected_by_row_and_field(
     name: str, values: dict[str, Value], text: str
 ) -> None:
     with pytest.raises(FieldError, match=text) as caught:
@@ -266,7 +266,7 @@ def test_values_against_the_definition_are_refused_by_row_and_field(
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_telecommand_with_a_number_that_is_none_is_refused(value: float) -> None:
+def test_a_telecommand_with_a_number_that_is_none_is_rejected(value: float) -> None:
     data = struct.pack("<Bd", 1, value)
     with pytest.raises(FieldError, match=r"set_parameter\.value"):
         ICD.telecommands["set_parameter"].decode(data)
@@ -387,7 +387,7 @@ def test_parameters_take_numbers_as_the_wire_carries_them(
         ("update_rate", 100.001), ("can_address", 255),
     ],
 )  # fmt: skip
-def test_parameters_refuse_what_is_outside_and_say_why(name: str, value: Value) -> None:
+def test_parameters_reject_what_is_outside_and_say_why(name: str, value: Value) -> None:
     with pytest.raises(MessageError, match=f"^{name}: ") as caught:
         ICD.parameters[name].check(value)
     assert caught.value.code is ErrorCode.INVALID_PARAMETER
@@ -451,7 +451,7 @@ BAD_DEFINITIONS = [
     [(text, message) for _, text, message in BAD_DEFINITIONS],
     ids=[name for name, _, _ in BAD_DEFINITIONS],
 )
-def test_a_bad_definition_is_refused_by_file_and_row(tmp_path: Path, text: str, message: str) -> None:
+def test_a_bad_definition_is_rejected_by_file_and_row(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "bad.toml"
     file.write_text(text)
     with pytest.raises(IcdError, match=message) as caught:

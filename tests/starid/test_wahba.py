@@ -137,10 +137,10 @@ def test_covariance_of_stars_on_the_axes() -> None:
 @pytest.mark.parametrize(
     ("body", "reference", "weights", "message"),
     [
-        ([[0, 0, 1]], [[0, 0, 1]], None, "1 star given"),
+        ([[0, 0, 1]], [[0, 0, 1]], None, "1 star; an attitude needs"),
         ([[0, 0, 1]] * 3, [[1, 0, 0]] * 3, None, "undetermined"),
         ([[0, 0, 1], [0, 0, -1]], [[1, 0, 0], [-1, 0, 0]], None, "undetermined"),
-        ([[0, 0, 1], [0, 1, 0]], [[1, 0, 0]], None, "as many of each"),
+        ([[0, 0, 1], [0, 1, 0]], [[1, 0, 0]], None, "their numbers must be equal"),
         ([[0, 0, 1], [0, 1]], [[1, 0, 0]], None, "directions"),
         ([[0, 0, 0], [0, 1, 0]], [[1, 0, 0], [0, 1, 0]], None, "not zero"),
         ([[0, 0, math.nan], [0, 1, 0]], [[1, 0, 0], [0, 1, 0]], None, "finite"),

@@ -11,11 +11,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.export.c import rows
 from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.row_key import key_of
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.serial_stack import ComposedStack, SerialStack, build_serial_stack
+from starhil.protocol.serial_interface import SerialStack
+from starhil.protocol.serial_stack import build_serial_stack
 
 _FUNCTION: Final = re.compile(r"^static .*?\b(\w+)\(", re.MULTILINE)
 
@@ -99,5 +101,5 @@ _USE: Final = (
     "Made by starhil from the interface definition; do not edit. docs/c-export.md shows its use.\n\n"
     "A row has an identifier, a size and, if it carries values, a structure with {prefix}_..._encode and\n"
     "{prefix}_..._decode. Values are physical: scaled by the row's scale, in the unit named at the member. `float` and\n"
-    "`double` must be those of IEEE 754. Nothing here keeps state of its own, allocates or waits."
+    "`double` must be those of IEEE 754. Nothing here keeps state, allocates or waits."
 )

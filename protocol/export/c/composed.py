@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header, HeaderField
 from starhil.protocol.export.row_key import row_key
 from starhil.protocol.link_schema import (
@@ -19,7 +20,7 @@ from starhil.protocol.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.messages import RequestKind
-from starhil.protocol.serial_stack import ComposedStack, RowShape
+from starhil.protocol.serial_interface import RowShape
 from starhil.protocol.values import IcdError
 
 _MARKS: Final = 8

@@ -12,12 +12,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.export import cosmos
 from starhil.protocol.export.cosmos_plugin.composed import link_text
 from starhil.protocol.export.row_key import key_bits, key_of
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import BURST_ID
-from starhil.protocol.serial_stack import ComposedStack, SerialStack, build_serial_stack
+from starhil.protocol.serial_interface import SerialStack
+from starhil.protocol.serial_stack import build_serial_stack
 
 TARGET: Final = "<%= target_name %>"
 """Name of the target, which COSMOS fills in when the plugin is installed."""

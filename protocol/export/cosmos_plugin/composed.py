@@ -8,6 +8,7 @@ from pathlib import Path
 from pprint import pformat
 from typing import Any
 
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header
 from starhil.protocol.export.row_key import CLASS_SHIFT, row_key
 from starhil.protocol.link_schema import (
@@ -23,7 +24,6 @@ from starhil.protocol.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.messages import RequestKind
-from starhil.protocol.serial_stack import ComposedStack
 from starhil.protocol.values import IcdError
 
 

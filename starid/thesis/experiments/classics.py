@@ -83,7 +83,7 @@ _SKY_WORDS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars 
 _SENSOR: Final = (12.0, 1024, 6.0)
 """Field in degrees, pixels and faintest star of the sensor that most of the papers simulate."""
 
-_NOTE: Final = """The thesis prints the competitors' figures from two papers, each with a simulator, a sensor and a catalogue of its own; it never ran
+_NOTE: Final = """The thesis prints the competitors' figures from two papers, each with its own simulator, sensor and catalogue; it never ran
 them. Here every algorithm is run, as published and without the project's verification, on the frames that the thesis tests itself
 with: its centres, its stars (Hp ≥ 11.5), its noise. A frame counts as identified if the boresight is within {limit}° of the
 truth, as in the thesis; "wrong" are answers farther off, the rest gave none. Each is given the σ of the position noise, as its paper assumes.

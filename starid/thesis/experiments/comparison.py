@@ -26,11 +26,6 @@ def rounding(digits: int, unit: str = "") -> Tolerance:
     return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
 
 
-def last_digit(digits: int, unit: str = "") -> Tolerance:
-    """One unit of the last printed digit, for a value that was itself made of rounded ones."""
-    return 1.001 * 10.0**-digits, f"one in the last digit, {10.0**-digits:g}{space_before(unit)}{unit}"
-
-
 def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
     """Difference of two shares (percent) that were each counted in so many trials, at so many standard errors.
 

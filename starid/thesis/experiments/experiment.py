@@ -127,7 +127,7 @@ class Experiment:
     parts
         Parts for given parameters.
     work
-        Computes a part, in a process of its own; it must be a function of a module.
+        Computes a part, in a separate process; it must be a function of a module.
     finish
         Makes tables, figures and rows from the results of all parts, by key.
     full, quick

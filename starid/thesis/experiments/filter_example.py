@@ -1,4 +1,4 @@
-"""Pictures of the filter's input and of its cluster: figures 3.2, 5.3 and 5.4, and the example of section 6.2.1."""
+"""Plots of the filter's input and of its cluster: figures 3.2, 5.3 and 5.4, and the example of section 6.2.1."""
 
 from __future__ import annotations
 

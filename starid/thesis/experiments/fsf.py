@@ -415,7 +415,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
 
 
 _NOTE: Final = """Seven stars (Hp < 3), circular field of 21°; every moved frame is compared with the first, complete one, which
-has false stars of its own but no noise. This reading alone gives the published numbers of true and of false stars in the
+has its own false stars but no noise. This reading alone gives the published numbers of true and of false stars in the
 field, about 6 617 and 976 per false star. "In the cluster" is the rule as printed: whoever appears in the main cluster is a
 star, *as printed*. *As the author ran it* wants two objects to name each other most and at least twice, "matched": only so does the
 precision come out, in nearly all sets; under the rule as printed one chance member of the cluster lets a false star pass.

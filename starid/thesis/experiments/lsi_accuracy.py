@@ -49,7 +49,7 @@ compared" goes one step further: at each such place, of up to 256 cells, the obs
 looked for among the catalogue's; the first place with nine in ten of them wins (databases from 99 % on)."""
 
 _LIMIT_NOTE: Final = """What limits the sub-cell search: while no star crosses the rim, n, A and σ_A are constant, and only
-r and σ_r tell where in the cell the frame is — two equations for two unknowns, with more than one solution in places. In
+r and σ_r give where in the cell the frame is — two equations for two unknowns, with more than one solution in places. In
 {ambiguous:.1f} % of the off-grid frames the answer is more than 0.01° away although all five features agree there to
 {agrees:g} on the scale 0 … 100: five features without the polar angle do not single out a frame. In {lost:.1f} % no start
 reached agreement. Neither more neighbours nor a finer grid mends the first; comparing the stars themselves does: {stars:.1f} % are then

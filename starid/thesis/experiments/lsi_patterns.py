@@ -1,4 +1,4 @@
-"""Does ε_ψ tell of a bad answer? Patterns 6.20–6.27 and B, and errors over thresholds of ε_ψ, 6.28–6.30 and C."""
+"""Does ε_ψ reveal a bad answer? Patterns 6.20–6.27 and B, and errors over thresholds of ε_ψ, 6.28–6.30 and C."""
 
 from __future__ import annotations
 

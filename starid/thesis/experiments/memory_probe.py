@@ -1,4 +1,4 @@
-"""A process of its own that loads a database, identifies with it, and says on stdout how much memory it took."""
+"""A separate process that loads a database, identifies with it, and says on stdout how much memory it took."""
 
 from __future__ import annotations
 

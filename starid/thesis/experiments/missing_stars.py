@@ -50,7 +50,7 @@ _WORDS: Final = {
     **{f"false-{n}": f"{n} false star{'s' if n > 1 else ''}" for n in (1, 2, 3)},
 }
 
-_NOTE: Final = f"""*Divided field*: nine circles of {_FRAME_DEG:g}° in the field of 40°, each searched in a database of its own width (step
+_NOTE: Final = f"""*Divided field*: nine circles of {_FRAME_DEG:g}° in the field of 40°, each searched in a database of that width (step
 {_STEP_DEG:g}°, 6 300 kB), and the boresight that most of them agree on within a degree; where no two agree there is no answer. A missing or a
 false star spoils the circles that hold it and leaves the others. *Put back*: in sequences the stars of the frame before that the
 measured motion carries into the field, and that are not seen there, are put back before the features are made; the two frames are

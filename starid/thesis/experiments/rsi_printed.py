@@ -39,13 +39,11 @@ _MARGIN_DEG: Final = 1.6
 _SIDE_DEG: Final = 3.96
 _FIRST: Final = 1
 _TAUS: Final = (LSI_ONLY, 0.5, 1.0)
-_READINGS: Final = ("author", "printed", "rigid")
 _WORDS: Final = {
     "author": "as the author ran it",
     "printed": "as printed",
     "rigid": "as printed, rigid motion",
 }
-_STATISTICS: Final = ("f_mean", "f_sigma", "theta_mean", "theta_sigma", "psi_mean", "psi_sigma")
 
 _NOTE: Final = """The clean rows of tables H.1 and H.2 are compared on the frames of figure 6.1, moved off the grid, each searched in the region of
 table 6.8 about its true place: which frames the thesis's sequences held is not known. *As the author ran it* is MATLAB's `lasso` on five

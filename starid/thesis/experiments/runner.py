@@ -169,7 +169,7 @@ def run(
     experiments
         Which, in the order of the report.
     folder
-        Where all results go, each experiment into a folder of its own.
+        Where all results go, each experiment into its own folder.
     quick
         Use the quick parameters.
     seed

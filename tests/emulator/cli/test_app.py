@@ -1,4 +1,4 @@
-"""What `starhil` does with errors that no command has put into its own words."""
+"""How `starhil` reports errors that no command has reported itself."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_folder_where_a_file_goes_is_named(
         ("campaign lost-in-space --frames 1.5", "campaign lost-in-space: invalid value for '--frames'"),
     ],
 )
-def test_a_refused_option_is_one_line_and_status_2(
+def test_a_rejected_option_is_one_line_and_status_2(
     arguments: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])

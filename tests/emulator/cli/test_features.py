@@ -78,7 +78,7 @@ def test_spherical_features_say_their_unit():
         (("database", "info", "no-such-file"), "cannot be read"),
     ],
 )
-def test_what_is_refused(arguments, words):
+def test_what_is_rejected(arguments, words):
     result = call(*arguments)
     assert isinstance(result.exception, EmulatorError | StaridError)
     assert words in str(result.exception)

@@ -100,7 +100,7 @@ def test_noise_alone_is_no_attitude(tmp_path):
     assert found["ra_deg"] is None
 
 
-def test_an_image_of_another_size_is_refused(tmp_path):
+def test_an_image_of_another_size_is_rejected(tmp_path):
     image = tmp_path / "small.png"
     cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (480, 640)).astype(np.uint8))
     result = starhil("identify", str(image))
@@ -117,7 +117,7 @@ def test_an_image_of_another_size_is_refused(tmp_path):
         (["--fov", "11", "--model", "fisheye"], "pinhole or equidistant"),
     ],
 )
-def test_options_that_name_no_camera_are_refused(tmp_path, options, named):
+def test_options_that_name_no_camera_are_rejected(tmp_path, options, named):
     image = tmp_path / "dark.png"
     cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (64, 64)).astype(np.uint8))
     result = starhil("identify", str(image), *options)
@@ -125,7 +125,7 @@ def test_options_that_name_no_camera_are_refused(tmp_path, options, named):
     assert named in str(result.exception)
 
 
-def test_colour_is_refused_but_where_the_image_may_come_from_any_camera(tmp_path):
+def test_colour_is_rejected_but_where_the_image_may_come_from_any_camera(tmp_path):
     image = tmp_path / "colour.png"
     noise = np.random.default_rng(2).normal(60, 4, (100, 120, 3)).astype(np.uint8)
     cv2.imwrite(str(image), noise)
@@ -139,7 +139,7 @@ def test_colour_is_refused_but_where_the_image_may_come_from_any_camera(tmp_path
     assert "channels" in str(starhil("identify", str(image), "--fov", "11", "--refuse-colour").exception)
 
 
-def test_a_tolerance_of_the_automatic_field_is_refused(tmp_path):
+def test_a_tolerance_of_the_automatic_field_is_rejected(tmp_path):
     image = tmp_path / "sky.png"
     cv2.imwrite(str(image), np.arange(64 * 64, dtype=np.uint16).reshape(64, 64))
     result = starhil("identify", str(image), "--fov", "auto", "--fov-tolerance", "0")
@@ -176,7 +176,7 @@ def test_the_aberration_of_a_dated_image_is_corrected(tmp_path):
         (["--observer-velocity", "0,0,3e8"], "at most 1e+06"),
     ],
 )
-def test_a_bad_date_or_velocity_is_refused(tmp_path, options, said):
+def test_a_bad_date_or_velocity_is_rejected(tmp_path, options, said):
     image = tmp_path / "dark.png"
     cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (937, 937)).astype(np.uint8))
     result = starhil("identify", str(image), *options)

@@ -293,7 +293,7 @@ def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):
                 "request: do must be one of"
                 in (await page.ask(do="control", request={"do": "quit"}))["error"]
             )
-            assert (await page.ask(do="control", request=3))["error"] == "request: an object is needed"
+            assert (await page.ask(do="control", request=3))["error"] == "request: must be an object"
             assert "do: must be one of" in (await page.ask(do="fly"))["error"]
             assert (await page.ask(do="control", request={"do": "clear_faults"}))["faults"] == {}
             slew = await page.ask(do="slew", to={"star": "rigel"}, max_rate_deg_s=2.0)

@@ -54,8 +54,8 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
             assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
             for wrong, said in (
-                ({}, "truth: an object is needed, with the keys of [truth] in a profile"),
-                ({"truth": 3}, "truth: an object is needed, with the keys of [truth] in a profile"),
+                ({}, "truth: must be an object with the keys of [truth] in a profile"),
+                ({"truth": 3}, "truth: must be an object with the keys of [truth] in a profile"),
                 ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind, mount"),
                 ({"truth": {}}, "truth.kind: must be one of '42', 'file', 'fixed', 'live', 'rate', 'slew'"),
                 (
@@ -65,7 +65,7 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             ):
                 assert await control.do("set_truth", **wrong) == {"ok": False, "error": said}
             bad = await control.do("set_truth", truth={"kind": "rate"})
-            assert bad == {"ok": False, "error": "truth.rate_deg_s: missing; give it"}
+            assert bad == {"ok": False, "error": "truth.rate_deg_s: missing"}
             assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
             assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
 
@@ -162,7 +162,7 @@ def test_bad_requests_are_answered_and_the_next_good_one_too(run, line):
         ),
     ],
 )
-def test_a_truth_that_cannot_be_is_refused_and_the_connection_stays(run, truth, said):
+def test_a_truth_that_cannot_be_is_rejected_and_the_connection_stays(run, truth, said):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             answer = await control.do("set_truth", truth=truth)

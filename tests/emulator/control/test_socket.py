@@ -80,7 +80,7 @@ def test_a_socket_that_a_killed_emulator_left_is_replaced(run, tmp_path):
     assert not path.exists()
 
 
-def test_a_path_in_use_is_refused_and_left_alone(run, tmp_path):
+def test_a_path_in_use_is_rejected_and_left_alone(run, tmp_path):
     path, text = tmp_path / "control", tmp_path / "text"
     text.write_text("of great worth")
     options = RunOptions(control=f"unix:{path}")
@@ -113,7 +113,7 @@ def test_a_path_in_use_is_refused_and_left_alone(run, tmp_path):
         ("/tmp/" + "x" * 200, "too long"),
     ],
 )
-def test_a_path_that_cannot_be_is_refused_in_one_line(run, path, said):
+def test_a_path_that_cannot_be_is_rejected_in_one_line(run, path, said):
     with pytest.raises(EmulatorError, match=said) as refusal:
         run(lambda *_: None, options=RunOptions(control=f"unix:{path}"))
     assert "\n" not in str(refusal.value)
@@ -157,7 +157,7 @@ def test_a_line_that_is_too_long_is_answered_and_the_channel_goes_on(run, size):
     run(scenario)
 
 
-def test_a_key_given_twice_is_refused(run):
+def test_a_key_given_twice_is_rejected(run):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             for line in (

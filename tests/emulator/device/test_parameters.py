@@ -138,7 +138,7 @@ def test_camera_constants_become_defaults_unless_set(make_bench):
 @pytest.mark.parametrize(
     "parameters", [{"exposur": 3}, {"exposure": -1}, {"exposure": "long"}, {"exposure": [1]}]
 )
-def test_a_profile_with_bad_parameters_is_refused(make_bench, parameters):
+def test_a_profile_with_bad_parameters_is_rejected(make_bench, parameters):
     with pytest.raises(EmulatorError, match="parameters"):
         make_bench(Profile(parameters=parameters))
 
@@ -150,7 +150,7 @@ def test_a_profile_with_bad_parameters_is_refused(make_bench, parameters):
         ({"nope": 1}, "profile bench: parameters: no parameter named 'nope'"),
     ],
 )
-def test_a_bad_default_is_refused_with_the_name_of_its_profile(make_bench, given, said):
+def test_a_bad_default_is_rejected_with_the_name_of_its_profile(make_bench, given, said):
     with pytest.raises(EmulatorError) as refusal:
         make_bench(Profile(name="bench", parameters=given))
     assert str(refusal.value).startswith(said)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
@@ -251,6 +252,8 @@ def test_a_plugin_adds_quantities_and_actions(unit, tmp_path):
     assert bench.read("plugged")["t"] == 400
 
 
-def test_a_unit_whose_rows_are_bound_to_nothing_does_not_start(unit):
+def test_a_unit_whose_rows_are_bound_to_nothing_does_not_start(tmp_path):
+    text = HEAD + row("telemetry", 1, "bare", '{ name = "a", type = "u8" }') + START
+    (tmp_path / "unit.toml").write_text(text, encoding="utf-8")
     with pytest.raises(EmulatorError, match="telemetry bare: field a: no `value`"):
-        unit(HEAD + row("telemetry", 1, "bare", '{ name = "a", type = "u8" }'))
+        Emulation(Profile(name="x", unit=str(tmp_path)))

@@ -111,8 +111,8 @@ def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photograp
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("images.folder=empty", "holds no PNG"),
-        ("images.folder=missing", "is no folder"),
+        ("images.folder=empty", "contains no PNG"),
+        ("images.folder=missing", "is not a folder"),
         ("camera.width=512", "400×320 pixels, the camera of the profile has 512×320"),
         ("images.dark=other.png", "dark frame of 20×20"),
     ],

@@ -96,7 +96,7 @@ def test_the_way_back_to_what_is_in_force_takes_no_time(factory, beside):
     factory.go.set()
 
 
-def test_what_cannot_be_made_is_refused_until_something_else_is_asked_for(factory, beside):
+def test_what_cannot_be_made_is_rejected_until_something_else_is_asked_for(factory, beside):
     impossible = replace(DEEP, options=(("limiting_magnitude", -1.0),))
     assert beside.get(impossible) == (Made(DEEP), False)
     factory.go.set()
@@ -125,11 +125,11 @@ def test_without_a_thread_each_one_is_waited_for(factory):
             r"identifier\.nonsense: no option of the algorithm geometric; known: blend_px, cache",
         ),
         ("geometric", "catalog", 1, "no option"),
-        ("geometric", "blend_px", "x", r"identifier\.blend_px: 'x' given, float needed"),
-        ("geometric", "blend_px", True, "True given, float needed"),
-        ("lsi", "neighbours", 2.5, "2.5 given, int needed"),
-        ("lsi", "solver", 3, "3 given, str needed"),
-        ("rsi", "limiting_magnitude", "x", "'x' given, float needed"),
+        ("geometric", "blend_px", "x", r"identifier\.blend_px: must be float, not 'x'"),
+        ("geometric", "blend_px", True, "must be float, not True"),
+        ("lsi", "neighbours", 2.5, "must be int, not 2.5"),
+        ("lsi", "solver", 3, "must be str, not 3"),
+        ("rsi", "limiting_magnitude", "x", "must be float, not 'x'"),
     ],
 )
 def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, value, said):

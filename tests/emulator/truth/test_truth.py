@@ -288,7 +288,7 @@ def test_bad_messages_are_counted_and_named_and_change_nothing(text, said):
     assert apart_arcsec(live.state(0.0).attitude, ORION) < MILLIARCSECOND
 
 
-def test_messages_that_do_not_rise_are_refused():
+def test_messages_that_do_not_rise_are_rejected():
     live = LiveTruth(EAST)
     live.receive(line(5.0, ORION), 0.0)
     assert not live.receive(line(5.0, EAST), 0.1)
@@ -481,7 +481,7 @@ def test_a_path_that_no_file_can_have_is_named():
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.one_of(st.binary(max_size=60), st.text(max_size=60)))
-def test_any_line_is_taken_or_refused_by_name(text):
+def test_any_line_is_taken_or_rejected_by_name(text):
     live = LiveTruth(EAST)
     assert live.receive(text, 0.0) == (live.refused == 0)
     assert live.accepted + live.refused == 1

@@ -15,8 +15,9 @@ import pytest
 
 import starhil.protocol.canopen
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
-from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import CaseFailed
+from starhil.hil_tests.conformance.runner import run_case
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import (
     CanopenSlave,
@@ -231,7 +232,7 @@ def run_conformance():
         probe = CanopenProbe(bus, NODE, import_eds(eds, NODE), eds)
         outcomes: dict[str, set[str]] = {"passed": set(), "failed": set(), "skipped": set()}
         for case in CANOPEN_CASES:
-            outcomes[run_canopen_case(probe, case).status].add(case.id)
+            outcomes[run_case(probe, case).status].add(case.id)
         return outcomes
 
     return run

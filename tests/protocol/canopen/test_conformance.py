@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
+from starhil.hil_tests.conformance.runner import run_case
 
 
 def mutant_names() -> list[str]:
@@ -22,7 +23,7 @@ def mutant_names() -> list[str]:
 
 @pytest.mark.parametrize("case", CANOPEN_CASES, ids=lambda case: case.id)
 def test_our_slave_passes(simulated_probe, case):
-    outcome = run_canopen_case(simulated_probe(), case)
+    outcome = run_case(simulated_probe(), case)
     assert (outcome.status, outcome.expected, outcome.seen) == ("passed", "", ""), "\n".join(outcome.log)
 
 
@@ -31,7 +32,7 @@ def test_cases_in_a_row_leave_nothing_behind(simulated_probe):
     failed = [
         case.id
         for case in (*CANOPEN_CASES, *reversed(CANOPEN_CASES))
-        if run_canopen_case(probe, case).status != "passed"
+        if run_case(probe, case).status != "passed"
     ]
     assert failed == []
 
@@ -48,7 +49,7 @@ def test_safe_cases_change_nothing(simulated_probe):
         if case.intrusive:
             continue
         probe = simulated_probe()
-        run_canopen_case(probe, case)
+        run_case(probe, case)
         sent = [line.split(" -> ")[1] for line in probe.log if " -> " in line]
         for frame in sent:
             identifier, _, data = frame.partition("#")
@@ -63,15 +64,15 @@ def test_mutant_is_caught(simulated_probe, mutants, name):
     probe = simulated_probe(mutants.load(mutant))
     likely_first = sorted(CANOPEN_CASES, key=lambda case: case.area != f"canopen.{mutant.area}")
     for case in likely_first:
-        probe.bus.budget = probe.bus.MOST_FRAMES
-        if run_canopen_case(probe, case).status == "failed":
+        probe.port.budget = probe.port.MOST_FRAMES
+        if run_case(probe, case).status == "failed":
             return
     pytest.fail("no case fails")
 
 
 def test_unchanged_copy_is_not_caught(simulated_probe, mutants):
     probe = simulated_probe(mutants.load(None))
-    assert [case.id for case in CANOPEN_CASES if run_canopen_case(probe, case).status != "passed"] == []
+    assert [case.id for case in CANOPEN_CASES if run_case(probe, case).status != "passed"] == []
 
 
 def test_there_are_enough_mutants(mutants):

@@ -49,7 +49,7 @@ DURAND_FAULTS = {
 
 
 class SteppedScheduler(VirtualScheduler):
-    """Runs one entry at a time up to a time, and lets go of entries that are gone."""
+    """Runs one entry at a time up to a time, and drops entries that are gone."""
 
     def cancel(self, entry):
         self._entry_dict.pop(entry, None)

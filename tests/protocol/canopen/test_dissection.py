@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, run_canopen_case
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
+from starhil.hil_tests.conformance.runner import run_case
 from tests.protocol.dissection import dissect
 
 
@@ -12,7 +13,7 @@ from tests.protocol.dissection import dissect
 def recorded(simulated_probe, tmp_path_factory):
     """Who sent each frame of a run of all cases ("->" the tester, "<-" the slave), and how it was dissected."""
     probe = simulated_probe()
-    lines = [line.split(" ", 2) for case in CANOPEN_CASES for line in run_canopen_case(probe, case).log]
+    lines = [line.split(" ", 2) for case in CANOPEN_CASES for line in run_case(probe, case).log]
     path = tmp_path_factory.mktemp("recording") / "can.log"
     path.write_text("".join(f"({float(time):017.6f}) vcan0 {frame}\n" for time, _, frame in lines))
     frames = dissect(path)

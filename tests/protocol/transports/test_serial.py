@@ -299,7 +299,7 @@ def no_terminal(*_args: object, **_options: object) -> NoReturn:
     raise termios.error(errno.EIO, "Input/output error")
 
 
-def test_a_tty_whose_settings_are_refused_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tty_whose_settings_are_rejected_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         master, slave = os.openpty()
         monkeypatch.setattr(serial, "Serial", no_terminal)

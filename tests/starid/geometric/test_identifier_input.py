@@ -139,7 +139,7 @@ def test_an_effort_out_of_range_is_named(change: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("limit", [None, 6.0])
 def test_a_catalogue_without_a_star_is_rejected(limit: float | None) -> None:
-    with pytest.raises(StaridError, match="identifier catalog: it holds no star"):
+    with pytest.raises(StaridError, match="identifier catalog: contains no stars"):
         Identifier(catalog=load_catalog().brighter_than(-5.0), limiting_magnitude=limit, cache=False)
 
 

@@ -150,7 +150,7 @@ def test_tracker_takes_a_rate_from_elsewhere() -> None:
     assert solution.attitude.error_to(turned).total_arcsec < RIGHT_ARCSEC
 
 
-def test_tracker_refuses_a_gap_that_is_none() -> None:
+def test_tracker_rejects_a_gap_that_is_none() -> None:
     with pytest.raises(StaridError, match="longest_gap_s"):
         Tracker(identifier(), longest_gap_s=0.0)
 

@@ -85,7 +85,7 @@ def test_stars_are_found_where_they_are(top: int) -> None:
 
 
 @pytest.mark.parametrize("flux", [250.0, 1000.0, 8000.0, 60000.0])
-def test_errors_are_honest_and_at_the_bound(flux: float) -> None:
+def test_errors_are_calibrated_and_reach_the_bound(flux: float) -> None:
     """Mean squared error over its own estimate is 1, and the estimate is the Cramér–Rao bound."""
     shape = (400, 400)
     squares, stated = [], []
@@ -395,8 +395,8 @@ def test_black_and_white_and_flat_have_a_reason(dtype: type, shape: tuple[int, i
         (np.zeros((50, 50), bool), "type bool"),
         (np.zeros((15, 50), np.uint8), "at least 16×16"),
         (np.zeros((0, 0), np.uint8), "at least 16×16"),
-        ([[1, 2], [3, 4]], "a list given"),
-        (None, "a NoneType given"),
+        ([[1, 2], [3, 4]], "not a list"),
+        (None, "not a NoneType"),
     ],
 )
 def test_what_is_no_image_is_rejected_in_one_line(image: object, text: str) -> None:

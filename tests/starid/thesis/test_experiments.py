@@ -121,7 +121,7 @@ def test_an_output_file_that_is_gone_is_made_again_from_the_parts(tmp_path):
     assert len(_calls(tmp_path)) == 3
 
 
-def test_a_damaged_part_is_refused_by_name(tmp_path):
+def test_a_damaged_part_is_rejected_by_name(tmp_path):
     runner.run([_experiment()], tmp_path, jobs=1)
     part = next((tmp_path / "toy" / "parts").glob("part2-*.npz"))
     part.write_bytes(part.read_bytes()[:40])
@@ -130,7 +130,7 @@ def test_a_damaged_part_is_refused_by_name(tmp_path):
         runner.run([_experiment()], tmp_path, jobs=1)
 
 
-def test_a_part_with_damaged_contents_is_refused_by_name(tmp_path):
+def test_a_part_with_damaged_contents_is_rejected_by_name(tmp_path):
     runner.run([_experiment()], tmp_path, jobs=1)
     part = next((tmp_path / "toy" / "parts").glob("part2-*.npz"))
     content = bytearray(part.read_bytes())
@@ -278,7 +278,7 @@ def test_a_text_has_no_bounds():
         row("q", ours="many", at_least=1.0)
 
 
-def test_columns_of_unequal_length_are_refused(tmp_path):
+def test_columns_of_unequal_length_are_rejected(tmp_path):
     with pytest.raises(StaridError, match=r"t\.csv have the lengths \[1, 2\]"):
         write_csv(tmp_path / "t.csv", {"a": [1], "b": [1, 2]})
 
@@ -347,12 +347,12 @@ def test_the_report_holds_all_that_is_finished_in_the_folder(tmp_path, monkeypat
     assert "`other`" in text
 
 
-def test_an_unknown_experiment_is_refused_with_the_nearest_name():
+def test_an_unknown_experiment_is_rejected_with_the_nearest_name():
     with pytest.raises(StaridError, match="no experiment lsi-acuracy; did you mean lsi-accuracy"):
         registry.select(["lsi-acuracy"], quick=False)
 
 
-def test_an_experiment_without_a_quick_form_is_left_out_or_refused(monkeypatch):
+def test_an_experiment_without_a_quick_form_is_left_out_or_rejected(monkeypatch):
     known = {"toy": _experiment(), "slow": dataclasses.replace(_experiment("slow"), quick=None)}
     monkeypatch.setattr(registry, "experiments", lambda: known)
     assert [experiment.name for experiment in registry.select([], quick=True)] == ["toy"]

@@ -140,7 +140,7 @@ def test_too_few_objects_are_no_stars(count):
         assert result.matches.shape == (0, 2)
 
 
-def test_what_is_refused():
+def test_what_is_rejected():
     many = ObservedFrame(np.ones(49), np.random.default_rng(0).uniform(-10.0, 10.0, (49, 2)))
     with pytest.raises(FilterError, match="scalable"):
         ClusterFilter()(many, many)
@@ -197,5 +197,5 @@ def test_an_affine_motion_needs_three_stars_in_a_triangle(before):
 
 
 def test_an_unknown_model_of_motion_is_rejected():
-    with pytest.raises(FilterError, match="one of rigid, affine"):
+    with pytest.raises(FilterError, match="model must be rigid or affine"):
         estimate_motion(np.eye(2), np.eye(2), model="projective")

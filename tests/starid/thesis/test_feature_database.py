@@ -108,7 +108,7 @@ def test_a_file_comes_back_as_it_went(tmp_path):
     assert back.exact_features(734) == made.exact_features(734)
 
 
-def test_bad_files_are_refused_by_name(tmp_path):
+def test_bad_files_are_rejected_by_name(tmp_path):
     path = tmp_path / "good.db"
     save_database(database(96.0), path)
     whole = path.read_bytes()
@@ -130,12 +130,12 @@ def test_bad_files_are_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("overlap", [1.0, -0.1, float("nan"), 99.5])
-def test_an_overlap_that_is_no_fraction_is_refused(overlap):
+def test_an_overlap_that_is_no_fraction_is_rejected(overlap):
     with pytest.raises(GridError, match="overlap"):
         make_grid("planar", 40.0, overlap)
 
 
-def test_a_header_with_other_parameters_is_refused():
+def test_a_header_with_other_parameters_is_rejected():
     values = dataclasses.asdict(DatabaseParameters())
     del values["kappa"]
     with pytest.raises(DatabaseError, match="parameters"):

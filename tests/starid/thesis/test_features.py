@@ -101,11 +101,11 @@ def test_one_star_has_no_spread():
         (np.array([1.0, 2.0]), np.zeros((1, 2))),
     ],
 )
-def test_bad_frames_are_refused(brightness, offsets):
+def test_bad_frames_are_rejected(brightness, offsets):
     with pytest.raises(FeatureError, match=r"^features: "):
         extract_features(brightness, offsets)
 
 
-def test_a_limit_that_leaves_nothing_is_refused():
+def test_a_limit_that_leaves_nothing_is_rejected():
     with pytest.raises(StaridError, match="no star is brightest than"):
         sky_of(thesis_catalog(), DatabaseParameters(kappa=-5.0, direction="brightest"))

@@ -75,7 +75,7 @@ def test_the_solver_of_scikit_learn_gives_the_verified_answers_of_the_compiled_c
 
 
 def test_an_unknown_solver_of_an_identifier_is_rejected():
-    with pytest.raises(DatabaseError, match="'octave' is unknown; one of exact, matlab, sklearn"):
+    with pytest.raises(DatabaseError, match="solver must be one of exact, matlab, sklearn, not 'octave'"):
         make_identifier("lsi", solver="octave")
 
 
@@ -155,16 +155,14 @@ def test_bad_input(make):
     assert not noise.valid
     with pytest.raises(StaridError, match="finite"):
         identifier.identify([[np.nan, 1.0]], [1.0])
-    with pytest.raises(StaridError, match="needed"):
+    with pytest.raises(StaridError, match=r"must be \(n, 2\) and \(n,\), not "):
         identifier.identify([[1.0, 1.0]], [1.0, 2.0])
 
 
 @pytest.mark.parametrize("window", [np.nan, -1.0, 0.0, np.inf])
-def test_a_window_that_is_none_is_refused(window):
+def test_a_window_that_is_none_is_rejected(window):
     recursion = RsiIdentifier()
-    with pytest.raises(
-        StaridError, match=r"tracking window_px: .* given, a positive number of pixels needed"
-    ):
+    with pytest.raises(StaridError, match=r"tracking window_px: must be a positive number of pixels, not "):
         recursion.track(np.empty((0, 2)), np.empty(0), Attitude.identity(), window_px=window)
 
 
@@ -175,10 +173,10 @@ def test_a_window_wider_than_the_field_searches_the_field():
 
 
 @pytest.mark.parametrize("options", [{}, {"feature_limit": 5.0}])
-def test_an_empty_catalogue_is_refused(options):
+def test_an_empty_catalogue_is_rejected(options):
     catalog = load_catalog()
     nothing = catalog.subset(np.zeros(len(catalog), dtype=bool))
-    with pytest.raises(StaridError, match="identifier catalog: it holds no star"):
+    with pytest.raises(StaridError, match="identifier catalog: contains no stars"):
         LsiIdentifier(DEFAULT_CAMERA, nothing, **options)
 
 
@@ -199,7 +197,7 @@ CAMERA_DATABASE = DatabaseParameters.for_camera(DEFAULT_CAMERA, overlap=0.9, kap
         (CAMERA_DATABASE, 1991.25, "another catalogue or epoch"),
     ],
 )
-def test_a_database_that_does_not_fit_is_refused(tmp_path, parameters, epoch, words):
+def test_a_database_that_does_not_fit_is_rejected(tmp_path, parameters, epoch, words):
     save_database(build_database(load_catalog(epoch=epoch), parameters), tmp_path / "other.db")
     with pytest.raises(DatabaseError, match=rf"other\.db .*{words}"):
         LsiIdentifier(database=tmp_path / "other.db")

@@ -174,7 +174,7 @@ def test_region_holds_the_frame_or_nothing():
     assert lsi.nearest_in_region(observation, 122.0, 89.0, 2.0)[0] == -1
 
 
-def test_bad_observations_are_refused():
+def test_bad_observations_are_rejected():
     lsi = lost_in_space(96.0)
     with pytest.raises(DatabaseError, match="five finite numbers"):
         lsi.solve(FeatureVector(3, np.nan, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))

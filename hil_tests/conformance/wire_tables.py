@@ -1,4 +1,4 @@
-"""Conformance of the link-error flags in `communication_status`, on any link."""
+"""Tables of raw traffic on any link: what is answered, and which error flags it sets in `communication_status`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,52 @@ FLAG_NAMES: Final = (
     "i2c_telecommand_error",
     "can_telecommand_error",
 )
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Raw traffic and the answers to it.
+
+    Attributes
+    ----------
+    id, title, clause
+        As of a case; None for the clause of the area.
+    sent
+        Raw traffic, as `LinkProbe.send_text` takes it.
+    answers
+        Expected answers, as `LinkProbe.expect_exactly` takes them; no more may come.
+    pause_s
+        Pause after each piece, s.
+    """
+
+    id: str
+    title: str
+    sent: tuple[str, ...]
+    answers: tuple[str, ...] = ()
+    clause: str | None = None
+    pause_s: float = 0.0
+
+
+def add_exchange_cases(
+    area: CaseArea[ProbeType], rows: Iterable[Exchange], *, intrusive: bool = False
+) -> None:
+    """Add one case per row."""
+    for row in rows:
+        _add_exchange_case(area, row, intrusive)
+
+
+def _add_exchange_case(area: CaseArea[ProbeType], row: Exchange, intrusive: bool) -> None:
+    @area.case(row.id, row.title, row.clause, intrusive=intrusive)
+    def run(probe: ProbeType) -> None:
+        probe.expecting(*row.answers)
+        for text in row.sent:
+            probe.send_text(text)
+            probe.sleep(row.pause_s)
+        for answer in row.answers:
+            probe.expect_exactly(answer)
+        probe.expect_silence("no more was asked for")
+        # a message that was left open ends at the start of the next one
+        probe.expect_alive()
 
 
 @dataclass(frozen=True)

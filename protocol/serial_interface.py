@@ -1,0 +1,82 @@
+"""The two ends of a serial link: what an emulator and an OBC use, whatever the unit."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
+from starhil.protocol.serial_framing import Dialect
+
+_Message_co = TypeVar("_Message_co", covariant=True)
+
+
+class Receiver(Protocol[_Message_co]):
+    """One end of a serial line: bytes in, messages and faults out."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a message is incomplete."""
+        ...
+
+    def feed(self, data: bytes, now: float, /) -> Sequence[_Message_co | LinkFault]:
+        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+        ...
+
+    def flush(self, now: float) -> list[LinkFault]:
+        """Drop an incomplete message that has timed out; return the faults."""
+        ...
+
+
+class HostEnd(Receiver[Reply], Protocol):
+    """The OBC's end."""
+
+    def expect(self, request: Request, reply_size: int) -> None:
+        """Set the next request, and the data bytes of its telemetry (0 for a telecommand)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RowShape:
+    """What a link must know of a row: its kind, sizes and answers."""
+
+    klass: str
+    id: int
+    kind: RequestKind
+    request_size: int = 0
+    """Data bytes of the request: parameters of a telecommand."""
+    reply_size: int = 0
+    """Data bytes of the reply: those of the telemetry."""
+    answers: tuple[str, ...] = ("reply",)
+    """`echo` and `reply`, in the order in which the device sends them."""
+
+
+class SerialStack(ABC):
+    """The serial link of a unit."""
+
+    baud: int
+
+    def supports_unsolicited(self, style: Dialect | None = None) -> bool:  # noqa: ARG002 -- for those with styles
+        """Return whether unsolicited telemetry can be sent in this style."""
+        return True
+
+    @abstractmethod
+    def device(self) -> Receiver[Request]:
+        """Return a receiver for the device's end."""
+
+    @abstractmethod
+    def host(self, style: Dialect | None = None) -> HostEnd:
+        """Return a receiver for the OBC's end."""
+
+    @abstractmethod
+    def encode_request(self, request: Request) -> bytes:
+        """Return a request as bytes on the line."""
+
+    @abstractmethod
+    def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:
+        """Return a reply as bytes on the line; none if the unit has no such reply.
+
+        Raises ProtocolError if the link cannot carry it.
+        """
