@@ -64,6 +64,20 @@ def test_the_earth_across_the_field_blinds_the_sensor(pipeline):
     assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("earth",))
 
 
+def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline):
+    for index, predicted in ((10, None), (11, as_quaternion(ORION)), (12, None), (13, as_quaternion(ORION))):
+        for cover in ({"blank": True}, {"blocked_share": 1.0}):
+            request = replace(REQUEST, index=index, predicted_xyzw=predicted, faults=cover)
+            result = pipeline.handle(request)
+            assert (result.valid, result.reason, result.matched) == (False, "too_few_stars", 0), cover
+
+
+def test_an_image_that_is_saturated_all_over_cannot_be_searched(pipeline):
+    glare = {"sun": {"ra_deg": 150.0, "dec_deg": 0.0, "electrons_s": 1e8}}
+    result = pipeline.handle(replace(REQUEST, index=14, faults=glare))
+    assert (result.valid, result.reason, result.detected) == (False, "detection_failed", 0)
+
+
 def test_particles_of_the_place_are_added_to_those_of_the_sky(pipeline):
     quiet = pipeline.handle(replace(REQUEST, index=3))
     anomaly = pipeline.handle(replace(REQUEST, index=3, particles_s=3000.0))
