@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -93,9 +94,10 @@ MakeClient = Callable[[ObcPort], ObcClient]
 
 @dataclass(frozen=True)
 class SentStep:
-    """A transaction as a step of a session."""
+    """A transaction as a step of a session, with the times of its request and its outcome."""
 
-    at_s: float
+    begin_s: float
+    end_s: float
     row: Row
     data: bytes
     values: Mapping[str, Value]
@@ -111,11 +113,16 @@ class ConsoleObc:
         OBC on a link.
     icd
         Interface definition of the device.
+    clock
+        Returns a time in seconds that only grows.
     """
 
-    def __init__(self, client: ObcClient, icd: InterfaceDefinition) -> None:
+    def __init__(
+        self, client: ObcClient, icd: InterfaceDefinition, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.client = client
         self._icd = icd
+        self._clock = clock
         self._steps: deque[SentStep] = deque(maxlen=KEPT_STEPS)
 
     @property
@@ -180,9 +187,9 @@ class ConsoleObc:
         return exchange, decode(row, exchange)
 
     async def _exchange(self, row: Row, data: bytes, values: Mapping[str, Value]) -> Exchange:
-        begin = time.monotonic()
+        begin_s = self._clock()
         exchange = await self.client.exchange(row, data)
-        self._steps.append(SentStep(begin, row, data, values, exchange))
+        self._steps.append(SentStep(begin_s, self._clock(), row, data, values, exchange))
         return exchange
 
     def _row(self, kind: str, name: str) -> Row:
@@ -202,12 +209,12 @@ class ConsoleObc:
         if not self._steps:
             raise EmulatorError("nothing was sent yet: send a telecommand or read a row first")
         lines = [f"title = {toml(title)}", "", "[defaults]", "timeout_s = 2.0"]
-        before: float | None = None
+        end_s = math.inf
         for step in self._steps:
-            if before is not None and step.at_s - before >= SHORTEST_WAIT_S:
-                lines += ["", "[[step]]", f"wait_s = {step.at_s - before:.2f}"]
+            if (pause_s := step.begin_s - end_s) >= SHORTEST_WAIT_S:
+                lines += ["", "[[step]]", f"wait_s = {pause_s:.2f}"]
             lines += ["", *_step_lines(step)]
-            before = step.at_s
+            end_s = step.end_s
         return "\n".join(lines) + "\n"
 
 

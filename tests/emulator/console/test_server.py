@@ -3,8 +3,10 @@
 import asyncio
 import json
 import socket
+import tomllib
 from contextlib import AsyncExitStack
 from dataclasses import replace
+from types import SimpleNamespace
 
 import aiohttp
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.obc import ConsoleObc, Exchange
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
@@ -262,21 +265,51 @@ def test_what_the_console_sent_is_a_session_script(run, tmp_path):
         async with Page(emulation) as page:
             assert "nothing was sent yet" in await page.get("/session.toml")
             await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
-            await asyncio.sleep(0.06)
             await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
             await page.ask(do="send", row="clear_counters", values={})
             await page.ask(do="read", row="device_status")
             path = tmp_path / "session.toml"
             path.write_text(await page.get("/session.toml"))
             script = load_script(path, load_unit())
-            names = [step.name for step in script.steps]
-            assert len(names) == 5  # the pause is a step too
-            assert script.steps[2].action.refused == "invalid_parameter"
-            assert script.steps[0].action.values == {"mode": "lost_in_space"}
+            mode, rate, *others = [step for step in script.steps if not step.name.startswith("wait")]
+            assert mode.action.values == {"mode": "lost_in_space"}
+            assert rate.action.refused == "invalid_parameter"
+            assert len(others) == 2
             await page.ask(do="clear_session")
             assert "nothing was sent yet" in await page.get("/session.toml")
 
     run(scenario, options=OPTIONS)
+
+
+class SlowClient:
+    """An OBC whose device answers after a while."""
+
+    def __init__(self, clock):
+        self.clock = clock
+
+    async def exchange(self, _row, _data):
+        self.clock.now_s += 0.8
+        return Exchange("ok", latency_s=0.8)
+
+
+def test_a_pause_between_two_telecommands_is_a_step_and_a_slow_reply_is_none():
+    clock = SimpleNamespace(now_s=100.0)
+    obc = ConsoleObc(SlowClient(clock), load_unit(), lambda: clock.now_s)
+
+    async def scenario():
+        await obc.send("clear_counters", {})
+        await obc.send("clear_counters", {})
+        clock.now_s += 1.5
+        await obc.send("clear_counters", {})
+
+    asyncio.run(scenario())
+    steps = tomllib.loads(obc.session("Pauses"))["step"]
+    assert steps == [
+        {"command": "clear_counters"},
+        {"command": "clear_counters"},
+        {"wait_s": 1.5},
+        {"command": "clear_counters"},
+    ]
 
 
 def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):
