@@ -40,6 +40,7 @@ def error_arcsec(result: FrameResult) -> float:
         (SkyObjects(sun=SunGlare(150.0, 0.0)), ()),
         (SkyObjects(moon=Moon(105.0, -1.2)), ("moon",)),
         (SkyObjects(moon=Moon(106.0, -1.2)), ()),
+        (SkyObjects(moon=Moon(90.0, -1.2), blank=True), ()),
         (SkyObjects(earth=EarthLimb(83.8, 84.0, radius_deg=64.5)), ("earth",)),
         (SkyObjects(earth=EarthLimb(83.8, 86.0, radius_deg=64.0)), ()),
         (SkyObjects(sun=SunGlare(90.0, 5.0), earth=EarthLimb(83.8, -1.2)), ("sun", "earth")),
