@@ -30,8 +30,8 @@ def load_bright_stars(path: str | None, epoch: float) -> dict[str, Any]:
     return {"map": stars.round(2).tolist(), "star_names": STAR_NAMES}
 
 
-def describe(emulation: Emulation) -> dict[str, Any]:
-    """Return the description of a run as JSON data."""
+def describe(emulation: Emulation, number: int) -> dict[str, Any]:
+    """Return the description of a head of a run, by its number, as JSON data."""
     icd = emulation.device.icd
     links = {
         key: emulation.ready_fields[key]
@@ -39,6 +39,10 @@ def describe(emulation: Emulation) -> dict[str, Any]:
         if key in emulation.ready_fields
     }
     return {
+        "head": number,
+        "heads": [
+            f"{each}: {head.profile.name}" for each, head in enumerate(emulation.leader.heads, start=1)
+        ],
         "columns": COLUMNS,
         "modes": MODES,
         "profile": emulation.profile.name,

@@ -15,6 +15,8 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.values import FieldError, Value
 
+Bus = Literal["can", "canopen", "serial"]
+
 HOST_ADDRESS: Final = 253
 """CAN address of the console as an OBC."""
 
@@ -70,18 +72,18 @@ class ObcPort:
     Attributes
     ----------
     bus
-        `can`, `serial`, or empty for a unit that an OBC cannot speak to without CANopen.
+        `can`, `canopen` or `serial`.
     where
         Channel or port.
     icd
         Interface definition of the device.
     device_address
-        Returns the device's present CAN address, which a telecommand may change.
+        Returns the device's present address on that bus, or node-ID, which a telecommand may change.
     dialect
         Returns the present dialect of serial replies; None for a unit that has no dialects.
     """
 
-    bus: Literal["can", "serial", ""]
+    bus: Bus
     where: str
     icd: InterfaceDefinition
     device_address: Callable[[], int]
