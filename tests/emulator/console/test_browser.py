@@ -132,10 +132,10 @@ def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_comes_ba
     wait_for_text(page, "#validity", "too few stars")
     frames = [number for number, text in page.evaluate("window.seen") if text == "too few stars"]
     assert frames[0] <= at + 3
-    assert page.locator("#active").text_content() == "1 active"
+    assert page.locator("#active").text_content() == "1 fault"
     page.click("#clear-faults")
     wait_for_text(page, "#validity", "valid")
-    wait_for_text(page, "#active", "none")
+    wait_for_text(page, "#active", "no fault")
 
 
 def test_a_wrong_parameter_shows_the_refusal(page):

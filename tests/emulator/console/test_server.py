@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
+from starhil.emulator.console.describe import fault_controls
 from starhil.emulator.console.history import COLUMNS, MODES
 from starhil.emulator.console.obc import ConsoleObc, Exchange
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
@@ -343,6 +344,19 @@ def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):
             assert unknown["error"].startswith("star 'Nibiru': unknown")
 
     run(scenario, options=OPTIONS)
+
+
+def test_every_fault_of_the_device_has_a_control_with_the_values_that_it_takes():
+    icd = load_unit()
+    device = next(level["controls"] for level in fault_controls(icd, ["can"]) if level["level"] == "device")
+    controls = {control["name"]: control for control in device}
+    upset = {control["name"]: control for control in controls.pop("upset")["controls"]}
+    assert upset["parameter"]["values"] == list(icd.device_parameters)
+    assert (upset["bit"]["kind"], upset["bit"]["min"], upset["bit"]["max"]) == ("integer", 0, 63)
+    assert (upset["star"]["kind"], upset["star"]["max"]) == ("integer", 200_000)
+    assert controls.pop("stuck")["kind"] == "flag"
+    assert set(controls) == {"error", "reset"}
+    assert all(control["kind"] == "choice" and control["values"] for control in controls.values())
 
 
 def test_a_scenario_from_the_page_begins_now(run, tmp_path):

@@ -95,7 +95,7 @@ store.on("hello", (hello) => {
 });
 
 store.on("faults", (count) => {
-  setText($("active"), count ? `${count} active` : "none");
+  setText($("active"), count ? `${count} fault${count === 1 ? "" : "s"}` : "no fault");
   $("active").dataset.state = count ? "bad" : "idle";
 });
 

@@ -20,7 +20,7 @@ export class Telecommands {
     this.rows = new Map(hello.telecommands.map((row) => [row.name, row]));
     this.parameters = hello.parameters;
     this.select = make("select", { id: "telecommand", size: "7", "aria-label": "telecommand", onchange: () => this.choose(this.select.value) });
-    for (const row of hello.telecommands) this.select.append(make("option", { value: row.name, text: `${String(row.id).padStart(3, " ")}  ${row.name}` }));
+    for (const row of hello.telecommands) this.select.append(make("option", { value: row.name, text: `${String(row.id).padStart(3, "\u2007")}  ${row.name}` }));
     this.form = make("form", { id: "telecommand-form", onsubmit: (event) => this.send(event) });
     this.log = this.log || make("ol", { class: "log scroll", id: "sent" });
     this.steps = make("output", { class: "num dim", text: "0 sent" });
