@@ -55,7 +55,7 @@ function list() {
     "li", { class: run.run === chosen ? "on" : "", "data-state": state(run), onclick: () => { chosen = run.run; follow = run === [...runs.values()].at(-1); list(); show(); } },
     make("b", { text: run.title }),
     make("span", { class: "dim", text: `${run.kind}, ${new Date(run.begin_s * 1000).toTimeString().slice(0, 8)}` }),
-    make("span", { class: "num", text: `${done(run)}/${run.planned} ${run.end_s === null ? "running" : run.counts.failed ? "failed" : "passed"}` }),
+    make("span", { class: "num", text: `${done(run)} of ${run.planned}, ${run.counts.failed ? `${run.counts.failed} failed` : run.end_s === null ? "running" : "passed"}` }),
   )));
 }
 
