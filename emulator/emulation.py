@@ -363,9 +363,8 @@ class Emulation:
     @property
     def _canopen_wanted(self) -> bool:
         """Whether a node is asked for, or CANopen is the only link that the unit has."""
-        links, has = self.profile.links, self.icd.link
-        only = self.icd.canopen is not None and has.serial is None and has.can is None
-        return bool(links.canopen.node) or (only and links.can.channel != "off")
+        links = self.profile.links
+        return bool(links.canopen.node) or (self.icd.canopen_only and links.can.channel != "off")
 
     def _check_links(self) -> None:
         """Check that the unit has one of the links that the profile asks for; note those that it lacks.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starhil.emulator.clock import make_clock
-from starhil.emulator.console.obc import MakeClient
+from starhil.emulator.console.obc import MakeClient, ObcClient
 from starhil.emulator.control.channel import ControlServer, ControlTarget
 from starhil.emulator.control.faults import Faults
 from starhil.emulator.control.scenario import Scenario, load_scenario
@@ -45,7 +45,7 @@ class RunOptions:
     view
         Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT.
     mcap
-        MCAP file of images, truth, telemetry and events.
+        MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`).
     make_client
         Makes the OBC of console and MCAP file; needed for these two.
     """
@@ -169,7 +169,8 @@ class Run:
         self.emulation = Emulation(profile, worker, tape=self._recorder, previews=self.options.watched)
         self.heads = [Head(1, self.emulation)]
         for number, other in enumerate(others, start=2):
-            self.heads.append(Head(number, Emulation(other, leader=self.emulation)))
+            emulation = Emulation(other, leader=self.emulation, previews=self.options.watched)
+            self.heads.append(Head(number, emulation))
         self.ended = asyncio.Event()
         self.control: ControlServer | None = None
         self._closers: list[Callable[[], object]] = []
@@ -248,29 +249,47 @@ class Run:
         await close_all(closers)
 
     async def _open_console(self, control: ControlServer) -> None:
-        """Open console and MCAP file, with an OBC on the bus of the first head."""
+        """Open console and MCAP files, with an OBC on the bus of each head."""
         from starhil.emulator.console.obc_link import open_obc
 
-        options, emulation = self.options, self.emulation
-        if options.make_client is None:
+        if self.options.make_client is None:
             raise EmulatorError("run: console and recording need make_client")
-        client = await open_obc(emulation, options.make_client, self._closers)
-        if options.mcap is not None:
-            from starhil.emulator.console.recorder import McapRecorder
+        clients = [
+            await open_obc(head.emulation, self.options.make_client, self._closers) for head in self.heads
+        ]
+        if self.options.mcap is not None:
+            self._open_recorders(self.options.mcap, clients)
+        if self.options.view != "off":
+            await self._open_server(control, clients)
 
-            recorder = McapRecorder(emulation, client, options.mcap, overwrite=options.overwrite)
+    def _open_recorders(self, path: Path, clients: Sequence[ObcClient]) -> None:
+        """Begin to record each head to an MCAP file of its own."""
+        from starhil.emulator.console.recorder import McapRecorder
+
+        for head, client in zip(self.heads, clients, strict=True):
+            own_path = path_of_head(path, head.number)
+            recorder = McapRecorder(head.emulation, client, own_path, overwrite=self.options.overwrite)
             self._closers.append(recorder.close)
             recorder.start()
-        if options.view != "off":
-            from starhil.emulator.console.console import Console
-            from starhil.emulator.console.server import ConsoleServer
 
-            console = Console(emulation, control.execute, client)
+    async def _open_server(self, control: ControlServer, clients: Sequence[ObcClient]) -> None:
+        """Serve a console for each head."""
+        from starhil.emulator.console.console import Console
+        from starhil.emulator.console.runs import Runs
+        from starhil.emulator.console.server import ConsoleServer
+        from starhil.emulator.console.stepping import StepRunner
+
+        stepping, runs = StepRunner(control.execute), Runs()
+        self._closers.append(stepping.pause)
+        consoles = []
+        for head, client in zip(self.heads, clients, strict=True):
+            console = Console(head.emulation, head.number, client, stepping, runs)
             self._closers.append(console.close)
             console.start()
-            server = ConsoleServer(console)
-            self._closers.append(server.close)
-            emulation.ready_fields["view"] = await server.start(options.view)
+            consoles.append(console)
+        server = ConsoleServer(consoles)
+        self._closers.append(server.close)
+        self.emulation.ready_fields["view"] = await server.start(self.options.view)
 
 
 def path_of_head(path: Path, number: int) -> Path:

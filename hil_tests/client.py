@@ -86,6 +86,7 @@ class ObcClient:
     ) -> Self:
         """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel.
 
+        On CAN it is a CANopen master if that is all that the unit has there.
         `unit` is the name of a unit that ships with starhil, a folder, or a definition.
         """
         if (serial is None) == (can is None):
@@ -96,6 +97,10 @@ class ObcClient:
         def make_link() -> HostLink[Any]:
             if serial is not None:
                 return SerialHostLink(icd, serial, dialect=Dialect(dialect), baud=baud, log=log)
+            if icd.link.can is None and icd.canopen is not None:
+                from starhil.hil_tests.canopen_link import CanopenHostLink
+
+                return CanopenHostLink(icd, str(can), log=log)
             return CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
 
         return cls(make_link, icd, timeout_s=timeout_s, retries=retries)

@@ -163,6 +163,11 @@ class InterfaceDefinition:
             return self.errors[name]
         return 0 if code is ErrorCode.OK else self.errors.get(OTHER_ERROR, int(code))
 
+    @property
+    def canopen_only(self) -> bool:
+        """Whether CANopen is the only link of the unit."""
+        return self.canopen is not None and self.link.serial is None and self.link.can is None
+
     def error_name(self, number: int) -> str:
         """Return the name of an error by the number in which the unit reports it."""
         numbers = self.errors or {code.name.lower(): int(code) for code in ErrorCode}

@@ -7,7 +7,7 @@ from typing import Any
 
 from starhil.emulator.console.obc import HOST_ADDRESS, Exchange, ObcPort
 from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
+from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
 from starhil.protocol.codec import Row
 from starhil.protocol.serial_framing import Dialect
@@ -38,7 +38,9 @@ class ConsoleClient:
         elif port.bus == "serial":
             link = SerialHostLink(port.icd, port.where, dialect=port.dialect() or Dialect.B)
         else:
-            return
+            from starhil.hil_tests.canopen_link import CanopenHostLink
+
+            link = CanopenHostLink(port.icd, port.where, node=port.device_address())
         self._client = AsyncObcClient(link, port.icd)
         await self._client.start()
 
@@ -57,7 +59,7 @@ class ConsoleClient:
             await self.close()
             await self.start()
         if self._client is None:
-            return Exchange("no_link", f"{row.name}: the unit has CANopen only; use a CANopen master")
+            return Exchange("link_lost", f"{row.name}: the console's link is closed")
         request = self._port.icd.request(row, data)
         begin = time.perf_counter()
         try:
@@ -68,6 +70,8 @@ class ConsoleClient:
             return Exchange(error.code_name, str(error), time.perf_counter() - begin, refused=True)
         except NoReplyError as error:
             return Exchange("no_reply", str(error))
-        except BenchError as error:
+        except LinkLostError as error:
             return Exchange("link_lost", str(error))
+        except BenchError as error:
+            return Exchange("not_sent", str(error))
         return Exchange("ok", "", latency, reply.data)

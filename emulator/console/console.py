@@ -14,10 +14,10 @@ from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.describe import describe, load_bright_stars
 from starhil.emulator.console.history import History, frame_message
 from starhil.emulator.console.obc import HOST_ADDRESS, ConsoleObc, Exchange, ObcClient
+from starhil.emulator.console.pointing import pointing_request
 from starhil.emulator.console.runs import Runs
-from starhil.emulator.console.slew import slew_request
 from starhil.emulator.console.stepping import StepRunner
-from starhil.emulator.console.trace import WireTrace, request_bytes
+from starhil.emulator.console.trace import RequestEncoder, WireTrace
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.modes import Transition
@@ -28,9 +28,6 @@ from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.console")
-
-Execute = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Executes a request of the control channel."""
 
 TURN_S: Final = 0.1
 """Time between two deliveries of the wire's trace, seconds."""
@@ -46,31 +43,42 @@ CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "cl
 
 
 class Console:
-    """Everything behind the page.
+    """Everything behind the page of a head.
 
     Parameters
     ----------
     emulation
-        The run, open.
-    execute
-        Executes requests of the control channel.
+        The head, open.
+    number
+        Number of the head, 1 for the first.
     client
         OBC on a link to the device, open.
+    stepping
+        Runs the stepped clock, for all heads.
+    runs
+        Session and conformance runs, for all heads.
     """
 
-    def __init__(self, emulation: Emulation, execute: Execute, client: ObcClient) -> None:
+    def __init__(
+        self, emulation: Emulation, number: int, client: ObcClient, stepping: StepRunner, runs: Runs
+    ) -> None:
         self._emulation = emulation
-        self._execute = execute
+        self._number = number
         device = emulation.device
         self.obc = ConsoleObc(client, device.icd)
         self.history = History()
-        self.runs = Runs(self._broadcast)
+        self.runs = runs
+        runs.listeners.append(self._broadcast)
         self.trace = WireTrace(
             device.icd,
             emulation.links,
             lambda: None if emulation.serial is None else emulation.serial.dialect,
         )
-        self.stepping = StepRunner(execute)
+        self.stepping = stepping
+        self._requests = RequestEncoder(device.icd)
+        self._address = "canopen_node" if device.icd.canopen_only else "can_address"
+        self._last_frame = b""
+        """The newest message with an image; empty before the first."""
         self.viewers: set[Viewer] = set()
         self._tasks: list[asyncio.Task[None]] = []
         self._rows_wanted = asyncio.Event()
@@ -79,7 +87,7 @@ class Console:
         self._actions: dict[str, Callable[[Viewer, dict[str, Any]], Awaitable[dict[str, Any]]]] = {
             "subscribe": self._subscribe,
             "control": self._control,
-            "slew": self._slew,
+            "point": self._point,
             "clock": self._set_clock,
             "encode": self._encode,
             "send": self._send,
@@ -101,7 +109,6 @@ class Console:
     async def close(self) -> None:
         """Cease to listen."""
         self.trace.listen(wanted=False)
-        self.stepping.pause()
         tasks = [*self._tasks, *([self._stars] if self._stars is not None else [])]
         for task in tasks:
             task.cancel()
@@ -116,6 +123,10 @@ class Console:
             except Exception as error:  # noqa: BLE001 (the run goes on without this turn)
                 log_internal_error("console", error)
                 await asyncio.sleep(STATUS_S)
+
+    async def _execute(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Execute a request of the control channel for this head."""
+        return await self.stepping.execute({**request, "head": self._number})
 
     # --- pages ---
 
@@ -149,7 +160,7 @@ class Console:
     async def welcome(self, viewer: Viewer) -> bytes:
         """Send the description of the run to a page; return its history as rows of 64-bit floats."""
         stars = await self._stars if self._stars is not None else {}
-        content = describe(self._emulation) | stars | {"session_steps": self.obc.steps}
+        content = describe(self._emulation, self._number) | stars | {"session_steps": self.obc.steps}
         viewer.send(json.dumps({"type": "hello", **content}))
         viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
         for message in self.runs.messages():
@@ -172,12 +183,14 @@ class Console:
         row = self.history.add(measurement)
         if len(self.history.reasons) != known:
             self._broadcast({"type": "reasons", "reasons": self.history.reasons})
-        receivers = [viewer for viewer in self.viewers if viewer.frames]
-        if not receivers:
+        if measurement.result.preview is None and not any(viewer.frames for viewer in self.viewers):
             return
         data = frame_message(measurement, row)
-        for viewer in receivers:
-            viewer.send_frame(data)
+        if measurement.result.preview is not None:
+            self._last_frame = data
+        for viewer in self.viewers:
+            if viewer.frames:
+                viewer.send_frame(data)
 
     def _mode_changed(self, transition: Transition) -> None:
         now_s = self._emulation.clock.now_ns() / NANOSECONDS
@@ -243,7 +256,9 @@ class Console:
             return {**identity, "ok": False, "error": f"internal error: {one_line(error)}"}
 
     async def _subscribe(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
-        viewer.frames = bool(request.get("frames"))
+        begins, viewer.frames = not viewer.frames, bool(request.get("frames"))
+        if begins and viewer.frames and self._last_frame:
+            viewer.send_frame(self._last_frame)
         begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
         if begins and viewer.wire:
             viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
@@ -259,22 +274,17 @@ class Console:
             raise EmulatorError(f"request: do must be one of {', '.join(sorted(CONTROL))}")
         return await self._execute(wanted)
 
-    async def _slew(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+    async def _point(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         profile = self._emulation.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
+        mount = None if profile.truth.mount is None else profile.truth.mount.build()
+        _table(request, "to")
         truth = await self._execute({"do": "truth"})
-        wanted = await asyncio.to_thread(
-            slew_request,
-            _table(request, "to"),
-            truth,
-            request.get("max_rate_deg_s"),
-            path,
-            profile.catalog.epoch,
-        )
+        wanted = await asyncio.to_thread(pointing_request, request, truth, mount, path, profile.catalog.epoch)
         return await self._execute(wanted)
 
     async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
-        if self._emulation.stepper is None:
+        if self._emulation.leader.stepper is None:
             raise EmulatorError(f"the clock is {self._emulation.clock.name}: it cannot be stopped")
         speed = request.get("speed")
         self.stepping.run(float(speed) if isinstance(speed, (int, float)) else 0.0)
@@ -282,8 +292,8 @@ class Console:
 
     async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
-        icd, address = self._emulation.icd, int(self._emulation.device.parameters["can_address"])
-        return {"problem": problem, **request_bytes(icd, row, data, HOST_ADDRESS, address)}
+        address = int(self._emulation.device.parameters[self._address])
+        return {"problem": problem, **self._requests.encode(row, data, HOST_ADDRESS, address)}
 
     async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         exchange = await self.obc.send(str(request.get("row")), _table(request, "values"))

@@ -30,8 +30,8 @@ def load_bright_stars(path: str | None, epoch: float) -> dict[str, Any]:
     return {"map": stars.round(2).tolist(), "star_names": STAR_NAMES}
 
 
-def describe(emulation: Emulation) -> dict[str, Any]:
-    """Return the description of a run as JSON data."""
+def describe(emulation: Emulation, number: int) -> dict[str, Any]:
+    """Return the description of a head of a run, by its number, as JSON data."""
     icd = emulation.device.icd
     links = {
         key: emulation.ready_fields[key]
@@ -39,6 +39,10 @@ def describe(emulation: Emulation) -> dict[str, Any]:
         if key in emulation.ready_fields
     }
     return {
+        "head": number,
+        "heads": [
+            f"{each}: {head.profile.name}" for each, head in enumerate(emulation.leader.heads, start=1)
+        ],
         "columns": COLUMNS,
         "modes": MODES,
         "profile": emulation.profile.name,
@@ -98,32 +102,49 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
 
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
     """Return the controls of the faults by level: name, kind and range of each value."""
-    causes = list(icd.enum("reset_cause").values)
-    errors = [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR]
-    device = [
-        {**control, "values": {"error": errors, "reset": causes}.get(control["name"])}
-        for control in _model_controls(DeviceFault)
-    ]
-    wire = _model_controls(WireFault)
+    choices = {
+        "error": [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR],
+        "reset": list(icd.enum("reset_cause").values),
+        "parameter": list(icd.device_parameters),
+    }
     share = {"name": "blocked_share", "kind": "number", "min": 0.0, "max": 1.0, "default": 0.0}
     levels = [
         {"level": "optical", "controls": [share, *_class_controls(SkyObjects)]},
-        {"level": "device", "controls": device},
+        {"level": "device", "controls": _model_controls(DeviceFault, choices)},
     ]
+    wire = _model_controls(WireFault, choices)
     return levels + [{"level": bus, "controls": wire} for bus in dict.fromkeys(buses)]
 
 
-def _model_controls(model: type[DeviceFault | WireFault]) -> list[dict[str, Any]]:
-    controls = []
-    for name, schema in model.model_json_schema()["properties"].items():
-        kinds = {"boolean": "flag", "integer": "integer", "number": "number"}
+def _model_controls(
+    model: type[DeviceFault | WireFault], choices: dict[str, list[str]]
+) -> list[dict[str, Any]]:
+    schema = model.model_json_schema()
+    return _schema_controls(schema["properties"], schema.get("$defs", {}), choices)
+
+
+def _schema_controls(
+    properties: dict[str, Any], models: dict[str, Any], choices: dict[str, list[str]]
+) -> list[dict[str, Any]]:
+    """Return the controls of a model by its JSON schema; a model within it becomes a group."""
+    kinds = {"boolean": "flag", "integer": "integer", "number": "number", "string": "choice"}
+    controls: list[dict[str, Any]] = []
+    for name, schema in properties.items():
+        content = schema["anyOf"][0] if "anyOf" in schema else schema
+        if "$ref" in content:
+            inner = models[content["$ref"].rpartition("/")[2]]["properties"]
+            controls.append(
+                {"name": name, "kind": "group", "controls": _schema_controls(inner, models, choices)}
+            )
+            continue
         controls.append(
             {
                 "name": name,
-                "kind": kinds.get(schema.get("type", ""), "choice"),
-                "min": schema.get("minimum"),
-                "max": schema.get("maximum"),
+                "kind": kinds[content["type"]],
+                "min": content.get("minimum"),
+                "max": content.get("maximum"),
                 "default": schema.get("default"),
+                "values": choices.get(name),
             }
         )
     return controls

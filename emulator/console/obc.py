@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -13,6 +14,8 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.values import FieldError, Value
+
+Bus = Literal["can", "canopen", "serial"]
 
 HOST_ADDRESS: Final = 253
 """CAN address of the console as an OBC."""
@@ -69,18 +72,18 @@ class ObcPort:
     Attributes
     ----------
     bus
-        `can`, `serial`, or empty for a unit that an OBC cannot speak to without CANopen.
+        `can`, `canopen` or `serial`.
     where
         Channel or port.
     icd
         Interface definition of the device.
     device_address
-        Returns the device's present CAN address, which a telecommand may change.
+        Returns the device's present address on that bus, or node-ID, which a telecommand may change.
     dialect
         Returns the present dialect of serial replies; None for a unit that has no dialects.
     """
 
-    bus: Literal["can", "serial", ""]
+    bus: Bus
     where: str
     icd: InterfaceDefinition
     device_address: Callable[[], int]
@@ -93,9 +96,10 @@ MakeClient = Callable[[ObcPort], ObcClient]
 
 @dataclass(frozen=True)
 class SentStep:
-    """A transaction as a step of a session."""
+    """A transaction as a step of a session, with the times of its request and its outcome."""
 
-    at_s: float
+    begin_s: float
+    end_s: float
     row: Row
     data: bytes
     values: Mapping[str, Value]
@@ -111,11 +115,16 @@ class ConsoleObc:
         OBC on a link.
     icd
         Interface definition of the device.
+    clock
+        Returns a time in seconds that only grows.
     """
 
-    def __init__(self, client: ObcClient, icd: InterfaceDefinition) -> None:
+    def __init__(
+        self, client: ObcClient, icd: InterfaceDefinition, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.client = client
         self._icd = icd
+        self._clock = clock
         self._steps: deque[SentStep] = deque(maxlen=KEPT_STEPS)
 
     @property
@@ -180,9 +189,9 @@ class ConsoleObc:
         return exchange, decode(row, exchange)
 
     async def _exchange(self, row: Row, data: bytes, values: Mapping[str, Value]) -> Exchange:
-        begin = time.monotonic()
+        begin_s = self._clock()
         exchange = await self.client.exchange(row, data)
-        self._steps.append(SentStep(begin, row, data, values, exchange))
+        self._steps.append(SentStep(begin_s, self._clock(), row, data, values, exchange))
         return exchange
 
     def _row(self, kind: str, name: str) -> Row:
@@ -202,12 +211,12 @@ class ConsoleObc:
         if not self._steps:
             raise EmulatorError("nothing was sent yet: send a telecommand or read a row first")
         lines = [f"title = {toml(title)}", "", "[defaults]", "timeout_s = 2.0"]
-        before: float | None = None
+        end_s = math.inf
         for step in self._steps:
-            if before is not None and step.at_s - before >= SHORTEST_WAIT_S:
-                lines += ["", "[[step]]", f"wait_s = {step.at_s - before:.2f}"]
+            if (pause_s := step.begin_s - end_s) >= SHORTEST_WAIT_S:
+                lines += ["", "[[step]]", f"wait_s = {pause_s:.2f}"]
             lines += ["", *_step_lines(step)]
-            before = step.at_s
+            end_s = step.end_s
         return "\n".join(lines) + "\n"
 
 

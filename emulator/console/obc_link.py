@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Literal
 
-from starhil.emulator.console.obc import MakeClient, ObcClient, ObcPort
+from starhil.emulator.console.obc import Bus, MakeClient, ObcClient, ObcPort
 from starhil.emulator.emulation import Emulation
+from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
+from starhil.protocol.icd import InterfaceDefinition
 
 
 async def open_obc(
@@ -26,20 +27,17 @@ async def open_obc(
     closers
         Gets the closers of what is opened, in that order.
     """
-    device, has = emulation.device, emulation.icd.link
-    bus: Literal["can", "serial", ""] = "can" if has.can is not None else ""
-    where = emulation.ready_fields["can"] if emulation.can is not None else ""
-    separate: SerialLink | CanLink | None = None
-    if bus and not where:
-        from starhil.protocol.transports.can import open_can
-
-        where = f"virtual:starhil-console-{os.getpid()}"
-        separate = CanLink(emulation.requests, open_can(where))
-    elif not bus and has.serial is not None:
+    icd, parameters = emulation.icd, emulation.device.parameters
+    separate: Link | None = None
+    where, bus = "", obc_bus(icd)
+    if bus == "serial":
         from starhil.protocol.transports.serial import open_serial
 
-        bus = "serial"
         separate = SerialLink(emulation.requests, open_serial("auto", paced=False))
+    elif emulation.canopen if icd.canopen_only else emulation.can:
+        where = emulation.ready_fields["can"]
+    else:
+        separate = _open_virtual_bus(emulation)
     if separate is not None:
         closers.append(separate.close)
         where = await separate.start()
@@ -47,11 +45,30 @@ async def open_obc(
         ObcPort(
             bus,
             where,
-            emulation.icd,
-            device_address=lambda: int(device.parameters["can_address"]),
+            icd,
+            device_address=lambda: int(parameters["canopen_node" if bus == "canopen" else "can_address"]),
             dialect=lambda: separate.dialect if isinstance(separate, SerialLink) else None,
         )
     )
     closers.append(client.close)
     await client.start()
     return client
+
+
+def _open_virtual_bus(emulation: Emulation) -> Link:
+    """Return a link of the device to a virtual CAN bus that nobody else uses."""
+    from starhil.protocol.transports.can import open_can
+
+    transport = open_can(f"virtual:starhil-console-{os.getpid()}-{id(emulation)}")
+    if not emulation.icd.canopen_only:
+        return CanLink(emulation.requests, transport)
+    from starhil.emulator.links.canopen import CanopenLink
+
+    return CanopenLink(emulation.requests, transport)
+
+
+def obc_bus(icd: InterfaceDefinition) -> Bus:
+    """Return the bus on which an OBC speaks to a unit."""
+    if icd.canopen_only:
+        return "canopen"
+    return "can" if icd.link.can is not None else "serial"

@@ -40,14 +40,14 @@ class Run:
 class Runs:
     """The newest runs.
 
-    Parameters
+    Attributes
     ----------
-    broadcast
-        Sends a message to every page.
+    listeners
+        Each sends a message to its pages.
     """
 
-    def __init__(self, broadcast: Callable[[dict[str, Any]], None]) -> None:
-        self._broadcast = broadcast
+    def __init__(self) -> None:
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []
         self._runs: OrderedDict[str, Run] = OrderedDict()
 
     def report(self, event: object) -> None:
@@ -71,6 +71,10 @@ class Runs:
                 self._broadcast({"type": "run", **run.head()})
             case _:
                 raise EmulatorError("report: event must be begin, result or end")
+
+    def _broadcast(self, message: dict[str, Any]) -> None:
+        for listener in self.listeners:
+            listener(message)
 
     def _begin(self, event: dict[str, Any]) -> None:
         planned = event.get("planned")

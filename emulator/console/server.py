@@ -8,7 +8,7 @@ import hmac
 import json
 import logging
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -50,18 +50,18 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class ConsoleServer:
-    """Serves a console at an address that holds a token.
+    """Serves the consoles of all heads at an address that holds a token; `head` in it is the number of one.
 
     Parameters
     ----------
-    console
-        Console, started.
+    consoles
+        A console for each head, started.
     token
         Token that every page must know; by default a random one.
     """
 
-    def __init__(self, console: Console, token: str | None = None) -> None:
-        self._console = console
+    def __init__(self, consoles: Sequence[Console], token: str | None = None) -> None:
+        self._consoles = consoles
         self.token = secrets.token_urlsafe(18) if token is None else token
         self._runner: web.AppRunner | None = None
 
@@ -75,8 +75,8 @@ class ConsoleServer:
         """
         host, port = parse_address(where)
         app = web.Application(middlewares=[self._guard], client_max_size=LARGEST_REPORT)
-        app.router.add_get("/", _page("index.html"))
-        app.router.add_get("/runs", _page("runs.html"))
+        for path in ("/", "/runs"):
+            app.router.add_get(path, _page)
         app.router.add_get("/ws", self._socket)
         app.router.add_get("/session.toml", self._session)
         app.router.add_get("/wire.log", self._wire_log)
@@ -126,74 +126,80 @@ class ConsoleServer:
     def _token_is_valid(self, request: web.Request) -> bool:
         return hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode())
 
-    async def _session(self, _request: web.Request) -> web.Response:
-        return _download(
-            self._console.obc.session("Recorded in the console"), "session.toml", "application/toml"
-        )
+    def _console(self, request: web.Request) -> Console:
+        """Return the console of the head that a request is for, the first one if it names none."""
+        wanted = request.query.get("head", "1")
+        known = {str(number): console for number, console in enumerate(self._consoles, start=1)}
+        if wanted not in known:
+            raise EmulatorError(f"head: {wanted!r} given, must be 1 to {len(known)}")
+        return known[wanted]
 
-    async def _wire_log(self, _request: web.Request) -> web.Response:
-        return _download(self._console.trace.candump(), "wire.log", "text/plain")
+    async def _session(self, request: web.Request) -> web.Response:
+        text = self._console(request).obc.session("Recorded in the console")
+        return _download(text, "session.toml", "application/toml")
+
+    async def _wire_log(self, request: web.Request) -> web.Response:
+        return _download(self._console(request).trace.candump(), "wire.log", "text/plain")
 
     async def _report(self, request: web.Request) -> web.Response:
         try:
             event = json.loads(await request.text())
         except (ValueError, RecursionError):
             raise EmulatorError("report: not JSON") from None
-        self._console.runs.report(event)
+        self._consoles[0].runs.report(event)
         return web.json_response({"ok": True})
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         """Connect a page: what it asks for is answered, and what it has subscribed to is sent."""
-        if len(self._console.viewers) >= MOST_VIEWERS:
+        console = self._console(request)
+        if sum(len(each.viewers) for each in self._consoles) >= MOST_VIEWERS:
             return web.Response(status=503, text=f"503: {MOST_VIEWERS} pages are open already\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
         await socket.prepare(request)
         viewer = Viewer(socket)
-        history = await self._console.welcome(viewer)
+        history = await console.welcome(viewer)
         tasks: set[asyncio.Task[None]] = set()
         try:
             await viewer.flush()
             await socket.send_bytes(b"H" + bytes(7) + history)
-            self._console.join(viewer)
+            console.join(viewer)
             tasks.add(asyncio.create_task(_pump(viewer, socket)))
-            await self._receive(socket, viewer, tasks)
+            await _receive(console, socket, viewer, tasks)
         except ConnectionError:
             pass  # the page has gone
         finally:
-            self._console.leave(viewer)
+            console.leave(viewer)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         return socket
 
-    async def _receive(
-        self, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
-    ) -> None:
-        """Execute the requests of a page until it closes."""
-        async for message in socket:
-            if message.type is not WSMsgType.TEXT:
-                continue
-            try:
-                request = json.loads(message.data)
-            except (ValueError, RecursionError):
-                request = None
-            if not isinstance(request, dict):
-                viewer.send(
-                    json.dumps({"type": "answer", "id": None, "ok": False, "error": "not a JSON object"})
-                )
-                continue
-            if len(tasks) > MOST_REQUESTS:
-                error = f"more than {MOST_REQUESTS} requests at a time"
-                viewer.send(
-                    json.dumps({"type": "answer", "id": request.get("id"), "ok": False, "error": error})
-                )
-                continue
-            task = asyncio.create_task(self._answer(viewer, request))
-            tasks.add(task)
-            task.add_done_callback(tasks.discard)
 
-    async def _answer(self, viewer: Viewer, request: dict[str, object]) -> None:
-        viewer.send(json.dumps(await self._console.answer(viewer, request)))
+async def _receive(
+    console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
+) -> None:
+    """Execute the requests of a page until it closes."""
+    async for message in socket:
+        if message.type is not WSMsgType.TEXT:
+            continue
+        try:
+            request = json.loads(message.data)
+        except (ValueError, RecursionError):
+            request = None
+        if not isinstance(request, dict):
+            viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": "not a JSON object"}))
+            continue
+        if len(tasks) > MOST_REQUESTS:
+            error = f"more than {MOST_REQUESTS} requests at a time"
+            viewer.send(json.dumps({"type": "answer", "id": request.get("id"), "ok": False, "error": error}))
+            continue
+        task = asyncio.create_task(_answer(console, viewer, request))
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+
+async def _answer(console: Console, viewer: Viewer, request: dict[str, object]) -> None:
+    viewer.send(json.dumps(await console.answer(viewer, request)))
 
 
 async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:
@@ -203,11 +209,8 @@ async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:
     await socket.close()
 
 
-def _page(name: str) -> Handler:
-    async def page(_request: web.Request) -> web.StreamResponse:
-        return web.FileResponse(STATIC / name)
-
-    return page
+async def _page(_request: web.Request) -> web.StreamResponse:
+    return web.FileResponse(STATIC / "index.html")
 
 
 def _download(text: str, name: str, kind: str) -> web.Response:

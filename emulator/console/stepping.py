@@ -8,6 +8,9 @@ from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
 
+Execute = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Executes a request of the control channel."""
+
 STEP_WALL_S: Final = 0.1
 """Wall time of one step, seconds."""
 
@@ -24,8 +27,8 @@ class StepRunner:
         Executes requests of the control channel.
     """
 
-    def __init__(self, execute: Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]) -> None:
-        self._execute = execute
+    def __init__(self, execute: Execute) -> None:
+        self.execute = execute
         self._task: asyncio.Task[None] | None = None
         self.speed = 0.0
         """Simulation seconds per second; 0 while paused."""
@@ -55,5 +58,5 @@ class StepRunner:
         loop = asyncio.get_running_loop()
         while self._task is own:
             begin = loop.time()
-            await self._execute({"do": "step", "seconds": self.speed * STEP_WALL_S})
+            await self.execute({"do": "step", "seconds": self.speed * STEP_WALL_S})
             await asyncio.sleep(max(0.0, begin + STEP_WALL_S - loop.time()))

@@ -21,6 +21,9 @@ from starhil.protocol.can_framing import (
     encode_request_frames,
 )
 from starhil.protocol.candump import format_candump
+from starhil.protocol.canopen.cob import SDO_RECEIVE
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
 from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
@@ -177,8 +180,7 @@ class Decoder:
         if isinstance(entry.item, CanFrame):
             frame = entry.item
             kind, text = self._can_text(frame, entry.at_s)
-            raw = f"{frame.id:08X}#" if frame.extended else f"{frame.id:03X}#"
-            raw += "R" if frame.remote else frame.data.hex().upper()
+            raw = cansend(frame)
         else:
             kind, text = self._serial_text(entry.item, entry.at_s, outgoing=entry.outgoing)
             raw = entry.item.hex(" ").upper()
@@ -286,13 +288,41 @@ def canopen_text(frame: CanFrame) -> str:
     return f"COB-ID {frame.id:03X}"
 
 
-def request_bytes(icd: InterfaceDefinition, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
-    """Return a telecommand as it goes over the links of the unit: bytes in hexadecimal, arguments of cansend."""
-    request = icd.request(row, data, host)
-    serial = build_serial_stack(icd).encode_request(request).hex(" ").upper() if icd.link.serial else ""
-    frames = encode_request_frames(request, host, device) if icd.link.can else []
-    return {
-        "data": data.hex(" ").upper(),
-        "serial": serial,
-        "cansend": [f"{frame.id:08X}#{frame.data.hex().upper()}" for frame in frames],
-    }
+class RequestEncoder:
+    """Encodes telecommands as they go over the links of a unit.
+
+    Parameters
+    ----------
+    icd
+        Interface definition.
+    """
+
+    def __init__(self, icd: InterfaceDefinition) -> None:
+        self._icd = icd
+        self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
+        self._objects = build_dictionary(icd) if icd.canopen_only else None
+
+    def encode(self, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
+        """Return data and serial bytes in hexadecimal, and arguments of cansend, from one CAN address to another.
+
+        Raises
+        ------
+        IcdError
+            The object dictionary does not hold the telecommand.
+        """
+        request = self._icd.request(row, data, host)
+        frames = encode_request_frames(request, host, device) if self._icd.link.can is not None else []
+        if self._objects is not None:
+            requests = requests_of(row_transfer(self._objects, row, data))
+            frames = [CanFrame(SDO_RECEIVE + device, each, extended=False) for each in requests]
+        return {
+            "data": data.hex(" ").upper(),
+            "serial": "" if self._stack is None else self._stack.encode_request(request).hex(" ").upper(),
+            "cansend": [cansend(frame) for frame in frames],
+        }
+
+
+def cansend(frame: CanFrame) -> str:
+    """Return a frame as an argument of cansend."""
+    number = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    return f"{number}#{'R' if frame.remote else frame.data.hex().upper()}"

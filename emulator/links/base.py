@@ -58,6 +58,9 @@ class Link(Protocol):
     def wire(self) -> WireFaults[Any]:
         """Outgoing side of the wire, with its faults."""
 
+    async def start(self) -> str:
+        """Open the transport; return its port or bus."""
+
     async def close(self) -> None:
         """Close the transport."""
 

@@ -19,7 +19,9 @@ _WITHOUT_STARS: Final = frozenset({"too_few_stars", "no_match", "prediction_lost
 
 
 def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tuple[str, ...]:
-    """Return which of `sun`, `moon` and `earth` are in the field of view, with any part of their discs."""
+    """Return which of `sun`, `moon` and `earth` are in the field of view, with any part of their discs; none behind a cover."""
+    if sky.blank:
+        return ()
     bodies: tuple[tuple[str, float, float, float], ...] = ()
     if sky.sun is not None:
         bodies += (("sun", sky.sun.ra_deg, sky.sun.dec_deg, 0.0),)

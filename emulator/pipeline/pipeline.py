@@ -313,9 +313,7 @@ class Pipeline:
         )
         valid = solution.valid
         x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
-        reason = REASONS[solution.reason]
-        if not valid and found.reason and len(found.flux) == 0:
-            reason = "detection_failed"
+        reason = REASONS[solution.reason] if found.searchable else "detection_failed"
         rate = solution.rate_rad_s
         return FrameResult(
             index=request.index,

@@ -91,6 +91,8 @@ class DeviceDictionary(Dictionary):
         self._writers: dict[Key, Writer] = {}
         self._sizes: dict[Key, int] = {}
         self._names: dict[str, Key] = {}
+        self._placed: dict[tuple[str, str, int | None], Key] = {}
+        """Kind, name and slot of a row → entry that holds it; the slot is None for the whole row."""
         self._cache: dict[str, bytes] = {}
         self._cached_at = -1
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
@@ -125,6 +127,23 @@ class DeviceDictionary(Dictionary):
             raise IcdError(f"canopen.toml: no object {name!r} to map")
         return key
 
+    def entries_of(self, row: Row) -> list[tuple[Key, Slot | None]]:
+        """Return the entries that hold a row: one per slot, or one for the whole row, with None for its slot.
+
+        Raises
+        ------
+        IcdError
+            No entry holds the row, or some slot of it.
+        """
+        whole = self._placed.get((row.kind, row.name, None))
+        if whole is not None:
+            return [(whole, None)]
+        slots = [slot for slot, _ in _slots(row)]
+        held = [(key, slot) for slot in slots if (key := self._placed.get((row.kind, row.name, slot.index)))]
+        if len(held) < max(1, len(slots)):
+            raise IcdError(f"unit {self.icd.name}: no entry of its object dictionary holds {row.name}")
+        return list(held)
+
     def _add_object(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
         if placed.index in objects.indices:
             raise IcdError(f"canopen.toml: index {placed.index:04X}h is used twice")
@@ -152,6 +171,7 @@ class DeviceDictionary(Dictionary):
             if row.kind == "telemetry":
                 member = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
                 self._bind_reader(key, row, row.name, partial(self.row_bytes, row))
+                self._placed[row.kind, row.name, None] = key
             else:
                 member = self._telecommand_variable(row.name, key, row)
             member.description = row.doc
@@ -167,6 +187,7 @@ class DeviceDictionary(Dictionary):
             _describe(member, fields)
             for field in fields:
                 self._bind_reader(key, row, field.name, partial(self._read_slot, row, slot))
+            self._placed[row.kind, row.name, slot.index] = key
             members.append(member)
         add_record(objects, placed.name, members)
 
@@ -184,6 +205,7 @@ class DeviceDictionary(Dictionary):
             else:
                 member.access_type = "rw"
             self._bind_reader(key, row, name, partial(self._read_slot, row, slot))
+            self._placed[row.kind, row.name, slot.index] = key
         return member
 
     def _place_members(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
@@ -215,10 +237,7 @@ class DeviceDictionary(Dictionary):
             default = int(default)
         data_type = DATA_TYPES[parameter.type]
         member = variable(name, *key, data_type, "rw", default, mappable=True)
-        low, high = parameter.minimum, parameter.maximum
-        if parameter.type == "f32":
-            low, high = min(low, to_f32(low)), max(high, to_f32(high))
-        set_limits(member, low, high)
+        set_limits(member, *_held_limits(parameter.type, parameter.minimum, parameter.maximum))
         member.unit = parameter.unit
         member.description = parameter.doc
         if parameter.enum is not None:
@@ -281,10 +300,12 @@ class DeviceDictionary(Dictionary):
 
         The client writes the only value, all bytes, or 1 if the telecommand has no data.
         """
+        scalar = len(row.slots) == 1 and row.slots[0].type != "bytes"
+        self._placed[row.kind, row.name, row.slots[0].index if scalar else None] = key
         if row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
             self._writers[key] = partial(self._execute_without_data, row)
-        elif len(row.slots) == 1 and row.slots[0].type != "bytes":
+        elif scalar:
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
             _describe(member, fields)
@@ -306,13 +327,13 @@ class DeviceDictionary(Dictionary):
         return self.application.telecommand(row, payload)
 
     def _execute_scalar(self, row: Row, payload: bytes) -> Deferred | None:
-        return self._execute(row, _in_order(row.slots[0], payload))
+        return self._execute(row, in_order(row.slots[0], payload))
 
     def _execute_without_data(self, row: Row, _data: bytes) -> Deferred | None:
         return self._execute(row, b"")
 
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
-        return _in_order(slot, self.row_bytes(row)[_span(slot)])
+        return in_order(slot, self.row_bytes(row)[span_of(slot)])
 
     def _bind_reader(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
         self._readers[key] = reader
@@ -366,7 +387,7 @@ class _Packer:
     def __call__(self) -> bytes:
         data = self._dictionary.row_bytes(self._row)
         if self._field is None:
-            raw = int.from_bytes(data[_span(self._slot)], self._slot.order)
+            raw = int.from_bytes(data[span_of(self._slot)], self._slot.order)
         else:
             value = self._row.decode(data)[self._field.name]
             number = value if isinstance(value, int | float) else self._raw(value)
@@ -419,11 +440,12 @@ def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
     return slots
 
 
-def _span(slot: Slot) -> slice:
+def span_of(slot: Slot) -> slice:
+    """Return the bytes of a slot in its row."""
     return slice(slot.offset, slot.offset + slot.size)
 
 
-def _in_order(slot: Slot, data: bytes) -> bytes:
+def in_order(slot: Slot, data: bytes) -> bytes:
     """Change bytes between the order of a slot and that of CANopen, little-endian."""
     return data[::-1] if slot.order == "big" and slot.type != "bytes" else data
 
@@ -445,4 +467,10 @@ def _describe(member: ODVariable, fields: list[Field]) -> None:
     if first.enum is not None:
         member.value_descriptions = dict(first.enum.names)
     elif first.minimum is not None or first.maximum is not None:
-        set_limits(member, *(first.physical_limits if first.kind == "float" else first.raw_limits))
+        limits = first.physical_limits if first.kind == "float" else first.raw_limits
+        set_limits(member, *_held_limits(first.slot.type, *limits))
+
+
+def _held_limits(kind: str, low: float, high: float) -> tuple[float, float]:
+    """Return limits that a number of a type can equal: the nearest f32 may lie just outside those of the definition."""
+    return (min(low, to_f32(low)), max(high, to_f32(high))) if kind == "f32" else (low, high)

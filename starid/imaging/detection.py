@@ -154,6 +154,8 @@ class Detections:
         Candidates above the noise that are not stars: hot pixels, bodies, edges.
     reason : str
         Why no star was found; empty otherwise.
+    searchable : bool
+        False if the image cannot be searched because it is saturated all over; an image without stars can.
     """
 
     xy_px: npt.NDArray[np.float64]
@@ -168,6 +170,7 @@ class Detections:
     trail_px: float
     rejected: int
     reason: str
+    searchable: bool = True
 
     @property
     def sigma_px(self) -> npt.NDArray[np.float64]:
@@ -204,7 +207,8 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     saturation = chosen.saturation_dn if chosen.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
     background = estimate_background(counts, chosen.block_px)
     if background.median_level >= saturation:
-        return _no_detections(background, "image is saturated all over: shorten the exposure")
+        found = _no_detections(background, "image is saturated all over: shorten the exposure")
+        return dataclasses.replace(found, searchable=False)
     sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
     peaks, heights = _peaks(counts, background, sigma, chosen.threshold_sigma)
     shape = _estimate_shape(counts, background, peaks, chosen, saturation)

@@ -116,3 +116,15 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
     said = [record.getMessage() for record in caplog.records if record.name == "starhil.record"]
     assert len(said) == 1
     assert said[0].endswith("ends here (No space left on device); the run goes on")
+
+
+def test_each_head_has_a_file_of_its_own(run, tmp_path):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(4.0)
+
+    off = {"serial": {"port": "off"}, "can": {"channel": "off"}}
+    tracking = {"links": off, "parameters": {"start_mode": "lost_in_space"}}
+    other = {"run": {"clock": "stepped", "seed": 2}, **tracking}
+    run(scenario, options=options(tmp_path / "run.mcap"), others=[other], **tracking)
+    first, second = (messages(tmp_path / name) for name in ("run.mcap", "run.2.mcap"))
+    assert len(first["/measurement"]) == len(second["/measurement"]) >= 2

@@ -3,15 +3,19 @@
 import asyncio
 import json
 import socket
+import tomllib
 from contextlib import AsyncExitStack
 from dataclasses import replace
+from types import SimpleNamespace
 
 import aiohttp
 import numpy as np
 import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
+from starhil.emulator.console.describe import fault_controls
 from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.obc import ConsoleObc, Exchange
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
@@ -30,8 +34,8 @@ WITHIN_S = 20.0
 class Page:
     """A page of a console."""
 
-    def __init__(self, emulation):
-        self.address = emulation.ready_fields["view"]
+    def __init__(self, emulation, head=None):
+        self.address = emulation.ready_fields["view"] + (f"&head={head}" if head is not None else "")
         self.messages = []
         self.frames = []
         self.history = None
@@ -46,6 +50,11 @@ class Page:
         hello = await self.until(lambda: self.history is not None)
         assert hello
         return self
+
+    async def refusal(self):
+        """Return the text with which a page is refused."""
+        async with aiohttp.ClientSession() as session, session.get(self.url("/ws")) as response:
+            return await response.text()
 
     async def __aexit__(self, *_):
         await self.socket.close()
@@ -262,21 +271,51 @@ def test_what_the_console_sent_is_a_session_script(run, tmp_path):
         async with Page(emulation) as page:
             assert "nothing was sent yet" in await page.get("/session.toml")
             await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
-            await asyncio.sleep(0.06)
             await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
             await page.ask(do="send", row="clear_counters", values={})
             await page.ask(do="read", row="device_status")
             path = tmp_path / "session.toml"
             path.write_text(await page.get("/session.toml"))
             script = load_script(path, load_unit())
-            names = [step.name for step in script.steps]
-            assert len(names) == 5  # the pause is a step too
-            assert script.steps[2].action.refused == "invalid_parameter"
-            assert script.steps[0].action.values == {"mode": "lost_in_space"}
+            mode, rate, *others = [step for step in script.steps if not step.name.startswith("wait")]
+            assert mode.action.values == {"mode": "lost_in_space"}
+            assert rate.action.refused == "invalid_parameter"
+            assert len(others) == 2
             await page.ask(do="clear_session")
             assert "nothing was sent yet" in await page.get("/session.toml")
 
     run(scenario, options=OPTIONS)
+
+
+class SlowClient:
+    """An OBC whose device answers after a while."""
+
+    def __init__(self, clock):
+        self.clock = clock
+
+    async def exchange(self, _row, _data):
+        self.clock.now_s += 0.8
+        return Exchange("ok", latency_s=0.8)
+
+
+def test_a_pause_between_two_telecommands_is_a_step_and_a_slow_reply_is_none():
+    clock = SimpleNamespace(now_s=100.0)
+    obc = ConsoleObc(SlowClient(clock), load_unit(), lambda: clock.now_s)
+
+    async def scenario():
+        await obc.send("clear_counters", {})
+        await obc.send("clear_counters", {})
+        clock.now_s += 1.5
+        await obc.send("clear_counters", {})
+
+    asyncio.run(scenario())
+    steps = tomllib.loads(obc.session("Pauses"))["step"]
+    assert steps == [
+        {"command": "clear_counters"},
+        {"command": "clear_counters"},
+        {"wait_s": 1.5},
+        {"command": "clear_counters"},
+    ]
 
 
 def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):
@@ -296,15 +335,28 @@ def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):
             assert (await page.ask(do="control", request=3))["error"] == "request: must be an object"
             assert "do: must be one of" in (await page.ask(do="fly"))["error"]
             assert (await page.ask(do="control", request={"do": "clear_faults"}))["faults"] == {}
-            slew = await page.ask(do="slew", to={"star": "rigel"}, max_rate_deg_s=2.0)
+            slew = await page.ask(do="point", kind="slew", to={"star": "rigel"}, max_rate_deg_s=2.0)
             assert slew["kind"] == "slew"
             await emulation.stepper.step(60.0)
             truth = await page.ask(do="control", request={"do": "truth"})
             assert (truth["ra_deg"], truth["dec_deg"]) == pytest.approx((78.634, -8.202), abs=0.01)
-            unknown = await page.ask(do="slew", to={"star": "Nibiru"})
+            unknown = await page.ask(do="point", kind="slew", to={"star": "Nibiru"})
             assert unknown["error"].startswith("star 'Nibiru': unknown")
 
     run(scenario, options=OPTIONS)
+
+
+def test_every_fault_of_the_device_has_a_control_with_the_values_that_it_takes():
+    icd = load_unit()
+    device = next(level["controls"] for level in fault_controls(icd, ["can"]) if level["level"] == "device")
+    controls = {control["name"]: control for control in device}
+    upset = {control["name"]: control for control in controls.pop("upset")["controls"]}
+    assert upset["parameter"]["values"] == list(icd.device_parameters)
+    assert (upset["bit"]["kind"], upset["bit"]["min"], upset["bit"]["max"]) == ("integer", 0, 63)
+    assert (upset["star"]["kind"], upset["star"]["max"]) == ("integer", 200_000)
+    assert controls.pop("stuck")["kind"] == "flag"
+    assert set(controls) == {"error", "reset"}
+    assert all(control["kind"] == "choice" and control["values"] for control in controls.values())
 
 
 def test_a_scenario_from_the_page_begins_now(run, tmp_path):
@@ -380,6 +432,93 @@ def test_five_pages_receive_every_frame(run):
                     await page.until_frame(emulation.device.cycle.published)
 
     run(scenario, options=OPTIONS)
+
+
+def test_a_page_that_joins_late_receives_the_newest_image_at_once(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        async with Page(emulation) as first:
+            await first.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(3.0)
+            newest = emulation.device.cycle.published
+            await first.until_frame(newest)
+            async with Page(emulation) as late:
+                await late.ask(do="subscribe", frames=True)
+                await late.until_frame(newest)
+                assert late.frames[-1][1] == PREVIEW.jpeg
+
+    run(scenario, options=OPTIONS)
+
+
+ALONG_X = {"matrix": [[0, 0, -1], [0, 1, 0], [1, 0, 0]]}
+
+
+def test_each_head_has_a_page_of_its_own_on_a_clock_of_all(run):
+    async def scenario(emulation, _line):
+        async with Page(emulation) as first, Page(emulation, head=2) as second:
+            for number, page in enumerate((first, second), start=1):
+                assert page.messages[0]["head"] == number
+                assert len(page.messages[0]["heads"]) == 2
+                assert page.messages[0]["seed"] == number
+                await page.ask(do="subscribe", frames=True)
+            await first.ask(do="clock", speed=10)
+            await second.message("status", lambda item: item["stepping"] == 10)
+            await second.until(lambda: second.frames and column(second.frames[-1][0]["row"], "valid"))
+            await second.ask(do="clock", speed=0)
+            await second.ask(do="control", request={"do": "fault", "device": {"stuck": True}})
+            assert (await second.ask(do="read", row="device_status"))["outcome"] == "no_reply"
+            assert (await first.ask(do="read", row="device_status"))["outcome"] == "ok"
+            assert run.launched.heads[0].faults.describe() == {}
+            slew = {"kind": "slew", "to": {"star": "rigel", "roll_deg": 20.0}, "max_rate_deg_s": 5.0}
+            await second.ask(do="point", **slew)
+            await emulation.stepper.step(60.0)
+            truth = await second.ask(do="control", request={"do": "truth"})
+            assert (truth["ra_deg"], truth["dec_deg"]) == pytest.approx((78.634, -8.202), abs=0.01)
+            assert truth["roll_deg"] == pytest.approx(20.0)
+            assert "head: '3' given, must be 1 to 2" in await Page(emulation, head=3).refusal()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": "off"}}
+    parameters = {"start_mode": "lost_in_space"}
+    mounted = {"kind": "fixed", "mount": ALONG_X}
+    second = {
+        "links": links,
+        "parameters": parameters,
+        "truth": mounted,
+        "run": {"clock": "stepped", "seed": 2},
+    }
+    run(scenario, options=OPTIONS, others=[second], links=links, parameters=parameters)
+
+
+@pytest.mark.parametrize("mount", [None, ALONG_X])
+def test_the_sensor_points_turns_and_stands_as_the_page_asks_however_it_is_mounted(run, mount):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+
+            async def truth():
+                return await page.ask(do="control", request={"do": "truth"})
+
+            begin = (await truth())["quaternion_xyzw"]
+            await page.ask(do="point", kind="rate", rate_deg_s=[0.1, 0.2, 0.3])
+            turning = await truth()
+            assert turning["quaternion_xyzw"] == pytest.approx(begin)
+            assert turning["rate_deg_s"] == pytest.approx([0.1, 0.2, 0.3])
+            await emulation.stepper.step(10.0)
+            before = (await truth())["quaternion_xyzw"]
+            await page.ask(do="point", kind="fixed", to={})
+            assert (await truth())["quaternion_xyzw"] == pytest.approx(before)
+            await page.ask(do="point", kind="fixed", to={"ra_deg": 10.0, "dec_deg": 20.0, "roll_deg": 30.0})
+            still = await truth()
+            assert [still[f"{name}_deg"] for name in ("ra", "dec", "roll")] == pytest.approx(
+                [10.0, 20.0, 30.0]
+            )
+            wrong = await page.ask(do="point", kind="fixed", to={"ra_deg": 10.0, "dec_deg": 95.0})
+            assert "dec_deg" in wrong["error"]
+            assert "kind" in (await page.ask(do="point", kind="fly"))["error"]
+            assert "rate_deg_s" in (await page.ask(do="point", kind="rate", rate_deg_s=[1.0]))["error"]
+
+    run(scenario, options=OPTIONS, truth={"kind": "fixed", "mount": mount} if mount else {"kind": "fixed"})
 
 
 class StalledSocket:
@@ -462,28 +601,54 @@ def test_the_candump_log_has_the_frames_of_the_bus(run):
     )
 
 
+LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
+
+
 @pytest.mark.parametrize(
-    ("unit", "link", "outcome"),
+    ("unit", "links"),
     [
-        ("sagitta", "serial", "ok"),
-        ("st16", "serial", "ok"),
-        ("cubestar-gen2", "can", "ok"),
-        ("oresat", "can", "no_link"),
+        ("sagitta", {"serial": {"port": "auto"}}),
+        ("st16", {"serial": {"port": "auto"}}),
+        ("cubestar-gen2", {"can": {"channel": "virtual:console-unit"}}),
+        ("oresat", {"can": {"channel": "virtual:console-unit"}}),
+        ("oresat", {}),
     ],
 )
-def test_a_unit_of_any_kind_is_reached_over_the_link_that_it_has(run, unit, link, outcome):
+def test_a_unit_of_any_kind_is_reached_over_the_link_that_it_has(run, unit, links):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:
             hello = page.messages[0]
             assert hello["unit"]["name"] == emulation.icd.name
-            answer = await page.ask(do="read", row=hello["telemetry"][0]["name"])
-            assert answer["outcome"] == outcome
-            assert bool(answer["values"]) == (outcome == "ok")
+            for row in hello["telemetry"][:3]:
+                answer = await page.ask(do="read", row=row["name"])
+                assert answer["outcome"] == "ok"
+                assert answer["values"]
 
-    wanted = {"serial": {"port": "auto"}, "can": {"channel": "virtual:console-unit"}}
-    off = {"serial": {"port": "off"}, "can": {"channel": "off"}}
-    run(scenario, options=OPTIONS, unit=unit, links={**off, link: wanted[link]})
+    run(scenario, options=OPTIONS, unit=unit, links={**LINKS_OFF, **links})
+
+
+def test_a_unit_with_canopen_only_is_commanded_by_sdo(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            shown = await page.ask(do="encode", row="set_status", values={"status": "4"})
+            assert (shown["serial"], shown["cansend"]) == ("", ["62C#2F00400004000000"])
+            await page.ask(do="subscribe", wire=True)
+            assert (await page.ask(do="send", row="set_status", values={"status": "4"}))["outcome"] == "ok"
+            assert emulation.device.modes.mode == "lost_in_space"
+            traced = await page.message("wire", lambda item: item["lines"])
+            assert traced["lines"][0]["raw"] == shown["cansend"][0]
+            refused = await page.ask(do="send", row="set_status", values={"status": "77"})
+            assert (refused["outcome"], refused["refused"]) == ("invalid_parameter", True)
+            assert (await page.ask(do="read", row="status"))["values"] == {"status": "lost_in_space"}
+
+    run(
+        scenario,
+        options=OPTIONS,
+        unit="oresat",
+        links={**LINKS_OFF, "can": {"channel": "virtual:console-sdo"}},
+    )
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ def error_arcsec(result: FrameResult) -> float:
         (SkyObjects(sun=SunGlare(150.0, 0.0)), ()),
         (SkyObjects(moon=Moon(105.0, -1.2)), ("moon",)),
         (SkyObjects(moon=Moon(106.0, -1.2)), ()),
+        (SkyObjects(moon=Moon(90.0, -1.2), blank=True), ()),
         (SkyObjects(earth=EarthLimb(83.8, 84.0, radius_deg=64.5)), ("earth",)),
         (SkyObjects(earth=EarthLimb(83.8, 86.0, radius_deg=64.0)), ()),
         (SkyObjects(sun=SunGlare(90.0, 5.0), earth=EarthLimb(83.8, -1.2)), ("sun", "earth")),
@@ -62,6 +63,20 @@ def test_the_earth_across_the_field_blinds_the_sensor(pipeline):
     earth = {"ra_deg": 83.8, "dec_deg": -1.2, "electrons_s": 1e6}
     result = pipeline.handle(replace(REQUEST, faults={"earth": earth}))
     assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("earth",))
+
+
+def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline):
+    for index, predicted in ((10, None), (11, as_quaternion(ORION)), (12, None), (13, as_quaternion(ORION))):
+        for cover in ({"blank": True}, {"blocked_share": 1.0}):
+            request = replace(REQUEST, index=index, predicted_xyzw=predicted, faults=cover)
+            result = pipeline.handle(request)
+            assert (result.valid, result.reason, result.matched) == (False, "too_few_stars", 0), cover
+
+
+def test_an_image_that_is_saturated_all_over_cannot_be_searched(pipeline):
+    glare = {"sun": {"ra_deg": 150.0, "dec_deg": 0.0, "electrons_s": 1e8}}
+    result = pipeline.handle(replace(REQUEST, index=14, faults=glare))
+    assert (result.valid, result.reason, result.detected) == (False, "detection_failed", 0)
 
 
 def test_particles_of_the_place_are_added_to_those_of_the_sky(pipeline):

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import struct
 
+import pytest
+
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.errors import NackError
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
 
 NODE = 0x2C
@@ -127,3 +132,21 @@ def test_unit_whose_only_link_is_canopen_opens_it_by_itself(run):
     links = {"serial": {"port": "auto"}, "can": {"channel": "auto"}}
     line = run(scenario, unit="oresat", links=links)
     assert f"canopen={NODE}" in line.split()
+
+
+def test_the_bench_commands_and_reads_the_card_by_name(run):
+    channel = "virtual:oresat-bench"
+
+    def drive():
+        with ObcClient.open(can=channel, unit="oresat", timeout_s=20.0) as obc:
+            obc.command("set_status", status="lost_in_space")
+            with pytest.raises(NackError, match="invalid_parameter"):
+                obc.command("set_status", status=77, checked=False)
+            return obc.telemetry("status"), obc.telemetry("orientation")["attitude_known"]
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        return await asyncio.to_thread(drive)
+
+    links = {"serial": {"port": "off"}, "can": {"channel": channel}}
+    assert run(scenario, unit="oresat", links=links) == ({"status": "lost_in_space"}, False)

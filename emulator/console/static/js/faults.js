@@ -40,7 +40,7 @@ export class Faults {
   // A control of one value: `read` returns the value, or undefined if it was left as it is by default.
   control(control) {
     if (control.kind === "group") return this.group(control);
-    const label = make("span", { text: control.name.replaceAll("_", " ") });
+    const label = make("span", { text: control.name, title: control.name });
     const range = control.min !== undefined && control.min !== null ? `${short(control.min)} … ${short(control.max)}` : "";
     let input;
     let read;
@@ -118,13 +118,21 @@ export class Faults {
     for (const [level, content] of Object.entries(active)) {
       for (const [name, item] of Object.entries(content)) {
         const idle = level !== "optical" && (item === 0 || item === false || name === "gap_s");
-        if (!idle) chips.push(make("li", { text: `${LEVELS[level] || level}: ${name.replaceAll("_", " ")} ${item === true ? "" : JSON.stringify(item)}` }));
+        if (!idle) chips.push(make("li", { text: `${LEVELS[level] || level}: ${name} ${shown(item)}` }));
       }
     }
     this.count = chips.length;
     this.now.replaceChildren(...(chips.length ? chips : [make("li", { class: "dim none", text: "no fault" })]));
     this.store.emit("faults", this.count);
   }
+}
+
+// A fault's value in one line.
+function shown(item) {
+  if (item === true) return "";
+  if (typeof item !== "object" || item === null) return String(item);
+  if (Array.isArray(item)) return item.map(shown).join("; ");
+  return Object.entries(item).map(([name, each]) => `${name} ${shown(each)}`).join(", ");
 }
 
 function values(controls) {

@@ -1,12 +1,14 @@
 // The WebSocket to the emulator: requests with answers, messages, frames, and reconnection.
 
-const TOKEN = new URLSearchParams(location.search).get("token") || "";
+const QUERY = new URLSearchParams(location.search);
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 5000;
 const FRAME = 70; // "F"
 
-export function address(path) {
-  return `${path}?token=${encodeURIComponent(TOKEN)}`;
+// The address of a path, for this page's head or another one.
+export function address(path, head = QUERY.get("head")) {
+  const query = new URLSearchParams({ token: QUERY.get("token") || "", ...(head && { head }) });
+  return `${path}?${query}`;
 }
 
 export class Link {

@@ -5,6 +5,7 @@ import { Faults } from "./faults.js";
 import { duration, fixed, make, setText, utc } from "./format.js";
 import { Link, address } from "./link.js";
 import { SkyMap } from "./map.js";
+import { Runs } from "./runs.js";
 import { Sky } from "./sky.js";
 import { Store } from "./store.js";
 import { Telecommands } from "./telecommands.js";
@@ -17,7 +18,6 @@ const TABS = ["telemetry", "telecommands", "wire", "faults", "truth"];
 const $ = (id) => document.getElementById(id);
 
 initTheme($("theme"));
-$("runs-page").href = address("/runs");
 
 const store = new Store();
 const link = new Link({
@@ -39,8 +39,27 @@ const panels = {
   faults: new Faults(store, link),
   truth: new Truth(store, link),
 };
+new Runs(store);
 link.subscribe({ frames: true });
 document.addEventListener("visibilitychange", () => link.send());
+
+// --- console or runs, by the path ---
+
+function openPage() {
+  const runs = location.pathname === "/runs";
+  $("console").hidden = runs;
+  $("runs").hidden = !runs;
+  setText($("other-page"), runs ? "console" : "runs");
+  $("other-page").href = address(runs ? "/" : "/runs");
+}
+
+$("other-page").addEventListener("click", (event) => {
+  event.preventDefault();
+  history.pushState(null, "", $("other-page").href + location.hash);
+  openPage();
+});
+window.addEventListener("popstate", openPage);
+openPage();
 
 // --- tabs ---
 
@@ -65,14 +84,18 @@ openTab(TABS.includes(location.hash.slice(1)) ? location.hash.slice(1) : "teleme
 
 // --- the line at the top ---
 
+$("head").addEventListener("change", () => location.assign(address(location.pathname, $("head").value) + location.hash));
+
 store.on("hello", (hello) => {
   setText($("unit"), `${hello.profile} · seed ${hello.seed} · clock ${hello.clock}`);
   document.title = `starhil · ${hello.profile}`;
+  $("head").replaceChildren(...hello.heads.map((name, number) => make("option", { value: String(number + 1), text: name, selected: number + 1 === hello.head })));
+  $("head").hidden = hello.heads.length < 2;
   $("unit").title = Object.entries(hello.links).map(([name, where]) => `${name} ${where}`).join("\n");
 });
 
 store.on("faults", (count) => {
-  setText($("active"), count ? `${count} active` : "none");
+  setText($("active"), count ? `${count} fault${count === 1 ? "" : "s"}` : "no fault");
   $("active").dataset.state = count ? "bad" : "idle";
 });
 
@@ -124,7 +147,7 @@ function showMoment(item) {
   setText($("when"), store.cursor === null ? "live" : `${duration(item("run_s"))}  (−${fixed(behind, 1)} s)`);
   if (!image) return;
   const head = image.head;
-  const apart = store.cursor === null ? 0 : image.time - item("run_s");
+  const apart = image.time - item("run_s");
   const note = Math.abs(apart) > 0.5 ? ` (image ${fixed(apart, 1)} s apart)` : "";
   const late = head.late ? " late" : "";
   setText($("frame-info"), `frame ${fixed(head.row[store.rows.index.frame], 0)}${late}  rejected ${head.rejected}${note}`);

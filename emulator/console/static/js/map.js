@@ -61,7 +61,7 @@ export class SkyMap {
     context.fillStyle = colour("dim");
     context.font = `${Math.max(9, this.radius / 12)}px system-ui, sans-serif`;
     context.textAlign = "center";
-    for (const hours of [0.01, 6, 12, 18]) context.fillText(`${Math.round(hours)}h`, ...this.place(15 * hours, 1.5));
+    for (const hours of [0.01, 6, 12, 18]) context.fillText(`${Math.round(hours)}h`, ...this.place(15 * hours, -7));
     this.base = base;
     this.draw();
   }
@@ -117,7 +117,10 @@ export class SkyMap {
     context.arc(x, y, (body.name === "sun" ? 5 : 3.5) * pen(), 0, 2 * Math.PI);
     context.fill();
     context.textAlign = "left";
-    context.fillText(body.name, x + 7 * pen(), y + 4 * pen());
+    context.strokeStyle = colour("map");
+    context.lineWidth = 4 * pen();
+    context.strokeText(body.name, x + 7 * pen(), y - 3 * pen());
+    context.fillText(body.name, x + 7 * pen(), y - 3 * pen());
   }
 
   // The outline of the field of view.

@@ -1,31 +1,22 @@
 // Session and conformance runs: the list, the one that is chosen, and its results as they come.
 
 import { duration, make, setText } from "./format.js";
-import { Link, address } from "./link.js";
-import { initTheme, toggleTheme } from "./theme.js";
 
 const MARKS = { passed: "✓", failed: "✗", skipped: "–", "not run": "·" };
 const $ = (id) => document.getElementById(id);
-
-initTheme($("theme"));
-document.addEventListener("keydown", (event) => event.key === "t" && toggleTheme());
-$("console-page").href = address("/");
 
 const runs = new Map();
 let chosen = null;
 let follow = true;
 
-new Link({
-  message: (message) => {
-    if (message.type === "hello") runs.clear();
-    if (message.type === "run") begin(message);
-    if (message.type === "result") add(message);
-  },
-  state: (state) => {
-    setText($("link"), state);
-    $("link").dataset.state = state;
-  },
-});
+export class Runs {
+  constructor(store) {
+    store.on("hello", () => runs.clear());
+    store.on("run", begin);
+    store.on("result", add);
+    $("only-failed").addEventListener("change", show);
+  }
+}
 
 function begin(message) {
   const known = runs.get(message.run);
@@ -64,13 +55,13 @@ function list() {
     "li", { class: run.run === chosen ? "on" : "", "data-state": state(run), onclick: () => { chosen = run.run; follow = run === [...runs.values()].at(-1); list(); show(); } },
     make("b", { text: run.title }),
     make("span", { class: "dim", text: `${run.kind}, ${new Date(run.begin_s * 1000).toTimeString().slice(0, 8)}` }),
-    make("span", { class: "num", text: `${done(run)}/${run.planned} ${run.end_s === null ? "running" : run.counts.failed ? "failed" : "passed"}` }),
+    make("span", { class: "num", text: `${done(run)} of ${run.planned}, ${run.counts.failed ? `${run.counts.failed} failed` : run.end_s === null ? "running" : "passed"}` }),
   )));
 }
 
 function head(run) {
   setText($("title"), run.title);
-  setText($("unit"), `${run.kind} · ${run.unit}${run.end_s === null ? "" : ` · ${duration(run.end_s - run.begin_s)}`}`);
+  setText($("run-unit"), `${run.kind} · ${run.unit}${run.end_s === null ? "" : ` · ${duration(run.end_s - run.begin_s)}`}`);
   setText($("counts"), Object.entries(run.counts).filter(([, count]) => count).map(([name, count]) => `${count} ${name}`).join("  "));
   $("progress").dataset.state = state(run);
   $("progress").firstElementChild.style.width = `${run.planned ? Math.min(100, (100 * done(run)) / run.planned) : 0}%`;
@@ -94,5 +85,3 @@ function show() {
   head(run);
   $("results").replaceChildren(...run.results.filter(wanted).map(line));
 }
-
-$("only-failed").addEventListener("change", show);

@@ -171,10 +171,11 @@ export class Sky {
       context.strokeStyle = colour("on-sky-bad");
       context.stroke();
     }
-    context.strokeStyle = context.fillStyle = colour("on-sky-body");
+    const ink = colour("on-sky-body");
     context.font = this.font();
     for (const body of head.bodies || []) {
       let label = null;
+      context.strokeStyle = ink;
       context.beginPath();
       let drawing = false;
       for (const point of body.outline_px) {
@@ -190,7 +191,7 @@ export class Sky {
         drawing = true;
       }
       context.stroke();
-      if (label) context.fillText(body.name, Math.min(label[0] + 6, this.stage.clientWidth - 50), Math.max(label[1] - 6, 14));
+      if (label) this.label(context, body.name, Math.min(label[0] + 6, this.stage.clientWidth - 50), Math.max(label[1] - 6, 14), ink);
     }
     context.strokeStyle = colour("on-sky-bad");
     for (const [x, y] of head.false_stars || []) {

@@ -107,11 +107,12 @@ export class Store {
     this.emit("rows");
   }
 
+  // A page that begins to look is sent the newest image, whose row is in the history already.
   frame(head, blob) {
     if (!this.rows) return;
-    this.rows.push(head.row);
     const time = head.row[this.rows.index.run_s];
-    if (blob) {
+    if (!this.rows.length || time > this.now) this.rows.push(head.row);
+    if (blob && !(this.images.length && time <= this.images.at(-1).time)) {
       this.images.push({ time, head, blob });
       this.thin(time);
     }

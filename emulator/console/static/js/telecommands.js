@@ -20,7 +20,7 @@ export class Telecommands {
     this.rows = new Map(hello.telecommands.map((row) => [row.name, row]));
     this.parameters = hello.parameters;
     this.select = make("select", { id: "telecommand", size: "7", "aria-label": "telecommand", onchange: () => this.choose(this.select.value) });
-    for (const row of hello.telecommands) this.select.append(make("option", { value: row.name, text: `${String(row.id).padStart(3, " ")}  ${row.name}` }));
+    for (const row of hello.telecommands) this.select.append(make("option", { value: row.name, text: `${String(row.id).padStart(3, "\u2007")}  ${row.name}` }));
     this.form = make("form", { id: "telecommand-form", onsubmit: (event) => this.send(event) });
     this.log = this.log || make("ol", { class: "log scroll", id: "sent" });
     this.steps = make("output", { class: "num dim", text: "0 sent" });
@@ -98,7 +98,7 @@ export class Telecommands {
     const outcome = item.ok ? item.outcome : "not sent";
     const good = item.ok && item.outcome === "ok";
     const pairs = Object.entries(item.values && item.kind === "command" ? item.values : {}).map(([key, one]) => `${key}=${one}`).join(" ");
-    const text = good ? `${item.kind === "command" ? "accepted" : "read"} in ${item.latency_ms.toFixed(1)} ms` : item.ok ? (item.refused ? `refused: ${outcome}` : outcome.replaceAll("_", " ")) : item.error;
+    const text = good ? `${item.kind === "command" ? "accepted" : "read"} in ${item.latency_ms.toFixed(1)} ms` : item.ok ? (item.refused ? `refused: ${outcome}` : item.detail) : item.error;
     const line = make("li", { class: good ? "good" : "bad" }, make("time", { class: "num dim", text: wall(Date.now() / 1000).slice(0, 8) }), make("b", { text: item.row }), make("span", { class: "num", text: pairs }), make("span", { class: "outcome", text }));
     this.log.prepend(line);
     while (this.log.children.length > KEPT_LINES) this.log.lastChild.remove();

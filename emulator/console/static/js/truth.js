@@ -17,20 +17,11 @@ export class Truth {
     const stars = make("datalist", { id: "star-names" }, ...Object.values(hello.star_names).sort().map((name) => make("option", { value: name })));
     const slew = this.form("slew", "slew", [["star", "", "or a direction:", "star-names"], ["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "° (as now if empty)"], ["max_rate_deg_s", "0.5", "°/s"]], (values) => {
       const { max_rate_deg_s: rate, ...to } = values;
-      return this.link.request({ do: "slew", to, max_rate_deg_s: rate });
+      return this.link.request({ do: "point", kind: "slew", to, max_rate_deg_s: rate });
     });
-    const rate = this.form("rate", "turn", [["x", "0", "°/s"], ["y", "0", "°/s"], ["z", "0", "°/s"]], async (values) => {
-      const truth = await this.link.control({ do: "truth" });
-      if (!truth.ok) return truth;
-      return this.set({ kind: "rate", attitude: { quaternion_xyzw: truth.quaternion_xyzw }, rate_deg_s: [values.x || 0, values.y || 0, values.z || 0] });
-    });
-    const still = this.form("fixed", "stand still", [["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "°"]], async (values) => {
-      if (values.ra_deg === undefined) {
-        const truth = await this.link.control({ do: "truth" });
-        return truth.ok ? this.set({ kind: "fixed", attitude: { quaternion_xyzw: truth.quaternion_xyzw } }) : truth;
-      }
-      return this.set({ kind: "fixed", attitude: values });
-    });
+    const rate = this.form("rate", "turn", [["x", "0", "°/s"], ["y", "0", "°/s"], ["z", "0", "°/s"]], (values) => (
+      this.link.request({ do: "point", kind: "rate", rate_deg_s: ["x", "y", "z"].map((axis) => values[axis] || 0) })));
+    const still = this.form("fixed", "stand still", [["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "°"]], (to) => this.link.request({ do: "point", kind: "fixed", to }));
     const json = make("textarea", { rows: "3", spellcheck: "false", "aria-label": "truth as JSON" });
     json.value = '{"kind": "live", "protocol": "udp", "port": 0}';
     const other = make("fieldset", {}, make("legend", { text: "file, feed or sequence: the keys of [truth], as JSON" }), json, make("button", {

@@ -1,0 +1,109 @@
+"""Where the sensor points: requests for a slew, a turn or a fixed attitude, as truth of the body that carries it."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.config import AttitudeConfig
+from starhil.emulator.validation_messages import explain
+from starid.attitude import Attitude
+from starid.catalog import load_catalog
+from starid.star_names import STAR_NAMES
+
+DEFAULT_RATE_DEG_S: Final = 0.5
+
+_HIP: Final = re.compile(r"(?:HIP\s*)?(\d+)", re.IGNORECASE)
+
+
+def pointing_request(
+    wanted: dict[str, Any],
+    truth: dict[str, Any],
+    mount: Attitude | None,
+    catalog_path: str | None,
+    epoch: float,
+) -> dict[str, Any]:
+    """Return the control channel's request for a new truth.
+
+    Parameters
+    ----------
+    wanted
+        `kind`: `slew`, `rate` or `fixed`. For a slew and `fixed`, `to`: `star` (a name, or HIP and its number), or
+        `ra_deg` and `dec_deg`; `roll_deg` is kept if left out. An empty `to` is the present attitude. For a slew,
+        `max_rate_deg_s`. For `rate`, `rate_deg_s`: three numbers, in the sensor frame.
+    truth
+        Present truth of the sensor, as the control channel answers it.
+    mount
+        Rotation body→sensor; None if the frames are equal.
+    catalog_path, epoch
+        The star catalogue.
+
+    Raises
+    ------
+    EmulatorError
+        No such star or kind, or a value that is out of range.
+    """
+    to_body = np.eye(3) if mount is None else mount.matrix.T
+    here = Attitude(np.array(truth["quaternion_xyzw"]))
+
+    def of_body(sensor: Attitude) -> dict[str, Any]:
+        return {"quaternion_xyzw": Attitude.from_matrix(to_body @ sensor.matrix).quaternion_xyzw.tolist()}
+
+    kind = wanted.get("kind")
+    content: dict[str, Any] = {"attitude": of_body(here)}
+    if kind == "rate":
+        rate = wanted.get("rate_deg_s")
+        if not isinstance(rate, list) or len(rate) != 3 or not all(isinstance(x, (int, float)) for x in rate):
+            raise EmulatorError("rate_deg_s: three numbers are needed")
+        content["rate_deg_s"] = (to_body @ np.array(rate)).tolist()
+    elif kind in ("slew", "fixed"):
+        target = of_body(_target(wanted.get("to") or {}, here, catalog_path, epoch))
+        if kind == "slew":
+            speed = wanted.get("max_rate_deg_s") or DEFAULT_RATE_DEG_S
+            content["segments"] = [{"do": "slew", "to": target, "max_rate_deg_s": speed}]
+        else:
+            content["attitude"] = target
+    else:
+        raise EmulatorError("kind: must be slew, rate or fixed")
+    return {"do": "set_truth", "truth": {"kind": kind, **content}}
+
+
+def _target(to: dict[str, Any], here: Attitude, catalog_path: str | None, epoch: float) -> Attitude:
+    """Return the attitude of the sensor that a page asks for."""
+    if not to:
+        return here
+    target = {key: to[key] for key in ("ra_deg", "dec_deg", "roll_deg") if to.get(key) is not None}
+    if to.get("star"):
+        target["ra_deg"], target["dec_deg"] = find_star(str(to["star"]), catalog_path, epoch)
+    target.setdefault("roll_deg", here.roll_deg)
+    try:
+        return AttitudeConfig.model_validate(target).build()
+    except ValidationError as error:
+        raise EmulatorError(explain(error, AttitudeConfig)) from None
+
+
+def find_star(text: str, catalog_path: str | None, epoch: float) -> tuple[float, float]:
+    """Return right ascension and declination, degrees, of a star by name or Hipparcos number.
+
+    Raises
+    ------
+    EmulatorError
+        There is no such star.
+    """
+    wanted = text.strip()
+    named = {name.lower(): hip for hip, name in STAR_NAMES.items()}
+    number = _HIP.fullmatch(wanted)
+    hip = int(number[1]) if number is not None else named.get(wanted.lower())
+    if hip is None:
+        raise EmulatorError(
+            f"star {wanted!r}: unknown; give a proper name such as Rigel, or HIP and its number"
+        )
+    catalog = load_catalog(catalog_path, epoch)
+    rows = np.flatnonzero(catalog.hip == hip)
+    if len(rows) == 0:
+        raise EmulatorError(f"star HIP {hip}: not in the catalogue")
+    return float(np.degrees(catalog.ra_rad[rows[0]])), float(np.degrees(catalog.dec_rad[rows[0]]))

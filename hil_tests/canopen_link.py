@@ -1,0 +1,97 @@
+"""The OBC's end of a CANopen bus: a master that executes telecommands and reads telemetry by SDO."""
+
+from __future__ import annotations
+
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.links import HostLink
+from starhil.hil_tests.wire_log import WireLog
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, SdoTransfer, row_transfer
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.transports import open_can
+from starhil.protocol.values import IcdError
+
+
+class CanopenHostLink(HostLink[CanFrame]):
+    """A CANopen bus with one node.
+
+    Parameters
+    ----------
+    icd : InterfaceDefinition
+        The unit; its rows are found in its object dictionary.
+    spec : str
+        A channel for `open_can`.
+    node : int, optional
+        Node-ID of the device; the unit's default without.
+    log : WireLog, optional
+        Log of every frame.
+    """
+
+    name = "can"
+
+    def __init__(
+        self, icd: InterfaceDefinition, spec: str, *, node: int | None = None, log: WireLog | None = None
+    ) -> None:
+        super().__init__(open_can(spec), f"CANopen {spec}", log)
+        self._icd = icd
+        self._dictionary = build_dictionary(icd)
+        self._node = int(icd.device_parameters["canopen_node"].default) if node is None else node
+        self._under_way: tuple[Request, SdoTransfer] | None = None
+
+    @property
+    def _receiver(self) -> CanopenHostLink:
+        return self
+
+    def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- an upload has its own length
+        """Begin the transfers of a request.
+
+        Raises
+        ------
+        BenchError
+            The object dictionary does not hold the row.
+        """
+        row = self._icd.rows_by_key.get((request.klass, request.id))
+        if row is None:
+            raise BenchError(f"{self.description}: request {request.id} is not in the object dictionary")
+        try:
+            transfer = row_transfer(self._dictionary, row, request.data)
+        except IcdError as error:
+            raise BenchError(str(error)) from None
+        self._under_way = request, transfer
+        self._send(next(transfer))
+
+    def feed(self, frame: CanFrame, _now: float) -> list[Reply | LinkFault]:
+        """Continue the transfers with a response of the node; return the reply at their end."""
+        if self._under_way is None or frame.extended or frame.id != SDO_TRANSMIT + self._node:
+            return []
+        request, transfer = self._under_way
+        try:
+            self._send(transfer.send(frame.data.ljust(8, b"\0")))
+        except StopIteration as done:
+            kind = ReplyKind.ACK if request.kind is RequestKind.TELECOMMAND else ReplyKind.TELEMETRY
+            return self._reply(Reply(kind, request.id, done.value, klass=request.klass))
+        except SdoAbortError as abort:
+            code = ERROR_OF_ABORT.get(abort.code, ErrorCode.INTERNAL)
+            return self._reply(Reply(ReplyKind.NACK, request.id, code=code, klass=request.klass))
+        return []
+
+    def flush(self, _now: float) -> list[LinkFault]:
+        """Nothing times out here: the client abandons a transfer by `reset_receiver`."""
+        return []
+
+    def reset_receiver(self) -> None:
+        """Abort the transfer that is under way."""
+        if self._under_way is not None:
+            self._under_way = None
+            self._send(bytes([0x80, 0, 0, 0]) + AbortCode.TIMEOUT.to_bytes(4, "little"))
+
+    def _send(self, data: bytes) -> None:
+        self.send(CanFrame(SDO_RECEIVE + self._node, data, extended=False))
+
+    def _reply(self, reply: Reply) -> list[Reply | LinkFault]:
+        self._under_way = None
+        return [reply]

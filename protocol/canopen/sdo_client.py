@@ -1,0 +1,111 @@
+"""The master's side of SDO: transfers as generators that yield a request of 8 bytes and are sent its response."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Generator, Sequence
+from contextlib import suppress
+from typing import Final
+
+from starhil.protocol.canopen.abort import ABORT_TEXTS, AbortCode, SdoAbortError
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary, Key, in_order, span_of
+from starhil.protocol.codec import Row, Slot
+from starhil.protocol.messages import ErrorCode
+
+SdoTransfer = Generator[bytes, bytes, bytes]
+"""Returns the data of an upload, none after a download; raises `SdoAbortError` on an abort."""
+
+ERROR_OF_ABORT: Final = {
+    AbortCode.NO_OBJECT: ErrorCode.INVALID_ID,
+    AbortCode.NO_SUBINDEX: ErrorCode.INVALID_ID,
+    AbortCode.LENGTH: ErrorCode.INVALID_LENGTH,
+    AbortCode.LENGTH_HIGH: ErrorCode.INVALID_LENGTH,
+    AbortCode.LENGTH_LOW: ErrorCode.INVALID_LENGTH,
+    AbortCode.VALUE_RANGE: ErrorCode.INVALID_PARAMETER,
+    AbortCode.VALUE_HIGH: ErrorCode.INVALID_PARAMETER,
+    AbortCode.VALUE_LOW: ErrorCode.INVALID_PARAMETER,
+    AbortCode.UNSUPPORTED_ACCESS: ErrorCode.NOT_IMPLEMENTED,
+    AbortCode.DEVICE_STATE: ErrorCode.BUSY,
+}
+"""Abort code → published error code; any other is an internal error."""
+
+_ABORT: Final = 0x80
+_SEGMENT: Final = 7
+_ACCEPTED: Final = bytes(8)
+_EXECUTE: Final = b"\x01"
+"""Written to the entry of a telecommand that has no data."""
+
+
+def upload(index: int, subindex: int) -> SdoTransfer:
+    """Read an entry, expedited or in segments."""
+    answer = _checked((yield struct.pack("<BHB4x", 0x40, index, subindex)))
+    if answer[0] & 0x02:
+        return answer[4 : 8 - (answer[0] >> 2 & 3)]
+    data, toggle = b"", 0
+    while True:
+        answer = _checked((yield bytes([0x60 | toggle]).ljust(8, b"\0")))
+        data += answer[1 : 8 - (answer[0] >> 1 & 7)]
+        if answer[0] & 0x01:
+            return data
+        toggle ^= 0x10
+
+
+def download(index: int, subindex: int, data: bytes) -> SdoTransfer:
+    """Write an entry, expedited up to 4 bytes, else in segments."""
+    if 0 < len(data) <= 4:
+        command = 0x23 | (4 - len(data)) << 2
+        _checked((yield struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")))
+        return b""
+    _checked((yield struct.pack("<BHBI", 0x21, index, subindex, len(data))))
+    for start in range(0, len(data), _SEGMENT):
+        piece = data[start : start + _SEGMENT]
+        toggle = 0x10 * (start // _SEGMENT % 2)
+        last = start + _SEGMENT >= len(data)
+        command = toggle | (_SEGMENT - len(piece)) << 1 | last
+        _checked((yield bytes([command]) + piece.ljust(_SEGMENT, b"\0")))
+    return b""
+
+
+def row_transfer(dictionary: DeviceDictionary, row: Row, data: bytes = b"") -> SdoTransfer:
+    """Execute a telecommand with its data, or read a telemetry row, by the entries that hold it.
+
+    Raises
+    ------
+    IcdError
+        The object dictionary does not hold the row.
+    """
+    entries = dictionary.entries_of(row)
+    if row.kind == "telemetry":
+        return _read(row, entries)
+    key, slot = entries[0]
+    value = data if slot is None else in_order(slot, data)
+    return download(*key, value or _EXECUTE)
+
+
+def _read(row: Row, entries: Sequence[tuple[Key, Slot | None]]) -> SdoTransfer:
+    data = bytearray(row.encode())
+    for key, slot in entries:
+        value = yield from upload(*key)
+        if slot is None:
+            return value
+        data[span_of(slot)] = in_order(slot, value)
+    return bytes(data)
+
+
+def requests_of(transfer: SdoTransfer) -> list[bytes]:
+    """Return the requests of a download that nothing aborts."""
+    requests = [next(transfer)]
+    with suppress(StopIteration):
+        while True:
+            requests.append(transfer.send(_ACCEPTED))
+    return requests
+
+
+def _checked(answer: bytes) -> bytes:
+    """Return an answer of 8 bytes that is no abort."""
+    if answer[0] == _ABORT:
+        number = int.from_bytes(answer[4:], "little")
+        if number in ABORT_TEXTS:
+            raise SdoAbortError(AbortCode(number))
+        raise SdoAbortError(AbortCode.GENERAL, f"code 0x{number:08X}")
+    return answer
