@@ -16,7 +16,8 @@ _HEAD: Final = """# Leaderboard of star identification
 
 `{command}`: the same scenes for all solvers. A row is named by σ of the positions in px, false stars and missing stars of a sensor of 42°
 and stars to V 5.5 where nothing else is said. *Right* counts answers whose boresight is within 0.1° and whose roll within 1° of the truth (where there is no sky to
-identify: none), *wrong* the other answers; the rest gave none.
+identify: none), *wrong* the other answers; the rest gave none. *Ill-conditioned* are those of the wrong answers that are within the same
+limits of the least-squares attitude of the true matches, so that no solver could do better with these stars.
 A solver that had spent its budget answered fewer scenes.
 """
 
@@ -28,7 +29,7 @@ def markdown(answer: Answer, command: str) -> str:
         lines += [
             f"## {row}",
             "",
-            "| solver | scenes | right % | wrong | boresight ″ | over the floor | median ms | 99 % ms | CPU ms |",
+            "| solver | scenes | right % | wrong (ill-conditioned) | boresight ″ | over the floor | median ms | 99 % ms | CPU ms |",
             "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
         ]
         lines += [_line(entry) for entry in ranked(answer, row)]
@@ -77,7 +78,7 @@ def _line(entry: Mapping[str, Any]) -> str:
         _text(entry["p99_ms"], 1),
         _text(entry["cpu_median_ms"], 2),
     )
-    return f"| {entry['solver']} | {entry['frames']} | {right(entry):.1f} | {entry['wrong']} | {' | '.join(figures)} |"
+    return f"| {entry['solver']} | {entry['frames']} | {right(entry):.1f} | {entry['wrong']} ({entry['ill_conditioned']}) | {' | '.join(figures)} |"
 
 
 def _text(value: float | None, digits: int) -> str:

@@ -233,7 +233,7 @@ _IDENTIFY_COLUMNS: Final[tuple[Column, ...]] = (
     ("solver", lambda row: row["solver"]),
     ("frames", lambda row: str(row["frames"])),
     ("valid %", _entry("valid_pct", 2)),
-    ("wrong", lambda row: str(row["wrong"])),
+    ("wrong (ill-conditioned)", lambda row: f"{row['wrong']} ({row['ill_conditioned']})"),
     ("″", _entry("boresight_median_arcsec", 1)),
     ("÷ floor", _entry("floor_ratio", 3)),
     ("roll ÷", _entry("roll_floor_ratio", 3)),

@@ -3,6 +3,10 @@
 M. Aghaei, H. A. Moghaddam, "Grid star identification improvement using optimization approaches", IEEE Transactions on Aerospace
 and Electronic Systems 52(5), 2080–2090, 2016.
 
+The thesis's IG, its reference [94], may be another: J. Li, X. Wei, G. Wang, S. Zhou, "Improved Grid Algorithm Based on Star Pair Pattern and
+Two-dimensional Angular Distances for Full-Sky Star Identification", IEEE Access 8, 1010–1020, 2020, of which only the abstract was available.
+It compares itself with the grid and the pyramid algorithms, whose rates the thesis quotes from the same place.
+
 Three changes to the grid algorithm. Neighbours are clustered by brightness and the grid is aligned with a bright one, and with
 several in turn, since a bright star is seldom missing and its place in the order of distance seldom wrong. Of every look-up the
 two best matches are kept. The threshold on the votes is that of Bayes' decision between a true and a chance match.

@@ -54,7 +54,8 @@ def oracle(tmp_path, monkeypatch):
 def entry(solver: str, *, valid: float, wrong: int, cpu: float, row: str = "0.5") -> dict:
     return {
         "row": row, "solver": solver, "frames": 10, "valid_pct": valid, "wrong": wrong, "boresight_median_arcsec": 9.0,
-        "floor_ratio": 1.0, "median_ms": cpu, "p99_ms": 2.0 * cpu, "cpu_median_ms": cpu, "cpu_p99_ms": 2.0 * cpu, "sky": True,
+        "floor_ratio": 1.0, "median_ms": cpu, "p99_ms": 2.0 * cpu, "cpu_median_ms": cpu, "cpu_p99_ms": 2.0 * cpu,
+        "ill_conditioned": min(wrong, 1), "sky": True,
     }  # fmt: skip
 
 
@@ -87,8 +88,8 @@ def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
         "`a command`",
         "## 0.5",
         "## 8°",
-        "| one | 10 | 100.0 | 0 |",
-        "| two | 10 | 30.0 | 2 |",
+        "| one | 10 | 100.0 | 0 (0) |",
+        "| two | 10 | 30.0 | 2 (1) |",
         "| one | 42° | 5.5 | 120 |",
         "three: left out",
     ):
@@ -134,6 +135,7 @@ def test_the_papers_scenes_are_those_of_their_sensors() -> None:
     }
     assert {(round(camera.fov_deg, 6), camera.width) for camera in cameras.values()} == {
         (12.0, 1024),
+        (12.0, 2048),
         (8.0, 512),
     }
     assert cameras["8°, V ≤ 7.5, 1, 0.4 mag"].width == 512

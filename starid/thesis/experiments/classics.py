@@ -377,5 +377,6 @@ EXPERIMENTS: Final = (
             "every": 340,
         },
         alone=True,
+        turn=1,
     ),
 )

@@ -133,7 +133,10 @@ class Experiment:
     full, quick
         Parameters of the full run and of the quick one; None leaves the experiment out of the quick run.
     alone
-        Measures time: nothing runs beside it.
+        Measures time: nothing runs beside it in the full run.
+    turn
+        Experiments with smaller numbers begin first. Those that compile different kernels, which others need, do: two
+        processes at work on the same experiment compile everything twice.
     revision
         Raised when the code changes what comes out, so that older results are made again.
     """
@@ -146,6 +149,7 @@ class Experiment:
     full: Parameters
     quick: Parameters | None
     alone: bool = False
+    turn: int = 2
     revision: int = 1
 
     def fingerprint(self, parameters: Parameters, seed: int, part: Part | None = None) -> str:

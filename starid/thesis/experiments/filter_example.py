@@ -233,5 +233,6 @@ EXPERIMENTS: Final = (
         _finish,
         full={},
         quick={},
+        turn=0,
     ),
 )

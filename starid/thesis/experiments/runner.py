@@ -67,6 +67,11 @@ class _Plan:
     def fingerprint(self) -> str:
         return self.experiment.fingerprint(self.context.parameters, self.context.seed)
 
+    @property
+    def alone(self) -> bool:
+        """Whether nothing runs beside it: it measures times that are checked, as the quick run does not."""
+        return self.experiment.alone and not self.context.quick
+
 
 def _plan(experiment: Experiment, folder: Path, *, quick: bool, seed: int) -> _Plan:
     parameters: Parameters | None = experiment.quick if quick else experiment.full
@@ -175,7 +180,7 @@ def run(
     seed
         Seed of all chance; results do not depend on `jobs`.
     jobs
-        Processes. Experiments that measure time run afterwards, one at a time.
+        Processes. Experiments that measure time run afterwards, one at a time, unless `quick`.
     progress
         Called with every part that ends.
 
@@ -202,10 +207,11 @@ def run(
         if missing[plan.experiment.name] == 0:
             end(plan)
     by_name = {plan.experiment.name: plan for plan in open_plans}
+    todo.sort(key=lambda task: task[0].experiment.turn)
     for alone in (False, True):
-        tasks = [(plan, part) for plan, part in todo if plan.experiment.alone == alone]
+        tasks = [(plan, part) for plan, part in todo if plan.alone == alone]
         work = (delayed(_run_part)(plan, part) for plan, part in tasks)
-        parallel = Parallel(n_jobs=1 if alone else jobs, return_as="generator_unordered")
+        parallel = Parallel(n_jobs=1 if alone else jobs, return_as="generator_unordered", batch_size=1)
         for name, _ in parallel(work):
             done += 1
             left[name] -= 1

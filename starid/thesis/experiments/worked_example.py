@@ -347,6 +347,7 @@ EXPERIMENTS: Final = (
         _finish,
         full={"percent": 96.0},
         quick={"percent": 96.0},
+        turn=0,
         revision=4,
     ),
 )

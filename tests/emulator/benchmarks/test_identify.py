@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.benchmarks import peers
-from starhil.emulator.benchmarks.identify import ROWS, run
+from starhil.emulator.benchmarks.identify import ROWS, Tally, run
+from starhil.emulator.benchmarks.peers import Reply
+from starhil.emulator.benchmarks.scenes import Scene
 from starhil.emulator.cli.bench import group
 from starhil.emulator.errors import EmulatorError
+from starid.attitude import Attitude
 from starid.solution import Reason, Solution
 
 PROMISED = [
@@ -37,6 +41,22 @@ def test_every_solver_of_our_own_answers_the_same_scenes() -> None:
         else:
             assert row["valid_pct"] == 0.0
             assert row["floor_ratio"] is None
+
+
+@pytest.mark.parametrize(
+    ("off_truth", "off_fit", "counts"),
+    [(0.05, 0.2, (0, 0)), (0.2, 0.05, (1, 1)), (0.2, 0.2, (1, 0)), (0.05, 0.05, (0, 0))],
+)
+def test_an_answer_off_the_truth_is_wrong_even_where_the_true_matches_give_no_better(
+    off_truth: float, off_fit: float, counts: tuple[int, int]
+) -> None:
+    found = Attitude.from_radec_roll(10.0, 20.0, 30.0)
+    truth, fit = (found.rotated([0.0, np.radians(angle), 0.0]) for angle in (off_truth, off_fit))
+    scene = Scene(truth, np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64), 0.5)
+    tally = Tally("tracking, 3 stars", "geometric")
+    tally.add(scene, fit, Reply(found.matrix, 1e-3, 1e-3))
+    report = tally.report()
+    assert (report["wrong"], report["ill_conditioned"]) == counts
 
 
 class Recorder:

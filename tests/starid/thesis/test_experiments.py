@@ -89,6 +89,13 @@ def test_a_finished_experiment_is_not_run_again(tmp_path):
     assert again[0].outcome == first[0].outcome
 
 
+def test_experiments_begin_in_their_turn_and_report_in_their_order(tmp_path):
+    late, early = _experiment("late"), dataclasses.replace(_experiment("early"), turn=0)
+    ended = runner.run([late, early], tmp_path, quick=True, jobs=1)
+    assert _calls(tmp_path) == ["early part1", "late part1"]
+    assert [result.experiment.name for result in ended] == ["late", "early"]
+
+
 def test_only_what_changed_is_computed_again(tmp_path):
     runner.run([_experiment()], tmp_path, jobs=1)
     longer = dataclasses.replace(_experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9})
