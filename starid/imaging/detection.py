@@ -12,7 +12,20 @@ import numpy.typing as npt
 
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
-from starid.imaging.centroid import CHI2, FIT_COLUMNS, FLUX, GOOD, PIXELS, STATE, VAR_FLUX, VAR_X, VAR_Y, X, Y
+from starid.imaging.centroid import (
+    CHI2,
+    FIT_COLUMNS,
+    FLUX,
+    GOOD,
+    NO_FIT,
+    PIXELS,
+    STATE,
+    VAR_FLUX,
+    VAR_X,
+    VAR_Y,
+    X,
+    Y,
+)
 from starid.imaging.matched_filter import (
     INTEGER_TAPS_SUM,
     find_peaks,
@@ -43,7 +56,16 @@ from starid.imaging.spot_shape import (
 )
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
-from starid.imaging.windows import COLUMNS, SEEN_BEFORE, START_Y, WINDOW_COLUMNS, cut_windows, lay_windows
+from starid.imaging.windows import (
+    COLUMNS,
+    LEAST_SPREAD_PX,
+    SEEN_BEFORE,
+    START_Y,
+    WINDOW_COLUMNS,
+    cut_windows,
+    lay_windows,
+    sky_under_lone_pixels,
+)
 
 Grid: TypeAlias = npt.NDArray[np.float32]
 Table: TypeAlias = npt.NDArray[np.float64]
@@ -182,6 +204,67 @@ class Detections:
         return len(self.flux)
 
 
+@dataclass(frozen=True)
+class _Scene:
+    """An image (h, w) with its background, the settings, and the count from which a pixel is saturated."""
+
+    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    background: Background
+    settings: DetectionSettings
+    saturation: float
+
+    @property
+    def level(self) -> tuple[Grid, float]:
+        """Background on the grid of blocks, and the side of a block."""
+        return self.background.level, float(self.background.block_px)
+
+    @property
+    def grids(self) -> tuple[Grid, Grid, float]:
+        """Background and noise on the grid of blocks, and the side of a block."""
+        return self.background.level, self.background.noise, float(self.background.block_px)
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Candidates with their windows, the pixels of these, their neighbours, fits and flags.
+
+    `sensor`, `lit` and `size` are those of `starid.imaging.measurement.measure`.
+    """
+
+    windows: Table
+    pixels: Grid
+    first: npt.NDArray[np.int32]
+    neighbours: npt.NDArray[np.int32]
+    sensor: tuple[float, float, float, float, float]
+    lit: tuple[float, float, float]
+    size: tuple[int, int]
+    stars: Table
+    flags: npt.NDArray[np.uint8]
+
+    def measure(self, todo: npt.NDArray[np.bool_], turns: tuple[int, int]) -> None:
+        """Fit the candidates of a mask (n,) in some turns."""
+        measure(
+            self.windows,
+            self.pixels,
+            self.first,
+            self.neighbours,
+            self.sensor,
+            self.lit,
+            self.size,
+            todo,
+            turns,
+            self.stars,
+            self.flags,
+        )
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether the shape of a star does not explain many of the candidates."""
+        good = self.stars[self.stars[:, STATE] == GOOD]
+        misfits = np.count_nonzero(_misfits(good)[1]) + np.count_nonzero(self.stars[:, STATE] == NOT_A_STAR)
+        return bool(misfits >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(good)))
+
+
 def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = None) -> Detections:
     """Find the stars of an image.
 
@@ -210,26 +293,30 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
         found = _no_detections(background, "image is saturated all over: shorten the exposure")
         return dataclasses.replace(found, searchable=False)
     sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
-    peaks, heights = _peaks(counts, background, sigma, chosen.threshold_sigma)
-    shape = _estimate_shape(counts, background, peaks, chosen, saturation)
+    scene = _Scene(counts, background, chosen, float(saturation))
+    peaks, heights = _peaks(scene, sigma)
+    shape = _estimate_shape(scene, peaks)
     if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
-        peaks, heights = _peaks(counts, background, shape.sigma_px, chosen.threshold_sigma)
-        shape = _estimate_shape(counts, background, peaks, chosen, saturation, shape.sigma_px)
+        peaks, heights = _peaks(scene, shape.sigma_px)
+        shape = _estimate_shape(scene, peaks, shape.sigma_px)
+    peaks, heights, hot = _without_hot_pixels(scene, peaks, heights, shape.sigma_px)
+    unsure = chosen.follow_trails and shape.trail_px == 0.0
+    if unsure and len(hot) > len(peaks):
+        shape = _trails_among_round(scene, peaks, shape)
+        unsure = False
     if shape.trail_px > _TRAIL_FILTER_PX:
-        peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
-    if len(peaks) == 0:
+        peaks, heights = _trail_peaks(scene, shape, hot)
+    if len(peaks) + len(hot) == 0:
         flat = float(counts.min()) == float(counts.max())
         return _no_detections(
             background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
         )
-    found, misfits = _measure_candidates(counts, background, peaks, heights, shape, chosen, saturation)
-    suspicious = misfits >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(found))
-    if suspicious and chosen.follow_trails and shape.trail_px == 0.0:
-        shape = _trails_among_round(counts, background, peaks, shape, saturation)
+    fits = _fit_candidates(scene, peaks, heights, shape)
+    if unsure and fits.suspicious:
+        shape = _trails_among_round(scene, peaks, shape)
         if shape.trail_px > 0.0:
-            peaks, heights = _trail_peaks(counts, background, shape, chosen.threshold_sigma)
-            found, _ = _measure_candidates(counts, background, peaks, heights, shape, chosen, saturation)
-    return found
+            fits = _fit_candidates(scene, *_trail_peaks(scene, shape, hot), shape)
+    return _stars_of(scene, fits, shape, len(hot))
 
 
 def _checked_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
@@ -255,13 +342,9 @@ def _no_detections(background: Background, reason: str, rejected: int = 0) -> De
     return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, rejected, reason)
 
 
-def _peaks(
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    background: Background,
-    sigma_px: float,
-    threshold_sigma: float,
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+def _peaks(scene: _Scene, sigma_px: float) -> tuple[npt.NDArray[np.int32], Grid]:
     """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
+    counts, background = scene.counts, scene.background
     bytes_taps = integer_taps(sigma_px)
     if counts.dtype == np.uint8 and bytes_taps is not None:
         taps8, image8 = bytes_taps, counts.view(np.uint8)
@@ -270,22 +353,32 @@ def _peaks(
             return find_peaks_in_bytes(image8, threshold, background.block_px, taps8, peaks, heights)
 
         factor = noise_factor(taps8 / INTEGER_TAPS_SUM)
-        return _search(search_bytes, background, threshold_sigma * factor)
+        return _search(search_bytes, background, scene.settings.threshold_sigma * factor)
     taps = spot_taps(sigma_px)
 
     def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
         return find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
 
-    return _search(search, background, threshold_sigma * noise_factor(taps))
+    return _search(search, background, scene.settings.threshold_sigma * noise_factor(taps))
 
 
-def _trail_peaks(
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    background: Background,
-    shape: SpotShape,
-    threshold_sigma: float,
-) -> tuple[npt.NDArray[np.int32], Grid]:
-    """As `_peaks`, with the filter for the frame's trails."""
+def _without_hot_pixels(
+    scene: _Scene, peaks: npt.NDArray[np.int32], heights: Grid, sigma_px: float
+) -> tuple[npt.NDArray[np.int32], Grid, Table]:
+    """Candidates that are more than a hot pixel, their heights, and (n, 3) the hot pixels with the sky under them."""
+    if sigma_px < LEAST_SPREAD_PX:
+        return peaks, heights, np.zeros((0, 3))
+    sky = np.empty(len(peaks))
+    sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
+    hot = ~np.isnan(sky)
+    return peaks[~hot], heights[~hot], np.column_stack([peaks[hot], sky[hot]])
+
+
+def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[npt.NDArray[np.int32], Grid]:
+    """As `_peaks`, with the filter for the frame's trails, and without the hot pixels, which it would smear."""
+    background, counts = scene.background, scene.counts.copy()
+    columns, rows = hot[:, :2].astype(np.int64).T
+    counts[rows, columns] = hot[:, 2]
     steps = trail_steps(shape.flow, counts.shape[1], counts.shape[0])
     sums, scale = sum_along_trails(counts, shape.flow, steps)
     taps = spot_taps(shape.sigma_px)
@@ -296,7 +389,7 @@ def _trail_peaks(
         return count
 
     factor = trail_noise_factor(shape.sigma_px, shape.trail_px, steps)
-    return _search(search, background, threshold_sigma * factor)
+    return _search(search, background, scene.settings.threshold_sigma * factor)
 
 
 def _search(
@@ -320,29 +413,25 @@ def _search(
 
 
 def _estimate_shape(
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    background: Background,
-    peaks: npt.NDArray[np.int32],
-    settings: DetectionSettings,
-    saturation: int,
-    assumed: float = _ASSUMED_SIGMA_PX,
+    scene: _Scene, peaks: npt.NDArray[np.int32], assumed: float = _ASSUMED_SIGMA_PX
 ) -> SpotShape:
     """Spot and trail from the brightest stars that are not saturated."""
-    height, width = counts.shape
+    settings = scene.settings
+    height, width = scene.counts.shape
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
     tries = peaks[: 4 * _STARS_FOR_SHAPE]
-    grid = (background.level, float(background.block_px))
     # a few stars show whether there are trails at all; more are needed only to follow them
     for wanted in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
         table = np.empty((wanted, MOMENT_COLUMNS))
-        count = moments_of(counts, tries, *grid, start, _SHAPE_WINDOW_PX, float(saturation), table)
+        count = moments_of(
+            scene.counts, tries, *scene.level, start, _SHAPE_WINDOW_PX, scene.saturation, table
+        )
         shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
         if shape.trail_px == 0.0 or count < wanted:
             break
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
-        levels = (background.level, background.noise, float(background.block_px))
-        fitted = spot_widths(counts, tries, *levels, start, float(saturation), widths)
+        fitted = spot_widths(scene.counts, tries, *scene.grids, start, scene.saturation, widths)
         if fitted >= _LEAST_FOR_WIDTH:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
     if settings.follow_trails:
@@ -350,107 +439,104 @@ def _estimate_shape(
     return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
 
 
-def _trails_among_round(
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    background: Background,
-    peaks: npt.NDArray[np.int32],
-    shape: SpotShape,
-    saturation: int,
-) -> SpotShape:
+def _trails_among_round(scene: _Scene, peaks: npt.NDArray[np.int32], shape: SpotShape) -> SpotShape:
     """Check whether stars leave trails although the brightest objects are round."""
     tries = peaks[:_PEAKS_FOR_TRAILS]
     table = np.empty((len(tries), MOMENT_COLUMNS))
-    limits = (shape.sigma_px, _SHAPE_WINDOW_PX, float(saturation))
-    count = moments_of(counts, tries, background.level, float(background.block_px), *limits, table)
-    return trails_among_round(table[:count], counts.shape[1], counts.shape[0], shape)
+    limits = (_SHAPE_WINDOW_PX, scene.saturation)
+    count = moments_of(scene.counts, tries, *scene.level, shape.sigma_px, *limits, table)
+    return trails_among_round(table[:count], scene.counts.shape[1], scene.counts.shape[0], shape)
 
 
-def _fit_candidates(
-    windows: Table,
-    pixels: Grid,
-    sensor: tuple[float, float, float, float, float],
-    lit: tuple[float, float, float],
-    size: tuple[int, int],
-    blend_px: float,
-) -> tuple[Table, Table, npt.NDArray[np.uint8]]:
-    """Windows, fits and flags of the candidates, and of the companions that bad fits indicate."""
-    count = len(windows)
-    stars, flags = np.zeros((count, FIT_COLUMNS)), np.zeros(count, dtype=np.uint8)
-    first = np.empty(count + 1, dtype=np.int32)
-    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
-    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
-    measure(
-        windows, pixels, first, neighbours, sensor, lit, size, np.ones(count, dtype=bool), FRESH, stars, flags
-    )
-    bad = (stars[:, STATE] == GOOD) & (stars[:, CHI2] > BAD_FIT * (stars[:, PIXELS] - FIT_PARAMETERS))
-    if not bad.any():
-        return windows, stars, flags
-    suspects = np.flatnonzero(bad & ((flags & SATURATED) == 0))
-    partners, owners = np.empty((len(suspects), FIT_COLUMNS)), np.empty(len(suspects), dtype=np.int64)
-    found = split_pairs(
-        windows, pixels, first, neighbours, sensor[:3], stars, suspects, blend_px, partners, owners, bad
-    )
-    owners = owners[:found]
-    measure(windows, pixels, first, neighbours, sensor, lit, size, bad, AGAIN, stars, flags)
-    return (
-        np.concatenate([windows, windows[owners]]),
-        np.concatenate([stars, partners[:found]]),
-        np.concatenate([flags, flags[owners]]),
-    )
-
-
-def _measure_candidates(
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    background: Background,
-    peaks: npt.NDArray[np.int32],
-    heights: npt.NDArray[np.float32],
-    shape: SpotShape,
-    settings: DetectionSettings,
-    saturation: int,
-) -> tuple[Detections, int]:
-    """Fit the candidates and keep the stars; also count the fits that the shape of a star does not explain."""
+def _fit_candidates(scene: _Scene, peaks: npt.NDArray[np.int32], heights: Grid, shape: SpotShape) -> _Fits:
+    """Fit the highest candidates, each as one star."""
+    counts, background, settings = scene.counts, scene.background, scene.settings
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
-    gain = settings.gain_e_per_dn
-    per_dn = 0.0 if gain is None else 1.0 / gain
-    typical = background.median_noise
-    spot = (shape.sigma_px, float(saturation), typical)
-    grid = (background.level, background.noise, float(background.block_px))
+    per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
     flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
     count = len(peaks)
     windows = np.zeros((count, WINDOW_COLUMNS))
-    pixels = np.empty(lay_windows(counts, peaks, flux, *grid, spot, shape.flow, windows), dtype=np.float32)
-    cut_windows(counts, windows, background.level, grid[2], float(saturation), pixels)
+    spot = (shape.sigma_px, scene.saturation, background.median_noise)
+    total = lay_windows(counts, peaks, flux, *scene.grids, spot, shape.flow, windows)
+    pixels = np.empty(total, dtype=np.float32)
+    cut_windows(counts, windows, *scene.level, scene.saturation, pixels)
+    first = np.empty(count + 1, dtype=np.int32)
+    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
+    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
     ratio = _RELAX * settings.threshold_sigma
-    sensor = (shape.sigma_px, per_dn, settings.model_error, ratio, saturation - background.median_level)
-    lit = (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels))
-    size = (counts.shape[1], counts.shape[0])
-    windows, stars, flags = _fit_candidates(windows, pixels, sensor, lit, size, settings.blend_px)
-    good = np.flatnonzero(stars[:, STATE] == GOOD)
-    if good.size == 0:
-        return _no_detections(background, "nothing on the image has the shape of a star", count), count
-    again = (stars[:, STATE] == TWICE) | (windows[:, COLUMNS] == SEEN_BEFORE)
-    rejected = len(stars) - good.size - int(np.count_nonzero(again))
-    good = good[np.argsort(-stars[good, FLUX], kind="stable")][: settings.max_stars]
-    fits, marks = stars[good], flags[good]
+    stars = np.zeros((count, FIT_COLUMNS))
+    stars[:, STATE] = NO_FIT
+    fits = _Fits(
+        windows,
+        pixels,
+        first,
+        neighbours,
+        (shape.sigma_px, per_dn, settings.model_error, ratio, scene.saturation - background.median_level),
+        (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels)),
+        (counts.shape[1], counts.shape[0]),
+        stars,
+        np.zeros(count, dtype=np.uint8),
+    )
+    fits.measure(np.ones(count, dtype=bool), FRESH)
+    return fits
+
+
+def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
+    """Return the candidates with the companions that bad fits indicate."""
+    stars = fits.stars
+    bad = (stars[:, STATE] == GOOD) & (stars[:, CHI2] > BAD_FIT * (stars[:, PIXELS] - FIT_PARAMETERS))
+    if not bad.any():
+        return fits
+    suspects = np.flatnonzero(bad & ((fits.flags & SATURATED) == 0))
+    partners, owners = np.empty((len(suspects), FIT_COLUMNS)), np.empty(len(suspects), dtype=np.int64)
+    near = (fits.first, fits.neighbours)
+    found = split_pairs(
+        fits.windows, fits.pixels, *near, fits.sensor[:3], stars, suspects, blend_px, partners, owners, bad
+    )
+    fits.measure(bad, AGAIN)
+    owners = owners[:found]
+    return dataclasses.replace(
+        fits,
+        windows=np.concatenate([fits.windows, fits.windows[owners]]),
+        stars=np.concatenate([stars, partners[:found]]),
+        flags=np.concatenate([fits.flags, fits.flags[owners]]),
+    )
+
+
+def _misfits(fits: Table) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """Sum of weighted squares per degree of freedom (n,) of fits, and where the shape of a star does not explain it."""
     freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
     misfit = fits[:, CHI2] / freedom
-    is_bad = misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
-    fits[:, [VAR_X, VAR_Y, VAR_FLUX]] *= np.where(is_bad, misfit, 1.0)[:, None]
-    doubt_close_pairs(fits, np.argsort(-fits[:, Y], kind="stable"), settings.blend_px)
-    unit = 1.0 if gain is None else gain
-    found = Detections(
-        fits[:, [X, Y]],
-        fits[:, FLUX] * unit,
-        np.sqrt(fits[:, VAR_FLUX]) * unit,
-        np.sqrt(fits[:, [VAR_X, VAR_Y]]),
+    return misfit, misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
+
+
+def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detections:
+    """Keep the candidates that are stars, `hot` others having been rejected before."""
+    background, settings = scene.background, scene.settings
+    fits = _with_companions(fits, settings.blend_px)
+    states = fits.stars[:, STATE]
+    good = np.flatnonzero(states == GOOD)
+    again = (states == TWICE) | (fits.windows[:, COLUMNS] == SEEN_BEFORE)
+    rejected = len(states) - good.size - int(np.count_nonzero(again)) + hot
+    if good.size == 0:
+        return _no_detections(background, "nothing on the image has the shape of a star", rejected)
+    good = good[np.argsort(-fits.stars[good, FLUX], kind="stable")][: settings.max_stars]
+    stars, marks = fits.stars[good], fits.flags[good]
+    misfit, is_bad = _misfits(stars)
+    stars[:, [VAR_X, VAR_Y, VAR_FLUX]] *= np.where(is_bad, misfit, 1.0)[:, None]
+    doubt_close_pairs(stars, np.argsort(-stars[:, Y], kind="stable"), settings.blend_px)
+    unit = 1.0 if settings.gain_e_per_dn is None else settings.gain_e_per_dn
+    return Detections(
+        stars[:, [X, Y]],
+        stars[:, FLUX] * unit,
+        np.sqrt(stars[:, VAR_FLUX]) * unit,
+        np.sqrt(stars[:, [VAR_X, VAR_Y]]),
         (marks & SATURATED) != 0,
         (marks & AT_EDGE) != 0,
         background.median_level,
-        typical,
+        background.median_noise,
         shape.sigma_px,
         shape.trail_px,
         rejected,
         "",
     )
-    misfits = int(np.count_nonzero(is_bad) + np.count_nonzero(stars[:, STATE] == NOT_A_STAR))
-    return found, misfits

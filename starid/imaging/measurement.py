@@ -13,8 +13,8 @@ from starid.imaging.centroid import (
     FLUX,
     GOOD,
     HOT_PIXEL,
-    NO_FIT,
     PIXELS,
+    SHORT_TRAIL_PX,
     STATE,
     UNUSABLE,
     WANDERED,
@@ -59,6 +59,7 @@ _EDGE_SIGMA: Final = 2.5
 BAD_FIT: Final = 4.0
 """Least sum of weighted squares per degree of freedom of a bad fit."""
 
+_AT_REST: Final = 0.5
 _STRAY_SIGMA: Final = 7.0
 _STRAY_DISTANCE_SIGMA: Final = 2.0
 FIT_PARAMETERS: Final = 3
@@ -152,6 +153,61 @@ def _mask_stray_pixel(
     if stray >= 0:
         pixels[stray] = np.float32(math.inf)
     return stray >= 0
+
+
+@compiled_ieee
+def _is_one_pixel(
+    pixels: npt.NDArray[np.float32],
+    shape: tuple[float, float, float],
+    bounds: tuple[int, int, int, int],
+    model: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+) -> bool:
+    """Whether one pixel holds so much of a window's light that it explains more than the shape of a star anywhere.
+
+    With u the share of the shape's norm in the pixel at its centre, the Cauchy–Schwarz inequality bounds the sum of squares
+    that the shape explains (`explained`): it is below that of the pixel alone where the pixel has more than
+    (1 + u)/2 of all. Such a window needs no fit.
+    """
+    highest = total = squares = 0.0
+    place = 0
+    for k in range(pixels.size):
+        value = float(pixels[k])
+        if value > highest:
+            highest, place = value, k
+        total += value * value
+    if not (highest < UNUSABLE and 2.0 * highest * highest > total):
+        return False
+    star_model(
+        float(bounds[0] + place % bounds[2]),
+        float(bounds[1] + place // bounds[2]),
+        shape,
+        bounds,
+        model,
+        work,
+    )
+    for k in range(pixels.size):
+        squares += model[0, k] * model[0, k]
+    return bool(2.0 * highest * highest > (1.0 + model[0, place] / math.sqrt(squares)) * total)
+
+
+@compiled_ieee
+def _is_at_rest(
+    pixels: npt.NDArray[np.float32],
+    bounds: tuple[int, int, int, int],
+    shape: tuple[float, float, float],
+    noise: tuple[float, float, float],
+    model: npt.NDArray[np.float64],
+    work: npt.NDArray[np.float64],
+    star: npt.NDArray[np.float64],
+    spot: npt.NDArray[np.float64],
+) -> bool:
+    """Whether a spot that did not move explains what the trail of a star does not; `spot` is workspace for its fit."""
+    bad = BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
+    if star[STATE] != GOOD or star[CHI2] <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
+        return False
+    fit_star(pixels, bounds, (star[X], star[Y]), (shape[0], 0.0, 0.0), noise, model, work, spot)
+    return bool(spot[STATE] == GOOD and spot[CHI2] <= min(bad, _AT_REST * star[CHI2]))
 
 
 @compiled_ieee
@@ -284,16 +340,13 @@ def measure(
         First and last round: `FRESH`, or `AGAIN` to continue from existing fits. In the last round a fit that stays bad is
         repeated without the pixel that contradicts it most.
     stars : ndarray (n, FIT_COLUMNS)
-        Filled with the fits.
+        Filled with the fits; STATE is NO_FIT before the first turn.
     flags : ndarray (n,)
         Filled with bits `SATURATED`, `AT_EDGE`.
     """
     sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
     largest, side = 1, _LEAST_SIDE
     for k in range(windows.shape[0]):
-        if todo[k] and turns[0] == 0:
-            stars[k, STATE] = NO_FIT
-            flags[k] = 0
         if windows[k, COLUMNS] > 0.0:
             largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
             side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
@@ -301,6 +354,7 @@ def measure(
     lights = np.empty((3, largest))
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
+    spot = np.empty(stars.shape[1])
     for turn in range(turns[0], turns[1]):
         last = turns[0] > 0 and turn == turns[1] - 1
         for k in range(windows.shape[0]):
@@ -322,6 +376,9 @@ def measure(
                 target[:] = own
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
+            if turn == 0 and sigma > _SHARP_SIGMA_PX and _is_one_pixel(target, shape, bounds, model, work):
+                star[STATE] = HOT_PIXEL
+                continue
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
             guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
             fit_star(target, bounds, guess, shape, noise, model, work, star)
@@ -336,6 +393,8 @@ def measure(
                 star[STATE] = _classify_fit(
                     target, model, star, window, sigma, least_ratio, saturation_dn, lit, size
                 )
+            if not last and _is_at_rest(target, bounds, shape, noise, model, work, star, spot):
+                star[STATE] = NOT_A_STAR
             if star[STATE] == GOOD:
                 flags[k] = _flags(star, window, own, sigma, size)
         _drop_doubles(stars, first, neighbours, sigma)

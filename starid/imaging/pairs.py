@@ -34,6 +34,9 @@ _CONVERGED_PX: Final = 2e-3
 _MOST_STEP_PX: Final = 0.4
 _MOST_CHANGE: Final = 0.5
 _BETTER: Final = 0.5
+_HOPEFUL_STEPS: Final = 10
+"""Steps within which the fit of a true pair is better than that of one star; a worse fit is then abandoned."""
+
 _LEAST_SIGNAL: Final = 6.0
 _LEAST_SHARE: Final = 0.03
 _CLOSEST_SIGMA: Final = 1.0
@@ -78,6 +81,7 @@ def fit_pair(
     noise: tuple[float, float, float],
     models: Array,
     work: Array,
+    enough: float,
     pair: Array,
 ) -> bool:
     """Fit two stars at once to a window by Gauss–Newton steps, weighted as in `starid.imaging.centroid.fit_star`.
@@ -88,6 +92,8 @@ def fit_pair(
         As in `fit_star`.
     models : ndarray (6, rows·columns)
         On return, the models of both stars.
+    enough : float
+        CHI2 that a fit has to reach in its first steps, or it is abandoned.
     pair : ndarray (2, FIT_COLUMNS)
         Holds first guesses of X, Y and FLUX; filled with the fits. CHI2 and PIXELS refer to both together.
 
@@ -103,7 +109,7 @@ def fit_pair(
     right = np.empty(_UNKNOWNS)
     slopes = np.empty(_UNKNOWNS)
     step = np.empty(_UNKNOWNS)
-    for _ in range(_ITERATIONS):
+    for iteration in range(_ITERATIONS):
         for star in range(2):
             star_model(pair[star, X], pair[star, Y], shape, window, models[3 * star : 3 * star + 3], work)
         matrix[:] = 0.0
@@ -135,7 +141,8 @@ def fit_pair(
         for i in range(_UNKNOWNS):
             for j in range(i):
                 matrix[j, i] = matrix[i, j]
-        if used <= _UNKNOWNS or not _invert(matrix, inverse):
+        hopeless = iteration >= _HOPEFUL_STEPS and chi2 > enough
+        if hopeless or used <= _UNKNOWNS or not _invert(matrix, inverse):
             return False
         for i in range(_UNKNOWNS):
             step[i] = 0.0
@@ -353,7 +360,8 @@ def split_pairs(
         if not _first_guesses(left_over, bounds, stars[k], sigma, pair):
             continue
         noises = (windows[k, NOISE] ** 2, per_dn, model_error)
-        fitted = fit_pair(target, bounds, shape, noises, models[:, :count], work, pair)
+        enough = _BETTER * stars[k, CHI2]
+        fitted = fit_pair(target, bounds, shape, noises, models[:, :count], work, enough, pair)
         if not fitted or not _is_better(pair, stars[k, CHI2], sigma, models, target):
             continue
         todo[k] = False

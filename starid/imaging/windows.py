@@ -41,6 +41,9 @@ MOST_SATURATED: Final = 400
 PATCH_REACH: Final = 40
 """Largest distance of the saturated patch of a star from its peak, pixels."""
 
+LEAST_SPREAD_PX: Final = 0.5
+"""Standard deviation of a spot from which the light of a star reaches more than one pixel."""
+
 EXTENDED: Final = -1.0
 SEEN_BEFORE: Final = -2.0
 NO_ROOM: Final = -3.0
@@ -56,7 +59,6 @@ _QUARTILE_SIGMA: Final = 1.349
 _LEAST_REACH_SIGMA: Final = 2.5
 _MOST_REACH_SIGMA: Final = 6.0
 _VISIBLE_NOISE: Final = 0.33
-_LEAST_SPREAD_PX: Final = 0.5
 _ALONE_SIGMA: Final = 8.0
 _ALONE_SHARE: Final = 0.125
 
@@ -226,6 +228,24 @@ def _stands_alone(
 
 
 @compiled_ieee
+def sky_under_lone_pixels(
+    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    peaks: npt.NDArray[np.int32],
+    level: npt.NDArray[np.float32],
+    noise: npt.NDArray[np.float32],
+    block: float,
+    sky: npt.NDArray[np.float64],
+) -> None:
+    """Fill `sky` (n,) with the background under the peaks (n, 2) that are hot pixels, and NaN for the others."""
+    for k in range(peaks.shape[0]):
+        column, row = peaks[k, 0], peaks[k, 1]
+        x, y = float(column), float(row)
+        base = interpolate_at(level, block, x, y)
+        alone = _stands_alone(image, column, row, base, interpolate_at(noise, block, x, y))
+        sky[k] = base if alone else math.nan
+
+
+@compiled_ieee
 def lay_windows(
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
     peaks: npt.NDArray[np.int32],
@@ -302,7 +322,7 @@ def lay_windows(
             typical_noise,
         )
         window[BASE] = sky_level
-        if sigma >= _LEAST_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
+        if sigma >= LEAST_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
             window[COLUMNS] = ONE_PIXEL
             continue
         left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)
