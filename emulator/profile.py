@@ -1,13 +1,13 @@
 """Device profiles: TOML files that configure camera, sensor, truth, links and parameters of a run.
 
-A profile may extend another (`extends = "cubestar"`, or a path relative to the file) and override its
+A profile may extend another (`extends = "ideal"`, or a path relative to the file) and override its
 keys. Every key is validated; an error names the file, the key and the remedy.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -171,6 +171,11 @@ class ImagesConfig(Strict):
             raise ValueError("folder and capture exclude each other; give one of them")
         return self
 
+    @property
+    def used(self) -> bool:
+        """Whether images are taken from a folder or a camera."""
+        return bool(self.folder) or self.capture != ""
+
     def resolved(self, relative_to: Path) -> dict[str, Any]:
         """Return the keys, with paths relative to a folder resolved."""
         files = {
@@ -245,7 +250,7 @@ class LinksConfig(Strict):
 class Profile(Strict):
     """A device profile."""
 
-    name: str = DEFAULT_PROFILE
+    name: str = "ideal"
     """Name in messages and on the control channel."""
     unit: str = DEFAULT_UNIT
     """Interface definition: the name of a unit that ships with starhil, or a folder relative to the profile."""
@@ -322,6 +327,9 @@ ALTERNATIVES: Final = (
 )
 """Pairs of key sets that exclude each other in a table."""
 
+CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
+"""Device parameters that describe the camera; without them the device knows its camera exactly."""
+
 LINK_PARAMETERS: Final[dict[str, str]] = {
     "serial_dialect": "links.serial.dialect",
     "serial_baud": "links.serial.baud",
@@ -372,6 +380,8 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     """
     path = find_profile(name_or_path)
     values = _read_extended(path, 0)
+    if any(override.startswith("camera.") for override in overrides):
+        _drop_calibration(values)
     for override in overrides:
         _apply_override(values, override)
     try:
@@ -407,7 +417,28 @@ def _read_extended(path: Path, depth: int) -> dict[str, Any]:
         raise EmulatorError(
             f"profile {path}: extends: more than {MAX_EXTENDS_DEPTH} deep; does a profile extend itself?"
         )
-    return merge(_read_extended(find_profile(base, path.parent), depth + 1), values)
+    below = _read_extended(find_profile(base, path.parent), depth + 1)
+    if "camera" in values:
+        _drop_calibration(below)
+    return merge(below, values)
+
+
+def _drop_calibration(values: dict[str, Any]) -> None:
+    """Remove what a device knows of its camera, which is about to be replaced."""
+    parameters = values.get("parameters")
+    if isinstance(parameters, dict):
+        values["parameters"] = {key: value for key, value in parameters.items() if key not in CALIBRATION}
+
+
+def _replaced_by(given: Iterable[str]) -> set[str]:
+    """Return the keys of a table that these keys exclude."""
+    return {
+        key
+        for one, other in ALTERNATIVES
+        for keys, by in ((one, other), (other, one))
+        if not by.isdisjoint(given)
+        for key in keys
+    }
 
 
 def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -418,13 +449,7 @@ def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """
     if "kind" in over and over["kind"] != base.get("kind"):
         return dict(over)
-    dropped = {
-        key
-        for one, other in ALTERNATIVES
-        for keys, by in ((one, other), (other, one))
-        if by & over.keys()
-        for key in keys
-    }
+    dropped = _replaced_by(over)
     merged = {key: value for key, value in base.items() if key not in dropped}
     for key, value in over.items():
         below = merged.get(key)
@@ -456,4 +481,6 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
     if names[-1] == "kind" and table.get("kind") != value:
         for other in set(table) - ({"attitude"} if value != "file" else set()):
             del table[other]
+    for excluded in _replaced_by(names[-1:]) & table.keys():
+        del table[excluded]
     table[names[-1]] = value

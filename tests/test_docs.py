@@ -29,6 +29,7 @@ from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen import build_dictionary
 from starhil.protocol.export import export
 from starhil.protocol.icd import load_unit
+from starid.camera import Camera
 
 DOCS = Path(__file__).parents[1] / "docs"
 PATIENCE_S = 20.0
@@ -106,11 +107,14 @@ def table_after(name: str, heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in row] for row in rows[2:]]
 
 
-def sensor_defaults() -> dict[str, object]:
-    """Values of the default profile by the keys that the data sheet names."""
-    profile = load_profile()
+def sensor_values(name: str) -> dict[str, object]:
+    """Values of a profile by the keys that the data sheet names."""
+    profile = load_profile(name)
     sections: dict[str, dict[str, object]] = {
-        "camera": {"focal_px": 1220.4842, **profile.camera.model_dump(exclude_none=True)},
+        "camera": {
+            **profile.camera.model_dump(exclude_none=True),
+            "focal_px": Camera.from_dict(profile.camera.values()).focal_px[0],
+        },
         "sensor": dataclasses.asdict(SensorModel(**profile.sensor)),
         "timing": profile.timing.model_dump(),
         "device": profile.device.model_dump(),
@@ -124,17 +128,21 @@ def sensor_defaults() -> dict[str, object]:
     return {f"{name}.{key}": value for name, part in sections.items() for key, value in part.items()}
 
 
-def test_sensor_gives_the_defaults_of_the_default_profile():
-    defaults, icd = sensor_defaults(), load_unit()
+def test_sensor_gives_the_values_of_both_profiles():
+    ideal, cubestar, icd = sensor_values("ideal"), sensor_values("cubestar"), load_unit()
     checked = 0
     for heading in ("Optics", "Detector", "Temperature, power, radiation", "Timing"):
         for row in table_after("sensor.md", heading):
             if not row[1].startswith("`"):
                 continue
             key, shown = row[1].strip("`"), row[2]
-            value = defaults[key]
+            value = ideal[key]
+            assert bool(row[3]) is (cubestar.get(key, value) != value), key
             if isinstance(value, (int, float)):
                 assert float(re.split(r"[ °]", shown)[0]) == pytest.approx(value, rel=1e-6), key
+                assert float(re.split(r"[ °,]", row[3] or shown)[0]) == pytest.approx(
+                    cubestar.get(key, value)
+                ), key
                 checked += 1
             if key.startswith("parameters."):
                 parameter = icd.parameters[key.removeprefix("parameters.")]
@@ -144,13 +152,14 @@ def test_sensor_gives_the_defaults_of_the_default_profile():
 
 def test_sensor_gives_the_modelled_latency_and_the_highest_rates():
     text = (DOCS / "sensor.md").read_text(encoding="utf-8")
-    timing, half_exposure_s = load_profile().timing, 0.05
-    for identify_s, name in (
-        (timing.identify_lost_s, "lost in space"),
-        (timing.identify_tracking_s, "tracking"),
-    ):
-        latency_s = half_exposure_s + timing.readout_s + timing.detect_s + identify_s
-        assert f"{1000 * latency_s:.0f} ms {name}" in text
+    for profile, half_exposure_s in (("ideal", 0.05), ("cubestar", 0.15)):
+        timing = load_profile(profile).timing
+        for identify_s, name in (
+            (timing.identify_lost_s, "lost in space"),
+            (timing.identify_tracking_s, "tracking"),
+        ):
+            latency_s = half_exposure_s + timing.readout_s + timing.detect_s + identify_s
+            assert re.search(rf"{1000 * latency_s:.0f} ms [a-z ]*{name}", text)
     pairs = re.findall(r"^\| (\d+) ms \| (\d+) Hz \|$", text, re.MULTILINE)
     assert len(pairs) == 4
     for exposure_ms, rate_hz in pairs:
@@ -235,6 +244,7 @@ def bus():
 def unit(bus, tmp_path_factory):
     """An emulator on every link that the walk-through uses: its ready line, by key."""
     command = emulator_command(
+        profile="ideal",
         serial="auto",
         can=bus,
         seed=1,
@@ -305,6 +315,7 @@ def test_walkthrough_program(heading, unit, tmp_path):
 @pytest.mark.process
 def test_walkthrough_by_steps(tmp_path):
     command = emulator_command(
+        profile="ideal",
         settings=["parameters.start_mode=lost_in_space", "parameters.update_rate=2"],
         extra=["--clock", "stepped", "--control", "auto"],
     )

@@ -138,7 +138,11 @@ def within_limits(found: Comparison) -> bool:
 
 def report(comparisons: dict[str, Comparison], console: Console) -> bool:
     """Print the attitude errors; return whether all are within their limits."""
-    table = Table("figure", *comparisons, title="Measured attitude against the truth, as the OBC read it")
+    table = Table(
+        "figure",
+        *comparisons,
+        title="Measured attitude of the ideal sensor against the truth, as the OBC read it",
+    )
     figures: dict[str, Callable[[Comparison], str]] = {
         "frames": lambda found: str(len(found.time_s)),
         "samples without a valid attitude": lambda found: str(found.invalid),

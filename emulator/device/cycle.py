@@ -170,6 +170,9 @@ class FrameCycle:
         """True orbit, for truth sources that bring none."""
         self.start_unix_s = 0.0
         """True date at simulation time zero, Unix time."""
+        self.sky_has_aberration = True
+        """Whether there is an aberration to be corrected."""
+        self._warned_of_aberration = False
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
         self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
         self.conditions: Callable[[TruthState], Conditions] = lambda _truth: Conditions()
@@ -279,8 +282,7 @@ class FrameCycle:
         truth = self.true_state(mid_ns)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
-        velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
-        request = self.request(truth, exposure_s, predicted, velocity)
+        request = self.request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         self._in_flight.append(frame)
         ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
         generation = self._generation
@@ -298,6 +300,18 @@ class FrameCycle:
         if self.after_exposure is not None:
             then, self.after_exposure = self.after_exposure, None
             then()
+
+    def _assumed_velocity(self, mid_ns: int) -> NDArray[np.float64] | None:
+        """Return the velocity by which the device corrects aberration; None under a sky that has none."""
+        velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
+        if velocity is None or self.sky_has_aberration:
+            return velocity
+        if not self._warned_of_aberration:
+            self._warned_of_aberration = True
+            log.warning(
+                "corrects_aberration has no effect: the sky has no aberration; give it a date, sky.date or sky.bodies=ephemeris"
+            )
+        return None
 
     def true_state(self, at_ns: int) -> TruthState:
         """Return the truth, with date and orbit, at a simulation time in nanoseconds."""

@@ -23,6 +23,7 @@ from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import IDENTITY, FrameRequest, Quaternion
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.sky.radiation import particle_rate
+from starhil.emulator.sky.view import has_aberration
 from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import TruthSource, TruthState
 from starhil.protocol.codec import Field
@@ -128,6 +129,7 @@ class Device:
         self.power = PowerModel(profile.power)
         self.thermal = ThermalModel(profile.thermal)
         self.cycle.start_unix_s = profile.start_unix_s
+        self.cycle.sky_has_aberration = profile.images.used or bool(has_aberration(profile.sky))
         self.cycle.orbit = orbit_of(profile)
         self.cycle.mode = lambda: self.modes.mode
         self.images = ImageStore(

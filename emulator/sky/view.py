@@ -47,6 +47,11 @@ class SkyView:
     observer: Observer | None = None
 
 
+def has_aberration(values: Mapping[str, Any]) -> Any:
+    """Return whether a table `[sky]` shows stars with aberration: what it says, else whether it has a date."""
+    return values.get("aberration", values.get("date") is not None or values.get("bodies") == BODIES[1])
+
+
 class Sky:
     """The sky of a profile.
 
@@ -68,13 +73,14 @@ class Sky:
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         fields = dict(values)
-        dated = fields.pop("date", None) is not None
+        fields.pop("date", None)
         bodies = fields.pop("bodies", BODIES[0])
         if bodies not in BODIES:
             raise EmulatorError(f"sky bodies: must be {' or '.join(map(repr, BODIES))}, not {bodies!r}")
         self.by_date = bodies == BODIES[1]
         """Whether the date places Sun, Moon, Earth and planets."""
-        self._moving = fields.pop("aberration", dated or self.by_date)
+        self._moving = has_aberration(values)
+        fields.pop("aberration", None)
         if not isinstance(self._moving, bool):
             raise EmulatorError(f"sky aberration: must be true or false, not {self._moving!r}")
         self._styles = {name: _styled(name, style, fields) for name, style in _STYLES.items() if self.by_date}

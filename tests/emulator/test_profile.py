@@ -2,8 +2,9 @@ import pytest
 
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile import Profile, configs_folder, load_profile
+from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
 from starhil.emulator.truth.config import SlewConfig
+from starid.camera import Camera
 
 
 def write(tmp_path, text, name="mine.toml"):
@@ -24,10 +25,13 @@ def test_every_profile_of_the_product_is_valid(name):
     assert load_profile(name).name == name
 
 
-def test_default_profile_is_the_unit_of_the_issue():
+def test_default_profile_is_of_the_class_of_the_first_cubestar():
     profile = load_profile()
-    assert (profile.camera.width, profile.camera.height, profile.camera.fov_deg) == (937, 937, 42.0)
+    camera = Camera.from_dict(profile.camera.values())
+    assert (profile.name, camera.width, camera.height) == ("cubestar", 937, 937)
+    assert camera.fov_deg == pytest.approx(42.0, abs=0.001)
     assert profile.parameters["update_rate"] == 1.0
+    assert profile.parameters.keys() >= CALIBRATION
     assert profile.links.serial.dialect == "b"
 
 
@@ -63,6 +67,17 @@ def test_a_calibrated_camera_takes_the_place_of_the_field_of_view(tmp_path):
     assert "fov_deg" not in load_profile(both).camera.values()
     back = write(tmp_path, f'extends = "{both}"\n[camera]\nfov_deg = 30.0\n', "back.toml")
     assert "focal_px" not in load_profile(back).camera.values()
+
+
+def test_a_camera_of_its_own_is_known_exactly_unless_the_profile_says_otherwise(tmp_path):
+    mine = 'extends = "cubestar"\n[camera]\nfov_deg = 20.0\n'
+    assert not load_profile(write(tmp_path, mine)).parameters.keys() & CALIBRATION
+    corrected = load_profile(write(tmp_path, f"{mine}[parameters]\nk1 = -0.14\n")).parameters
+    assert {name: corrected[name] for name in corrected.keys() & CALIBRATION} == {"k1": -0.14}
+    typed = load_profile("cubestar", ["parameters.k1=-0.14", "camera.fov_deg=20"])
+    assert typed.camera.values()["fov_deg"] == 20.0
+    assert "focal_px" not in typed.camera.values()
+    assert {name: typed.parameters[name] for name in typed.parameters.keys() & CALIBRATION} == {"k1": -0.14}
 
 
 def test_a_profile_extends_a_path_beside_it(tmp_path):

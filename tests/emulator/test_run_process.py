@@ -44,6 +44,7 @@ class Emulator:
             "-c",
             f"{default}; from starhil.emulator.cli.app import main; main()",
             "run",
+            "ideal",
         ]
         self.process = subprocess.Popen(
             [*command, "--can", "off", "--control", "auto", *arguments],

@@ -26,9 +26,10 @@ def bus():
 
 @pytest.fixture(scope="module")
 def emulator(bus, tmp_path_factory):
-    """An emulator on a pty at 921600 baud and on the bus."""
+    """An emulator of an accurate sensor on a pty at 921600 baud and on the bus."""
     folder = tmp_path_factory.mktemp("emulator")
     command = emulator_command(
+        profile="ideal",
         serial="auto",
         can=bus,
         seed=1,
@@ -43,7 +44,9 @@ def emulator(bus, tmp_path_factory):
 @pytest.fixture(scope="module")
 def sagitta(tmp_path_factory):
     """An emulated Sagitta on a pty."""
-    command = emulator_command(unit="sagitta", seed=1, state_dir=tmp_path_factory.mktemp("sagitta"))
+    command = emulator_command(
+        profile="ideal", unit="sagitta", seed=1, state_dir=tmp_path_factory.mktemp("sagitta")
+    )
     with EmulatorProcess(command) as process:
         yield process
 

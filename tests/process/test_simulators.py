@@ -102,6 +102,7 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(WITHIN_S)
         command = emulator_command(
+            profile="ideal",
             settings=["truth.kind=42", f"truth.port={server.getsockname()[1]}", "parameters.start_mode=lost_in_space"],
             truth_log=tmp_path / "truth.csv",
             extra=["--clock", "stepped", "--record", str(tmp_path / "recorded")],

@@ -32,6 +32,7 @@ def unit(tmp_path_factory):
     """An emulator on vcan0."""
     state = tmp_path_factory.mktemp("state")
     command = emulator_command(
+        profile="ideal",
         serial="off",
         can="auto",
         seed=1,

@@ -26,7 +26,7 @@ def campaign(folder, *settings: str) -> dict:
     return json.loads(result.stdout)
 
 
-PROFILE = "cubestar"
+PROFILE = "ideal"
 
 
 def test_an_injected_drift_is_found_and_the_campaign_is_resumed(tmp_path):

@@ -149,7 +149,7 @@ def test_a_tolerance_of_the_automatic_field_is_rejected(tmp_path):
 def test_the_aberration_of_a_dated_image_is_corrected(tmp_path):
     profile, image = tmp_path / "dated.toml", tmp_path / "sky.png"
     orbit = "[orbit]\nkind = 'state'\nposition_m = [7e6, 0.0, 0.0]\nvelocity_m_s = [0.0, 0.0, 7500.0]\n"
-    profile.write_text(f"extends = 'cubestar'\n[sky]\ndate = 2026-12-20T12:00:00Z\n{orbit}")
+    profile.write_text(f"extends = 'ideal'\n[sky]\ndate = 2026-12-20T12:00:00Z\n{orbit}")
     where = ["--ra", "83.8", "--dec", "-1.2", "--roll", "30"]
     assert (
         starhil("render", "--profile", str(profile), *where, "--bits", "16", "-o", str(image)).exit_code == 0

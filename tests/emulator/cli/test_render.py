@@ -106,14 +106,14 @@ def test_a_profile_gives_exposure_gain_and_what_is_in_the_sky(
         assert run(monkeypatch, *arguments, *options) == 0
         return read_image(target), json.loads(capsys.readouterr().out)["exposure_s"]
 
-    plain, exposure = rendered('extends = "cubestar"\n')
+    plain, exposure = rendered('extends = "ideal"\n')
     assert exposure == 0.1
-    dark, _ = rendered('extends = "cubestar"\nsky = { blank = true }\n')
+    dark, _ = rendered('extends = "ideal"\nsky = { blank = true }\n')
     assert np.count_nonzero(dark > 30) < np.count_nonzero(plain > 30) / 4  # hot pixels stay
-    longer, exposure = rendered('extends = "cubestar"\nparameters = { exposure = 400, analog_gain = 2.0 }\n')
+    longer, exposure = rendered('extends = "ideal"\nparameters = { exposure = 400, analog_gain = 2.0 }\n')
     assert exposure == 0.4
     assert np.median(longer) > np.median(plain)
-    _, exposure = rendered('extends = "cubestar"\n', "--exposure", "0.3")
+    _, exposure = rendered('extends = "ideal"\n', "--exposure", "0.3")
     assert exposure == 0.3
 
 

@@ -29,7 +29,7 @@ def emulator():
     settings = [f"parameters.update_rate={UPDATE_RATE_HZ}"]
     with PrivateCanBus() as bus:
         command = emulator_command(
-            profile="cubestar", serial="off", can=bus, seed=1, settings=settings, extra=["--view", "auto"]
+            profile="ideal", serial="off", can=bus, seed=1, settings=settings, extra=["--view", "auto"]
         )
         with EmulatorProcess(command) as process:
             yield process

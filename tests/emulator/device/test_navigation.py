@@ -58,10 +58,25 @@ def test_a_device_that_corrects_aberration_takes_the_velocity_of_the_earth_at_it
     assert bench.pipeline.frames[-1].observer_velocity == pytest.approx(earth_velocity(EQUINOX), abs=0.1)
 
 
+def test_nothing_is_corrected_under_a_sky_without_aberration_and_one_line_says_so(make_bench, caplog):
+    bench = running(make_bench, parameters={"corrects_aberration": True})
+    assert len(bench.pipeline.frames) >= 2
+    assert {frame.observer_velocity for frame in bench.pipeline.frames} == {None}
+    assert caplog.text.count("corrects_aberration has no effect") == 1
+
+
+def test_photographs_have_aberration_without_a_date(make_bench):
+    bench = running(make_bench, images={"folder": "night"}, parameters={"corrects_aberration": True})
+    assert bench.pipeline.frames[0].observer_velocity == pytest.approx(
+        earth_velocity(NEW_YEAR + 1.0), abs=0.1
+    )
+
+
 def test_an_uploaded_orbit_adds_its_velocity(make_bench):
     bench = running(
         make_bench,
         run={"start_unix_s": EQUINOX},
+        sky={"bodies": "ephemeris"},
         orbit={"kind": "kepler", **ELEMENTS},
         parameters={"corrects_aberration": True},
     )

@@ -23,7 +23,7 @@ from tests.emulator.truth.simulators import ORION
 
 MILLIARCSECOND = 1e-3
 RATE_DEG_S = [0.4, 0.1, -0.2]
-"""Far from the axis (1, 0, 1), about which a wrong order together with a wrong convention turns the body frame: near it they cannot be detected."""
+"""Far from (0, 1, 0) and (1, 0, 1), about which a wrong order together with a wrong convention turns the body: near them it cannot be detected."""
 CONVENTIONS = [(convention, order) for convention in ("rotation", "attitude") for order in ("xyzw", "wxyz")]
 
 
