@@ -19,6 +19,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
 from starid.attitude import Attitude
+from tests.emulator.cli.command_line import run_command_line
 
 pytestmark = pytest.mark.process
 
@@ -289,18 +290,8 @@ def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place
     ],
 )
 def test_bad_input_ends_in_one_line_and_status_2(arguments, said):
-    command = [
-        sys.executable,
-        "-c",
-        "from starhil.emulator.cli.app import main; main()",
-        "run",
-        "--can",
-        "off",
-        *arguments,
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=READY_WITHIN_S, check=False)
-    assert done.returncode == 2, done.stderr
-    assert done.stdout == ""
-    (line,) = log_lines(done.stderr)
+    status, out, err = run_command_line("run", "--can", "off", *arguments)
+    assert (status, out) == (2, ""), err
+    (line,) = log_lines(err)
     assert line.startswith("starhil: ")
     assert said in line
