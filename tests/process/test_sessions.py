@@ -10,6 +10,7 @@ import pytest
 
 from starhil.hil_tests.emulator_process import installed_command
 from starhil.protocol.candump import read_candump
+from tests.emulator.cli.command_line import run_command_line
 from tests.protocol.dissection import dissect
 
 pytestmark = pytest.mark.process
@@ -76,8 +77,8 @@ def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(emulator, 
 def test_bad_input_ends_with_one_line_and_status_2(text, words, message, tmp_path):
     script = tmp_path / "wrong.toml"
     script.write_text(text)
-    done = starhil("session", script, *words, "--log", tmp_path / "log")
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert done.stderr.startswith("starhil: ")
+    status, _, said = run_command_line("session", str(script), *words, "--log", str(tmp_path / "log"))
+    assert status == 2
+    assert message in said
+    assert len(said.strip().splitlines()) == 1
+    assert said.startswith("starhil: ")
