@@ -171,8 +171,8 @@ def _check(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
         ("ra_rad", (ra >= 0.0) & (ra <= 2.0 * math.pi), "radians 0…2π"),
         ("dec_rad", np.abs(dec) <= 0.5 * math.pi, "radians −π/2…π/2"),
         ("hp", np.abs(hp) < 30.0, "a magnitude"),
-        ("pm_ra_mas_yr", np.abs(columns["pm_ra_mas_yr"]) < 1e5, "mas a year"),
-        ("pm_dec_mas_yr", np.abs(columns["pm_dec_mas_yr"]) < 1e5, "mas a year"),
+        ("pm_ra_mas_yr", np.abs(columns["pm_ra_mas_yr"]) < 1e5, "less than 1e5 mas a year"),
+        ("pm_dec_mas_yr", np.abs(columns["pm_dec_mas_yr"]) < 1e5, "less than 1e5 mas a year"),
     )
     for name, good, need in rules:
         if not good.all():
