@@ -118,7 +118,7 @@ def self_calibrate(
         No image could be identified, or `calibrate` fails.
     """
     if not frames:
-        raise StaridError("calibration: no images; at least one with stars is needed")
+        raise StaridError("calibration: no frames; at least one image with stars is needed")
     if estimate is not None:
         check_estimate(estimate)
     sky = load_catalog() if catalog is None else catalog

@@ -296,7 +296,10 @@ def test_blank_optional_fields_are_unknown(tmp_path: Path) -> None:
         (lambda rows: [rows[0], rows[1][:90] + b"\n", rows[2]], "line 2 is 90 characters long, must be"),
         (lambda rows: [rows[0], put(rows[1], 130, b" x.y  "), rows[2]], r"line 2: hp \(columns 130-136\)"),
         (lambda rows: [rows[0], put(rows[1], 130, b"       "), rows[2]], r"line 2: hp \(columns 130-136\)"),
-        (lambda rows: [put(rows[0], 30, b" 9.9999999999"), *rows[1:]], "line 1: dec_rad must be radians .*, not 10"),
+        (
+            lambda rows: [put(rows[0], 30, b" 9.9999999999"), *rows[1:]],
+            "line 1: dec_rad must be radians .*, not 10",
+        ),
         (lambda rows: [put(rows[0], 130, b"    nan"), *rows[1:]], "line 1: hp must be a magnitude, not nan"),
         (lambda rows: [rows[0], rows[1], put(rows[2], 1, b"     1")], "HIP 1 appears twice"),
         (lambda _: [b"not a catalogue\n"], "hip2.dat"),
