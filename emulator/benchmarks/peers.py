@@ -22,6 +22,8 @@ from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.geometric.pattern_index import field_solid_angle
+from starid.geometric.pattern_stars import pick_pattern_stars
 from starid.interface import CLASSICS, make_identifier
 from starid.solution import Solution
 
@@ -30,6 +32,8 @@ Array = NDArray[np.float64]
 OWN: Final = ("geometric", "lsi", "rsi")
 VARIANTS: Final = ("lsi-matlab", "lsi-sklearn")
 """The thesis's algorithm with another solver, by name only: its verified answers are those of `lsi`."""
+EVEN: Final = "-even"
+"""Suffix of a published algorithm whose guide stars are thinned out to be evenly spread, by name only."""
 PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve", "solve-field")
 ALL: Final = (*OWN, *CLASSICS, *PEERS)
 PATTERN_MAX_ERROR: Final = 0.005
@@ -37,6 +41,8 @@ RUST_TOLERANCE_RAD: Final = 0.0015
 RUST_LOOKUP_MAGNITUDE: Final = 4.0
 RUST_MATCHES: Final = 8
 CEDAR_TIMEOUT_MS: Final = 5000.0
+EVEN_PER_FIELD: Final = 12
+"""Most evenly spread guide stars in the solid angle of a field round any of them."""
 LEAST_SIGMA_PX: Final = 0.1
 """Noise that a raw published algorithm is given where there is none."""
 LEAST_FEATURE_FIELD_DEG: Final = 30.0
@@ -136,8 +142,8 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog, *, raw: bool = Fa
     """
     if name in (*OWN, *VARIANTS):
         return _own(name, camera)
-    if name in CLASSICS:
-        return _classic(name, camera, float(stars.v[-1]), verify=not raw)
+    if name.removesuffix(EVEN) in CLASSICS:
+        return _classic(name, camera, stars, verify=not raw)
     if ":" in name:
         return _custom(name, camera, stars)
     check_name(name)
@@ -162,7 +168,7 @@ def check_name(name: str) -> None:
         It is neither one of `ALL` nor MODULE:FUNCTION.
     """
     known = (*ALL, *VARIANTS)
-    if name not in known and ":" not in name:
+    if name.removesuffix(EVEN) not in CLASSICS and name not in known and ":" not in name:
         raise EmulatorError(f"solver {name!r}: must be one of {', '.join(known)}, or MODULE:FUNCTION")
 
 
@@ -209,10 +215,21 @@ def _own(name: str, camera: Camera) -> Solver:
     return Solver(solve, getattr(identifier, "reset", lambda: None), track, size)
 
 
-def _classic(name: str, camera: Camera, limiting_magnitude: float, *, verify: bool) -> Solver:
+def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> Solver:
     """Make a published algorithm; it is given the sensor's limit and the magnitude of one unit of flux, and raw also the noise."""
+    guide = None
+    if name.endswith(EVEN):
+        if verify:
+            raise UnsuitedError("its verification needs all stars; evenly spread guide stars are for --raw")
+        picked = pick_pattern_stars(stars.vectors, field_solid_angle(camera), EVEN_PER_FIELD)
+        guide = stars.subset(picked)
     identifier: Any = make_identifier(
-        name, camera, limiting_magnitude=limiting_magnitude, zero_point=0.0, verify=verify
+        name.removesuffix(EVEN),
+        camera,
+        guide,
+        limiting_magnitude=float(stars.v[-1]),
+        zero_point=0.0,
+        verify=verify,
     )
 
     def solve(scene: Scene) -> Reply:

@@ -255,7 +255,8 @@ def identify(
     solvers: Annotated[
         str,
         typer.Option(
-            help="Solvers: geometric,lsi,rsi, published ones such as pyramid,grid, or a custom MODULE:FUNCTION; "
+            help="Solvers: geometric,lsi,rsi, published ones such as pyramid,grid (pyramid-even: with evenly spread guide stars), "
+            "or a custom MODULE:FUNCTION; "
             "'all' adds the third-party ones."
         ),
     ] = "geometric",

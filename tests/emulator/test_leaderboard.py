@@ -19,6 +19,7 @@ from starhil.emulator.cli.bench import group
 from starhil.emulator.errors import EmulatorError
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from starid.geometric.pattern_index import field_solid_angle
 from starid.interface import CLASSICS
 from starid.solution import Reason, Solution
 
@@ -42,6 +43,12 @@ def liar(camera, stars):
 def nothing(camera, stars):
     return None
 """
+
+
+class Classic:
+    """What a published algorithm has beside its answers."""
+
+    database_bytes, build_seconds = 1, 0.1
 
 
 @pytest.fixture
@@ -153,21 +160,38 @@ def test_a_field_is_drawn_until_it_has_its_least_number_of_stars() -> None:
 def test_raw_answers_are_not_verified_and_know_the_noise(monkeypatch: pytest.MonkeyPatch, raw: bool) -> None:
     asked: list[object] = []
 
-    class Classic:
-        database_bytes, build_seconds = 1, 0.1
-
+    class Noting(Classic):
         def identify(self, *arguments):
             asked.append(None if arguments[2] is None else float(arguments[2][0]))
             return Solution.invalid(Reason.NO_MATCH)
 
     def made(*_, **options):
         asked.append(options["verify"])
-        return Classic()
+        return Noting()
 
     monkeypatch.setattr(peers, "make_identifier", made)
     bench.run(1, 5, own=["pyramid"], rows=["2"], raw=raw)
     assert asked[0] is not raw
     assert asked[-1] == (2.0 if raw else None)
+
+
+def test_evenly_spread_guide_stars_are_the_brightest_of_each_neighbourhood_and_unverified(
+    monkeypatch,
+) -> None:
+    camera, stars = Camera.from_fov(20.0), load_catalog().brighter_than(5.0)
+    given = []
+    monkeypatch.setattr(
+        peers, "make_identifier", lambda *arguments, **_: given.append(arguments) or Classic()
+    )
+    make_solver("pyramid-even", camera, stars, raw=True)
+    ((name, _, guide),) = given
+    near = guide.vectors @ guide.vectors.T > 1.0 - field_solid_angle(camera) / (2.0 * math.pi)
+    assert name == "pyramid"
+    assert 0.3 * len(stars) < len(guide) < 0.9 * len(stars)
+    # of each star's neighbourhood so many are brighter at most: it was selected after them
+    assert np.tril(near, -1).sum(axis=1).max() < peers.EVEN_PER_FIELD
+    with pytest.raises(peers.UnsuitedError, match="--raw"):
+        make_solver("pyramid-even", camera, stars)
 
 
 @pytest.mark.parametrize(
