@@ -450,7 +450,10 @@ class AreaPainter:
             x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
             along = (math.cos(angle) * x)[None, :] + (math.sin(angle) * y)[:, None]
             edge = np.quantile(along, 1.0 - obstruction.share)
-            cover = (along <= edge if obstruction.share > 0.0 else np.ones_like(along)).astype(np.float32)
+            partial = 0.0 < obstruction.share < 1.0
+            cover = (along <= edge if partial else np.full_like(along, obstruction.share == 0.0)).astype(
+                np.float32
+            )
         if obstruction.softness_px <= 0.0:
             return cover
         soft = cv2.GaussianBlur(cover, (0, 0), obstruction.softness_px, borderType=cv2.BORDER_REPLICATE)

@@ -150,6 +150,11 @@ def test_a_blank_sky_has_no_light(renderer: Renderer) -> None:
     assert found.reason
 
 
+def test_an_obstruction_of_the_whole_image_lets_no_light_in(renderer: Renderer) -> None:
+    covered = renderer.render(ORION, objects=SkyObjects(obstructions=(Obstruction(1.0),)))
+    assert covered.image.tobytes() == renderer.render(ORION, objects=SkyObjects(blank=True)).image.tobytes()
+
+
 def test_objects_do_not_change_the_noise_stream(renderer: Renderer) -> None:
     plain = renderer.render(ORION)
     nothing = renderer.render(ORION, objects=SkyObjects())
