@@ -19,7 +19,7 @@ from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
-from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area, add_glare
+from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area, add_earth, add_glare
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -290,15 +290,16 @@ class Renderer:
     ) -> npt.NDArray[np.float64]:
         """Add point sources at fixed directions; return their positions (n, 2)."""
         xy = np.full((len(planets), 2), np.nan)
-        if not planets:
+        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets]).reshape(-1, 3)
+        near = self._near(vectors, attitude, rate, exposure_s)
+        if not near.size:
             return xy
-        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
-        path, inside, touching = self._path_of(vectors, attitude, rate, exposure_s)
-        xy[inside] = path[inside, :2]
-        if not touching.any():
-            return xy
-        electrons = np.array([self.sensor.electrons(planet.magnitude, exposure_s) for planet in planets])
-        path, electrons = path[touching], electrons[touching]
+        path, inside, touching = self._path_of(vectors[near], attitude, rate, exposure_s)
+        xy[near[inside]] = path[inside, :2]
+        electrons = np.array(
+            [self.sensor.electrons(planets[k].magnitude, exposure_s) for k in near[touching]]
+        )
+        path = path[touching]
         self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))
         return xy
 
@@ -310,6 +311,8 @@ class Renderer:
         exposure_s: float,
     ) -> npt.NDArray[np.float64]:
         """Add false stars at random positions; return the positions (n, 2)."""
+        if not objects.false_stars + objects.fixed_false_stars:
+            return np.zeros((0, 2))
         fixed = np.random.default_rng((self.seed, _OBJECT_STREAM))
         size = np.array([self.camera.width, self.camera.height])
         low, high = objects.false_star_magnitudes
@@ -351,6 +354,8 @@ class Renderer:
             add_glare(self._work, self._still, sensitivity, area.glare, exposure_s)
         else:
             np.copyto(self._work, self._still)
+        if area is not None and area.earth is not None:
+            add_earth(self._work, self._still, sensitivity, area.earth, float(self._sky_e_s), exposure_s)
         if area is not None and area.electrons_s is not None and area.transmission is not None:
             add_area(
                 self._work, area.electrons_s, area.transmission, sensitivity, float(self._sky_e_s), exposure_s
@@ -368,15 +373,25 @@ class Renderer:
 
         A path is the parabola through the projections at the start, middle and end of the exposure.
         """
-        readout_s = self.camera.height * self.sensor.row_time_s
-        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
-        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
-        near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
+        near = self._near(self._vectors, attitude, rate, exposure_s)
         icrs = self._vectors[near]
         if observer is not None:
             icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
         path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
+
+    def _near(
+        self,
+        vectors: npt.NDArray[np.float64],
+        attitude: Attitude,
+        rate: npt.NDArray[np.float64],
+        exposure_s: float,
+    ) -> npt.NDArray[np.int64]:
+        """Return the numbers of the directions (n, 3) in the cone around the field that the exposure sweeps."""
+        readout_s = self.camera.height * self.sensor.row_time_s
+        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
+        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
+        return np.flatnonzero(vectors @ attitude.boresight >= cosine)
 
     def _path_of(
         self,

@@ -38,6 +38,49 @@ _SPOT_SIGMAS: Final = 2.0
 _GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
 
+_WIDE_EARTH_DEG: Final = 20.0
+"""Angular radius of the Earth from which it is computed on the grid: the limb is within 0.03 pixels of its place."""
+
+
+@dataclass(frozen=True)
+class WideEarth:
+    """An Earth that covers much of the field, as smooth functions of the position in the image.
+
+    Attributes
+    ----------
+    grid : ndarray (3, gh, gw), float32
+        At every `GLARE_STEP`-th column and row: cosines of the angles to the Earth's centre and to the Sun, and the height
+        above the limb in heights of the atmosphere.
+    distance : float
+        Distance of the Earth's centre in its radii.
+    behind : float
+        Cosine of the Sun's zenith distance at the point opposite to the nadir.
+    brightness : float
+        Electrons/s per pixel where the Sun is in the zenith.
+    """
+
+    grid: Image
+    distance: float
+    behind: float
+    brightness: float
+
+    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return the transmission (n,) of the atmosphere at positions (n, 2)."""
+        height = self.grid[2]
+        limits = np.array(height.shape)[::-1] - 2
+        cell = np.clip(np.floor(xy_px / GLARE_STEP), 0, limits).astype(np.int64)
+        along, down = (xy_px / GLARE_STEP - cell).T
+        column, row = cell.T
+        upper = height[row, column] * (1.0 - along) + height[row, column + 1] * along
+        lower = height[row + 1, column] * (1.0 - along) + height[row + 1, column + 1] * along
+        seen: npt.NDArray[np.float64] = np.clip(upper * (1.0 - down) + lower * down, 0.0, 1.0)
+        return seen
+
+    @property
+    def covered_share(self) -> float:
+        """Fraction of the cells of the grid that receive less than half of the sky's light."""
+        return float(np.mean(self.grid[2, :-1, :-1] < 0.5))
+
 
 @dataclass(frozen=True)
 class AreaLight:
@@ -53,15 +96,20 @@ class AreaLight:
         Fraction of the light from behind that is visible, 0…1; None together with `electrons_s`.
     flooded : bool
         Light passes the baffle and saturates the image; the rest is then empty.
+    earth : WideEarth or None
+        An Earth in front of `glare` and sky; the other light and shadow are then None.
     """
 
     glare: Image | None = None
     electrons_s: Image | None = None
     transmission: Image | None = None
     flooded: bool = False
+    earth: WideEarth | None = None
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
+        if self.earth is not None:
+            return self.earth.seen_at(xy_px)
         if self.transmission is None:
             return np.full(len(xy_px), 0.0 if self.flooded else 1.0)
         height, width = self.transmission.shape
@@ -72,6 +120,8 @@ class AreaLight:
     @property
     def covered_share(self) -> float:
         """Fraction of the image that receives less than half of the sky's light."""
+        if self.earth is not None:
+            return self.earth.covered_share
         if self.transmission is None:
             return float(self.flooded)
         return float(np.count_nonzero(self.transmission < 0.5) / self.transmission.size)
@@ -80,10 +130,14 @@ class AreaLight:
 @compiled_ieee
 def _expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32]) -> None:
     """Interpolate a row of the glare's grid at every column."""
-    for i in range(row.size - 1):
+    whole = line.size // GLARE_STEP
+    for i in range(whole):
         first, slope = row[i], (row[i + 1] - row[i]) * np.float32(1.0 / GLARE_STEP)
-        for k in range(min(GLARE_STEP, line.size - i * GLARE_STEP)):
+        for k in range(GLARE_STEP):
             line[i * GLARE_STEP + k] = first + slope * np.float32(k)
+    for x in range(whole * GLARE_STEP, line.size):
+        slope = (row[whole + 1] - row[whole]) * np.float32(1.0 / GLARE_STEP)
+        line[x] = row[whole] + slope * np.float32(x - whole * GLARE_STEP)
 
 
 @compiled_ieee
@@ -118,6 +172,84 @@ def add_area(
         for x in range(to.size):
             added = (light[x] + (passed[x] - np.float32(1.0)) * sky) * gain[x] * exposure
             to[x] = max(to[x] + added, np.float32(0.0))
+
+
+@compiled_ieee
+def _glow(height: npt.NDArray[np.float32], line: npt.NDArray[np.float32]) -> None:
+    """Brightness of the atmosphere over that of the disc, from its height at every `GLARE_STEP`-th column."""
+    line[:] = 1.0
+    for i in range(height.size - 1):
+        first, last = height[i], height[i + 1]
+        if max(first, last) <= 0.0:
+            continue
+        start, end = i * GLARE_STEP, min((i + 1) * GLARE_STEP, line.size)
+        if min(first, last) > _GLOW_HEIGHTS:
+            line[start:end] = 0.0
+            continue
+        share, ratio = math.exp(-first), math.exp((first - last) / GLARE_STEP)
+        for x in range(start, end):
+            line[x] = min(share, 1.0)
+            share *= ratio
+
+
+def add_earth(
+    mean: Image, still: Image, sensitivity: Image, earth: WideEarth, sky_e_s: float, exposure_s: float
+) -> None:
+    """Put a wide Earth in front of the mean electrons (h, w), in place.
+
+    `still` is `mean` without the glare of Sun and Moon: sky and dark current.
+    """
+    body = (earth.distance, earth.behind, earth.brightness)
+    _add_wide_earth(mean, still, sensitivity, earth.grid, body, sky_e_s, exposure_s)
+
+
+@compiled_ieee
+def _add_wide_earth(
+    mean: Image,
+    still: Image,
+    sensitivity: Image,
+    grid: Image,
+    body: tuple[float, float, float],
+    sky_e_s: float,
+    exposure_s: float,
+) -> None:
+    """As `add_earth`, with the Earth's grid, and its distance, `behind` and brightness."""
+    width = mean.shape[1]
+    upper, lower = np.empty((3, width), dtype=np.float32), np.empty((3, width), dtype=np.float32)
+    for k in range(3):
+        _expand(grid[k, 0], lower[k])
+    height = np.empty(grid.shape[2], dtype=np.float32)
+    light, glow = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    far, far2, behind = np.float32(body[0]), np.float32(body[0] * body[0]), np.float32(body[1])
+    full, sky, exposure = np.float32(body[2]), np.float32(sky_e_s), np.float32(exposure_s)
+    for y in range(mean.shape[0]):
+        cell, share = y // GLARE_STEP, np.float32(y % GLARE_STEP) / np.float32(GLARE_STEP)
+        if y % GLARE_STEP == 0:
+            upper, lower = lower, upper
+            nearest = min(np.min(grid[2, cell]), np.min(grid[2, cell + 1]))
+            for k in range(3):
+                _expand(grid[k, cell + 1], lower[k])
+        if nearest > _GLOW_HEIGHTS:
+            continue
+        for i in range(height.size):
+            height[i] = grid[2, cell, i] + share * (grid[2, cell + 1, i] - grid[2, cell, i])
+        _glow(height, glow)
+        near, next_near = upper[0], lower[0]
+        lit, next_lit = upper[1], lower[1]
+        for x in range(width):
+            # brightness by the Sun's zenith distance where the line of sight meets a sphere of radius 1
+            cosine = near[x] + share * (next_near[x] - near[x])
+            along = far * cosine - np.sqrt(max(one - far2 * (one - cosine * cosine), zero))
+            shade = behind + along * (lit[x] + share * (next_lit[x] - lit[x]))
+            light[x] = full * glow[x] * min(max(shade, zero), one)
+        high, next_high = upper[2], lower[2]
+        to, base, gain = mean[y], still[y], sensitivity[y]
+        for x in range(width):
+            clear = min(max(high[x] + share * (next_high[x] - high[x]), zero), one)
+            sensed = gain[x] * exposure
+            dark = base[x] - sensed * sky
+            to[x] = max(dark + (to[x] - dark) * clear + sensed * light[x], zero)
 
 
 def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
@@ -302,14 +434,20 @@ class AreaPainter:
         moon, earth = objects.moon, objects.earth
         if earth is not None and not self._earth_in_field(earth, attitude):
             earth = None
-        covered = earth is not None or bool(objects.obstructions) or objects.blank
+        covered = bool(objects.obstructions) or objects.blank
         disc = None if moon is None else self._moon_box(moon, attitude)
         smooth, sharp = self._sorted_glare(objects, attitude, sharp=covered)
+        wide = earth is not None and earth.radius_deg >= _WIDE_EARTH_DEG
+        if earth is not None and (covered or sharp or disc or not wide):
+            covered, wide = True, False
+            smooth, sharp = [], smooth + sharp
         glare = None
         if smooth:
             glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
             for source in smooth:
                 _add_glare(glare, self._grid_directions, *source)
+        if earth is not None and wide:
+            return AreaLight(glare, earth=self._wide_earth(earth, attitude))
         if not (sharp or covered or disc):
             return AreaLight(glare)
         electrons_s, transmission = self._buffers
@@ -418,18 +556,34 @@ class AreaPainter:
     def _paint_earth(
         self, electrons_s: Image, transmission: Image, earth: EarthLimb, attitude: Attitude
     ) -> None:
-        """Add the Earth's disc; its limb fades over the atmosphere, and at least over the width of a spot."""
+        """Add the Earth's disc, pixel by pixel."""
+        nadir, sun = self._earth_and_sun(earth, attitude)
+        angles = (math.radians(earth.radius_deg), self._atmosphere_rad(earth))
+        _add_earth(electrons_s, transmission, self._directions, nadir, sun, angles, earth.electrons_s)
+
+    def _wide_earth(self, earth: EarthLimb, attitude: Attitude) -> WideEarth:
+        """Return the Earth on the grid."""
+        nadir, sun = self._earth_and_sun(earth, attitude)
+        directions = self._grid_directions
+        cosine = np.tensordot(nadir, directions, axes=1)
+        height = np.arccos(np.clip(cosine, -1.0, 1.0)) - math.radians(earth.radius_deg)
+        grid = np.stack([cosine, np.tensordot(sun, directions, axes=1), height / self._atmosphere_rad(earth)])
+        distance = 1.0 / math.sin(math.radians(earth.radius_deg))
+        behind = -distance * float(nadir @ sun) if np.any(sun) else 1.0
+        return WideEarth(grid.astype(np.float32), distance, behind, earth.electrons_s)
+
+    def _earth_and_sun(
+        self, earth: EarthLimb, attitude: Attitude
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""
         sun = _sun_of(earth)
+        nadir = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg))
+        return nadir, np.zeros(3) if sun is None else attitude.to_sensor(sun)
+
+    def _atmosphere_rad(self, earth: EarthLimb) -> float:
+        """Return the angle over which the limb fades: the atmosphere's, but at least the width of a spot."""
         spot = _SPOT_SIGMAS * self._psf_sigma_px * self._camera.pixel_scale_rad
-        _add_earth(
-            electrons_s,
-            transmission,
-            self._directions,
-            attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg)),
-            np.zeros(3) if sun is None else attitude.to_sensor(sun),
-            (math.radians(earth.radius_deg), max(math.radians(earth.atmosphere_deg), spot)),
-            earth.electrons_s,
-        )
+        return max(math.radians(earth.atmosphere_deg), spot)
 
     def _earth_in_field(self, earth: EarthLimb, attitude: Attitude) -> bool:
         """Whether the Earth or the glow of its limb reaches into the field."""

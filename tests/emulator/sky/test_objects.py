@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.light import AreaPainter, add_area, add_earth, add_glare
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
 from starid.attitude import Attitude
-from starid.camera import DEFAULT_CAMERA
+from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
 from starid.imaging.detection import detect
 
@@ -79,6 +82,36 @@ def test_the_earth_covers_what_is_behind_it(renderer: Renderer, electrons_s: flo
     assert 0.2 < frame.objects.covered_share < 0.6
     below = np.median(frame.image[-40:])
     assert below == renderer.sensor.max_dn if electrons_s else below <= np.median(frame.image[:40])
+
+
+@pytest.mark.parametrize("sun", [None, (60.0, 20.0), (150.0, -40.0)])
+@pytest.mark.parametrize("radius_deg", [64.0, 20.0])
+def test_a_wide_earth_is_that_of_every_pixel(radius_deg: float, sun: tuple[float, float] | None) -> None:
+    """Within 1.2 % of full daylight and 0.8 % of the stars' light of the computation pixel by pixel, up to the limb."""
+    camera = Camera.from_fov(20.0, width=440, height=440)
+    lit = {} if sun is None else {"sun_ra_deg": sun[0], "sun_dec_deg": sun[1]}
+    earth = EarthLimb(83.8, -1.0 - radius_deg, radius_deg=radius_deg, atmosphere_deg=0.2, **lit)
+    objects = SkyObjects(earth=earth, sun=SunGlare(83.8, 60.0, 2000.0))
+    no_cover = Obstruction(0.0, softness_px=0.0)  # brings the Earth of every pixel
+    painter = AreaPainter(camera, 1.8e6, 0.8)
+    flat = np.ones((camera.height, camera.width), dtype=np.float32)
+    exact = painter.paint(replace(objects, obstructions=(no_cover,)), ORION)
+    assert exact.electrons_s is not None
+    assert exact.transmission is not None
+    expected = flat.copy()
+    add_area(expected, exact.electrons_s, exact.transmission, flat, 1.0, 1.0)
+    pixels = np.argwhere(flat)[::97, ::-1].astype(np.float64)
+    visible, share = exact.seen_at(pixels), exact.covered_share
+    wide = painter.paint(objects, ORION)
+    assert wide.earth is not None
+    assert wide.glare is not None
+    mean = flat.copy()
+    add_glare(mean, flat, flat, wide.glare, 1.0)
+    add_earth(mean, flat, flat, wide.earth, 1.0, 1.0)
+    np.testing.assert_allclose(mean, expected, atol=0.012 * earth.electrons_s)
+    np.testing.assert_allclose(wide.seen_at(pixels), visible, atol=0.008)
+    assert wide.covered_share == pytest.approx(share, abs=0.02)
+    assert 0.3 < share < 0.7
 
 
 def test_a_straight_edge_covers_the_share_asked_for(renderer: Renderer) -> None:
