@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
 import io
+import math
 import re
 import subprocess
 import sys
@@ -166,6 +168,20 @@ def test_sensor_gives_the_modelled_latency_and_the_highest_rates():
         Parameters(load_unit(), {"exposure": int(exposure_ms), "update_rate": float(rate_hz)})
         with pytest.raises(EmulatorError, match="or less"):
             Parameters(load_unit(), {"exposure": int(exposure_ms) + 1, "update_rate": float(rate_hz)})
+
+
+def test_the_report_of_cubestar_has_the_published_figures():
+    folder = DOCS / "performance" / "cubestar"
+    with (folder / "errors.csv").open(encoding="utf-8") as stream:
+        errors = {row["error"].split()[0]: row for row in csv.DictReader(stream)}
+    for line in ("total", "measured"):
+        x, y, z = (float(errors[line][f"{axis}_arcsec"]) / 3600.0 for axis in "xyz")
+        assert math.hypot(x, y) / math.sqrt(2.0) == pytest.approx(0.0154, rel=0.2), line
+        assert z == pytest.approx(0.0215, rel=0.2), line
+    with (folder / "availability.csv").open(encoding="utf-8") as stream:
+        rest = next(csv.DictReader(stream))
+    assert (rest["influence"], rest["frames"], rest["wrong"]) == ("rest", "10000", "0")
+    assert int(rest["correct"]) >= 9800
 
 
 def test_every_link_between_documents_leads_somewhere():
