@@ -63,11 +63,6 @@ def earth_and_sun(
     return position, velocity, position - in_metres(heliocentric)[0]
 
 
-def earth_state(unix_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Barycentric position (3,), m, and velocity (3,), m/s, of the Earth's centre, ICRS."""
-    return earth_and_sun(unix_s)[:2]
-
-
 def earth_velocity(unix_s: float) -> NDArray[np.float64]:
     """Barycentric velocity (3,) of the Earth's centre, ICRS, m/s."""
     return earth_and_sun(unix_s)[1]
