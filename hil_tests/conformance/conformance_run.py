@@ -66,9 +66,9 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     if request.can is not None and (icd.link.can is not None or request.canopen_node is None):
         cases += can_suite(icd)
     if request.canopen_node is not None:
-        from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
+        from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 
-        cases += CANOPEN_CASES
+        cases += canopen_suite(icd)
     if not cases:
         raise BenchError("no link given: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
     return select_cases(cases, request.patterns, safe_only=request.safe_only)

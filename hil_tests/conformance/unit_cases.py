@@ -45,7 +45,8 @@ def _case(
     return Case(f"{area}.{name}", area, title, clause, run, intrusive)
 
 
-def _clause(row: Row) -> str:
+def clause_of_row(row: Row) -> str:
+    """Where a row is written."""
     return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
 
 
@@ -258,11 +259,11 @@ def _unknown(icd: InterfaceDefinition, stack: object, klass: str) -> Run:
 def _rows(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
     for row in icd.telemetry.values():
         title = f"{row.name} has {row.size} bytes and values within their limits"
-        yield _case("telemetry", row.name, title, _read_twice(row), _clause(row))
+        yield _case("telemetry", row.name, title, _read_twice(row), clause_of_row(row))
         bound = {field.value: name for name, field in row.named_fields.items() if field.value}
         if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
             title = f"{row.name} has a quaternion of length 1 when it is valid"
-            yield _case("attitude", row.name, title, _unit_length(row, bound), _clause(row))
+            yield _case("attitude", row.name, title, _unit_length(row, bound), clause_of_row(row))
 
 
 def _read_twice(row: Row) -> Run:
@@ -273,13 +274,18 @@ def _read_twice(row: Row) -> Run:
     return run
 
 
+def is_valid(value: Value) -> bool:
+    """Return whether a field reports a valid attitude: a flag or a number."""
+    return str(value).lower() in ("true", "1")
+
+
 def _unit_length(row: Row, bound: dict[str, str]) -> Run:
     step = max(abs(row.named_fields[bound[name]].scale) for name in QUATERNION)
     tolerance = 1e-5 + (2.0 * step if step < 1.0 else 0.0)
 
     def run(probe: UnitProbe) -> None:
         end = probe.now() + ATTITUDE_S
-        while str((seen := probe.values(row))[bound["attitude.valid"]]).lower() not in ("true", "1"):
+        while not is_valid((seen := probe.values(row))[bound["attitude.valid"]]):
             if probe.now() > end:
                 raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
             probe.sleep(0.1)
@@ -307,7 +313,7 @@ def _lengths(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
                     f"{row.name}.{why}",
                     title,
                     run,
-                    _clause(row),
+                    clause_of_row(row),
                     intrusive=row.kind == "telecommand",
                 )
 
@@ -318,7 +324,9 @@ def _limits(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
             for why, data in bad_values(row, field):
                 title = f"{row.name} with {name} {why} is refused"
                 run = _refused(row, data, ErrorCode.INVALID_PARAMETER)
-                yield _case("limits", f"{row.name}.{name}.{why}", title, run, _clause(row), intrusive=True)
+                yield _case(
+                    "limits", f"{row.name}.{name}.{why}", title, run, clause_of_row(row), intrusive=True
+                )
 
 
 def _refused(row: Row, data: bytes, code: ErrorCode) -> Run:
@@ -333,13 +341,13 @@ def _settings(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
     for row in icd.telecommands.values():
         if row.action in (None, "nothing") or row.action in icd.plugin.actions:
             title = f"{row.name} is accepted"
-            yield _case("commands", row.name, title, _accepted(row), _clause(row), intrusive=True)
+            yield _case("commands", row.name, title, _accepted(row), clause_of_row(row), intrusive=True)
     for row in icd.telemetry.values():
         source = next((field.telecommand for field in row.named_fields.values() if field.telecommand), None)
         if source is not None and icd.telecommands[source].action in (None, "nothing"):
             title = f"{row.name} reports what {source} has set, whatever the bytes"
             run = _read_back(icd.telecommands[source], row, used)
-            yield _case("settings", row.name, title, run, _clause(row), intrusive=True)
+            yield _case("settings", row.name, title, run, clause_of_row(row), intrusive=True)
 
 
 def _accepted(row: Row) -> Run:
@@ -391,7 +399,7 @@ def _echoes(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
         if "echo" in row.answers:
             title = f"{row.name} is echoed byte for byte before anything else"
             yield _case(
-                "echo", row.name, title, _echoed(row), _clause(row), intrusive=row.kind == "telecommand"
+                "echo", row.name, title, _echoed(row), clause_of_row(row), intrusive=row.kind == "telecommand"
             )
 
 
@@ -420,7 +428,7 @@ def _subscriptions(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops telemetry that is not asked for"
             run = _subscribed(row, fields, offered)
-            yield _case("subscriptions", row.name, title, run, _clause(row), intrusive=True)
+            yield _case("subscriptions", row.name, title, run, clause_of_row(row), intrusive=True)
 
 
 def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
@@ -450,7 +458,7 @@ def _clock(icd: InterfaceDefinition, stack: object) -> Iterator[Case[UnitProbe]]
         if command.action == "set_clock" and "microseconds" in arguments and row is not None:
             title = "the times of replies run from what the clock was set to"
             run = _clock_runs(command, arguments["microseconds"], row)
-            yield _case("clock", command.name, title, run, _clause(command), intrusive=True)
+            yield _case("clock", command.name, title, run, clause_of_row(command), intrusive=True)
 
 
 def _clock_runs(command: Row, name: str, row: Row) -> Run:

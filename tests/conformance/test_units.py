@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.icd import load_unit
+from tests.conformance.mutants_oresat import DAMAGES, MISTAKES, Mistake
 from tests.conformance.mutants_units import UnitMutant, mutants
 from tests.conformance.simulated import SimulatedUnit
 
@@ -32,6 +34,37 @@ def test_a_mutant_of_a_unit_is_caught_by_its_case(mutant: UnitMutant) -> None:
     assert outcome.status == "failed", f"{mutant.caught_by} passed on a {mutant.unit} where {mutant.name}"
     assert outcome.expected
     assert outcome.seen
+
+
+def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
+    with SimulatedUnit("canopen", unit="oresat") as simulated:
+        outcomes = run_cases(simulated.probe, canopen_suite(load_unit("oresat")))
+    assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
+    assert {o.id: o.seen for o in outcomes if o.status == "skipped"} == {
+        "canopen.design.attitude": "the EDS has no object named sequence"
+    }
+    assert len(outcomes) >= 175
+
+
+def caught_on_canopen(simulated: SimulatedUnit, case: str) -> None:
+    cases = {item.id: item for item in canopen_suite(load_unit("oresat"))}
+    with simulated:
+        outcome = run_case(simulated.probe, cases[f"canopen.{case}"])
+    assert outcome.status == "failed", f"{case} passed"
+    assert outcome.expected
+    assert outcome.seen
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_a_mistake_in_a_definition_on_canopen_is_caught_by_its_case(mistake: Mistake, tmp_path) -> None:
+    served = mistake.write(tmp_path)
+    caught_on_canopen(SimulatedUnit("canopen", unit="oresat", served=served), mistake.caught_by)
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_mutant_of_a_unit_on_canopen_is_caught_by_its_case(name: str) -> None:
+    case, damage = DAMAGES[name]
+    caught_on_canopen(SimulatedUnit("canopen", damage, unit="oresat"), case)
 
 
 def test_a_unit_without_cases_for_a_link_is_named() -> None:
