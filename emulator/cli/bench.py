@@ -190,7 +190,7 @@ def bus(
         int | None, typer.Option(min=1, max=127, help="CANopen node ID of a running device.")
     ] = None,
     device_address: DeviceAddress = 4,
-    dialect: SerialDialect = "b",
+    dialect: SerialDialect = None,
     realtime: Annotated[
         bool,
         typer.Option(
@@ -212,9 +212,10 @@ def bus(
     from starhil.protocol.icd import load_unit
     from starhil.protocol.serial_framing import Dialect
 
-    one_of("--dialect", dialect, DIALECTS)
+    if dialect is not None:
+        one_of("--dialect", dialect, DIALECTS)
     report = _progress()
-    running = Target(can, serial, canopen, device_address, baud, Dialect(dialect))
+    running = Target(can, serial, canopen, device_address, baud, Dialect(dialect or "b"))
     start = can is None and serial is None
     with started_device(baud, realtime, report) if start else nullcontext(running) as target:
         if realtime and not start:

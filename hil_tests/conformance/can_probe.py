@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Final
 
+from starhil.hil_tests.conformance.case import CaseFailed
 from starhil.hil_tests.conformance.link_probe import (
     BURST_ID,
     FIRST_TELEMETRY,
@@ -16,6 +18,7 @@ from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.raw_traffic import format_frame, parse_frame
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode
 
 TELECOMMAND: Final = 1
 ACK: Final = 2
@@ -43,36 +46,39 @@ def segments(data: bytes) -> list[bytes]:
     return [part + bytes([len(parts) - 1 - number]) for number, part in enumerate(parts)]
 
 
-class CanProbe(LinkProbe):
-    """Talks over a CAN bus.
+class CanWire(ABC):
+    """Sends requests and takes answers apart on a CAN bus, whatever the rows of the unit.
 
-    Parameters
+    Attributes
     ----------
     bus
         The bus.
-    icd
-        Rows and names.
     host, device
         CAN addresses of the tester and of the device.
+    log
+        What was sent and received.
     """
 
     link = "can"
+    icd: InterfaceDefinition
+    times: ProbeTimes
+    log: list[str]
 
-    def __init__(
-        self,
-        bus: Port[CanFrame],
-        icd: InterfaceDefinition,
-        *,
-        host: int = 1,
-        device: int = 4,
-        times: ProbeTimes | None = None,
-    ) -> None:
-        super().__init__(icd, times or ProbeTimes())
+    def join(self, bus: Port[CanFrame], host: int, device: int) -> None:
+        """Take a bus and addresses on it."""
         self.bus = bus
         self.host = host
         self.device = device
         self.unsolicited: list[CanFrame] = []
         self._frames: list[CanFrame] = []
+
+    @abstractmethod
+    def expect_silence(self, why: str, seconds: float | None = None) -> None:
+        """Fail the case if anything comes within a time."""
+
+    @abstractmethod
+    def expect_alive(self) -> None:
+        """Fail the case unless the next good request is answered."""
 
     def now(self) -> float:
         """Time of the port, s."""
@@ -83,10 +89,6 @@ class CanProbe(LinkProbe):
         end = self.now() + seconds
         while (left := end - self.now()) > 0:
             self._receive_into_buffer(left)
-
-    def post(self, identifier: int, data: bytes = b"") -> None:
-        """Send a request without waiting."""
-        self.post_as(self.host, identifier, data)
 
     def post_as(self, source: int, identifier: int, data: bytes = b"") -> None:
         """Send a request from another address than the tester's own."""
@@ -163,6 +165,14 @@ class CanProbe(LinkProbe):
         """Return the next unread answer."""
         return self._read(self.times.answer_s if timeout_s is None else timeout_s)
 
+    def expect_answer(self, kind: AnswerKind, what: str, code: ErrorCode | None = None) -> Answer:
+        """Take the next answer, which must be of a kind, and with a code if one is given."""
+        answer = self.next_answer()
+        number = None if code is None else int(self.icd.error_number(code))
+        if answer.kind != kind or number not in (None, answer.code):
+            raise CaseFailed(what, str(answer))
+        return answer
+
     def _read(self, timeout_s: float) -> Answer:
         frame = self.next_frame(timeout_s)
         if frame is None:
@@ -203,3 +213,41 @@ class CanProbe(LinkProbe):
             frame = self.next_frame()
         seen = b"" if frame is None else frame.data
         return Answer("malformed", data=data + seen, identifier=number, other=other)
+
+
+class CanProbe(CanWire, LinkProbe):
+    """Talks to a CubeStar over a CAN bus.
+
+    Parameters
+    ----------
+    bus
+        The bus.
+    icd
+        Rows and names.
+    host, device
+        CAN addresses of the tester and of the device.
+    """
+
+    def __init__(
+        self,
+        bus: Port[CanFrame],
+        icd: InterfaceDefinition,
+        *,
+        host: int = 1,
+        device: int = 4,
+        times: ProbeTimes | None = None,
+    ) -> None:
+        super().__init__(icd, times or ProbeTimes())
+        self.join(bus, host, device)
+
+    def post(self, identifier: int, data: bytes = b"") -> None:
+        """Send a request without waiting."""
+        self.post_as(self.host, identifier, data)
+
+    def expect_silence(self, why: str, seconds: float | None = None) -> None:
+        """Fail the case if anything comes within a time."""
+        LinkProbe.expect_silence(self, why, seconds)
+
+    def expect_alive(self) -> None:
+        """Fail the case unless the next good request is answered."""
+        LinkProbe.expect_alive(self)

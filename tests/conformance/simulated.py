@@ -26,7 +26,8 @@ from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import is_cubestar
-from starhil.hil_tests.conformance.unit_probe import UnitProbe
+from starhil.hil_tests.conformance.unit_can_probe import CanUnitProbe
+from starhil.hil_tests.conformance.unit_probe import SerialUnitProbe
 from starhil.protocol.canopen import build_dictionary, build_eds
 from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_framing import PacingSchedule
@@ -210,7 +211,7 @@ class SimulatedUnit:
         self.loop.run_until_complete(self._start())
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
-        self.probe: SerialProbe | CanProbe | UnitProbe | CanopenProbe
+        self.probe: SerialProbe | CanProbe | SerialUnitProbe | CanUnitProbe | CanopenProbe
         if self.kind == "canopen":
             node = int(self.icd.parameters["canopen_node"].default)
             eds = build_eds(build_dictionary(self.icd))
@@ -218,7 +219,9 @@ class SimulatedUnit:
             self.loop.run_until_complete(asyncio.sleep(1.0))
             return self
         if not is_cubestar(self.icd):
-            self.probe = UnitProbe(port, self.icd, times=times)
+            self.probe = (SerialUnitProbe if self.kind == "serial" else CanUnitProbe)(
+                port, self.icd, times=times
+            )
         elif self.kind == "serial":
             self.probe = SerialProbe(port, self.icd, dialect=self.dialect, baud=BAUD, times=times)
         else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 
+from starhil.protocol.unit_folders import UNITS_FOLDER
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
 
 NODE = 0x2C
@@ -114,6 +115,32 @@ def test_card_is_restarted_by_an_entry():
         unit.step(3.0)
         assert unit.bench.device.boot_count == before + 1
         assert struct.unpack("<H", upload(unit, 0x3003, 6))[0] == before + 1
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_refusals_keep_the_abort_codes_of_canopen_whatever_the_unit_numbers_and_echoes(tmp_path):
+    definition = (UNITS_FOLDER / "oresat" / "oresat.toml").read_text(encoding="utf-8")
+    echoed = definition.replace(
+        'kind = "telecommand"\n', 'kind = "telecommand"\nanswer = ["echo", "reply"]\n'
+    )
+    (tmp_path / "unit.toml").write_text(f"{echoed}\n[errors]\nother = 99\n", encoding="utf-8")
+
+    def scenario(unit: Emulated) -> None:
+        request = struct.pack("<BHB", 0x2F, 0x3003, 1) + bytes([1, 0, 0, 0])
+        unit.ask_can(0x600 + NODE, request, extended=False)
+        unit.step(0.01)
+        assert download(unit, 0x4000, STAR_TRACK) == 0x08000022  # while it boots
+
+    with_unit(str(tmp_path), "canopen", scenario)
+
+
+def test_time_of_the_c3_card_sets_the_clock():
+    def scenario(unit: Emulated) -> None:
+        operational(unit)
+        unit.ask_can(0x181, struct.pack("<II", 1_800_000_000, 500_000), extended=False)
+        unit.step(0.6)
+        assert struct.unpack("<I", upload(unit, 0x3003, 4))[0] == 1_800_000_001
 
     with_unit("oresat", "canopen", scenario)
 
