@@ -8,6 +8,7 @@ import re
 import pytest
 from typer.testing import CliRunner
 
+from starhil.emulator.cli.bench import group as bench
 from starhil.emulator.cli.conformance import links_of
 from starhil.emulator.cli.unit import group
 from starhil.emulator.emulation import Emulation
@@ -138,6 +139,14 @@ def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch,
 )
 def test_a_conformance_run_takes_the_links_that_the_unit_has(name, node, links):
     assert links_of(load_unit(name), node) == links
+
+
+def test_the_load_of_the_links_is_refused_for_a_unit_without_its_rows():
+    done = CliRunner().invoke(bench, ["bus", "--unit", "sagitta"])
+    assert isinstance(done.exception, BenchError)
+    assert "unit sagitta lacks the rows of a CubeStar that load its links (identification, " in str(
+        done.exception
+    )
 
 
 def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, caplog):
