@@ -388,7 +388,7 @@ class Emulation:
         there = {"serial.port": has.serial is not None, "can.channel": has.can is not None or canopen}
         wanted = [key for key, value in asked.items() if value != "off"]
         if wanted and not links.canopen.node and not any(there[key] for key in wanted):
-            raise EmulatorError(f"links.{wanted[0]}: unit {name} has none of the requested links")
+            raise EmulatorError(f"links.{wanted[0]}: unit {name} has none of the links requested")
         for key in wanted:
             if asked[key] != "auto" and not there[key]:
                 log.warning("links.%s: unit %s has no such link; it is not opened", key, name)
