@@ -41,9 +41,10 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.icd_bindings import unbound
+from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
-from starhil.protocol.values import Value
+from starhil.protocol.values import IcdError, Value
 from starid.attitude import Attitude
 
 log = logging.getLogger("starhil.run")
@@ -372,12 +373,17 @@ class Emulation:
         Raises
         ------
         EmulatorError
-            It has none of them, or a CANopen node is asked for and it has no CANopen.
+            It has none of them, a CANopen node is asked for and it has no CANopen, or it lacks the dialect.
         """
         links, has, name = self.profile.links, self.icd.link, self.icd.name
         canopen = self.icd.canopen is not None
         if links.canopen.node and not canopen:
             raise EmulatorError(f"links.canopen.node: unit {name} has no CANopen")
+        if "dialect" in links.serial.model_fields_set:
+            try:
+                chosen_dialect(self.icd, links.serial.dialect)
+            except IcdError as error:
+                raise EmulatorError(f"links.serial.dialect: {error}") from None
         asked = {"serial.port": links.serial.port, "can.channel": links.can.channel}
         there = {"serial.port": has.serial is not None, "can.channel": has.can is not None or canopen}
         wanted = [key for key, value in asked.items() if value != "off"]

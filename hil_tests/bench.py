@@ -33,7 +33,7 @@ class LinkOptions:
 
     serial: str | None = None
     can: str | None = None
-    dialect: str = "b"
+    dialect: str | None = None
     baud: int = DEFAULT_BAUD
     host_address: int = DEFAULT_HOST_ADDRESS
     device_address: int = DEFAULT_DEVICE_ADDRESS

@@ -75,7 +75,7 @@ class CanopenHostLink(HostLink[CanFrame]):
             kind = ReplyKind.ACK if request.kind is RequestKind.TELECOMMAND else ReplyKind.TELEMETRY
             return self._reply(Reply(kind, request.id, done.value, klass=request.klass))
         except SdoAbortError as abort:
-            code = ERROR_OF_ABORT.get(abort.code, ErrorCode.INTERNAL)
+            code = self._icd.error_number(ERROR_OF_ABORT.get(abort.code, ErrorCode.INTERNAL))
             return self._reply(Reply(ReplyKind.NACK, request.id, code=code, klass=request.klass))
         return []
 

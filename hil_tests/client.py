@@ -24,7 +24,6 @@ from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import LinkFault, Reply, RequestKind
-from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import Value
 
@@ -75,7 +74,7 @@ class ObcClient:
         *,
         serial: str | None = None,
         can: str | None = None,
-        dialect: str = "b",
+        dialect: str | None = None,
         baud: int = DEFAULT_BAUD,
         host_address: int = DEFAULT_HOST_ADDRESS,
         device_address: int = DEFAULT_DEVICE_ADDRESS,
@@ -96,7 +95,7 @@ class ObcClient:
 
         def make_link() -> HostLink[Any]:
             if serial is not None:
-                return SerialHostLink(icd, serial, dialect=Dialect(dialect), baud=baud, log=log)
+                return SerialHostLink(icd, serial, dialect=dialect, baud=baud, log=log)
             if icd.link.can is None and icd.canopen is not None:
                 from starhil.hil_tests.canopen_link import CanopenHostLink
 

@@ -13,9 +13,8 @@ from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reque
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
-from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_interface import HostEnd
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
+from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -151,8 +150,8 @@ class SerialHostLink(HostLink[bytes]):
         The unit.
     spec : str
         `/dev/…` or `socket://host:port`.
-    dialect : Dialect
-        Form of the replies, for units of the CubeSpace family.
+    dialect : str, optional
+        Form of the replies, for a unit that has several: `b` unless given.
     baud : int
         Bit rate of a real line.
     log : WireLog, optional
@@ -166,13 +165,13 @@ class SerialHostLink(HostLink[bytes]):
         icd: InterfaceDefinition,
         spec: str,
         *,
-        dialect: Dialect = Dialect.B,
+        dialect: str | None = None,
         baud: int = DEFAULT_BAUD,
         log: WireLog | None = None,
     ) -> None:
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
         self._stack = build_serial_stack(icd)
-        self._dialect = dialect if isinstance(self._stack, CubeSpaceStack) else None
+        self._dialect = chosen_dialect(icd, dialect)
         self._host_receiver = self._stack.host(self._dialect)
 
     @property

@@ -33,7 +33,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--starhil-serial", metavar="DEV", help="serial port of a unit, instead of an emulator")
     group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, instead of an emulator")
     group.addoption(
-        "--starhil-dialect", default="b", metavar="a|b|c", help="form of serial replies (default b)"
+        "--starhil-dialect",
+        metavar="a|b|c",
+        help="form of serial replies, of a unit that has several (default b)",
     )
     group.addoption(
         "--starhil-unit",

@@ -177,7 +177,7 @@ def _shown_on_console(
 
 def _options(request: SessionRequest, script: Script) -> LinkOptions:
     options = request.options
-    if options.dialect not in list(Dialect):
+    if options.dialect not in (None, *Dialect):
         raise BenchError(f"--dialect {options.dialect}: must be a, b or c")
     if options.serial is None and options.can is None:
         if not request.start:

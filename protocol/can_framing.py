@@ -143,6 +143,8 @@ def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
     each with the counter. Burst packets are segmented telemetry with the burst's id. Public sources confirm the three
     types, but not this layout, nor that of bursts; both are ours.
     """
+    if reply.kind is ReplyKind.ECHO:
+        raise ProtocolError("CAN has no echo messages")
     if reply.id is None:
         raise ProtocolError(f"a {reply.kind.value} on CAN needs an id")
     long = len(reply.data) > MAX_FRAME_DATA

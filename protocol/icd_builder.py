@@ -17,7 +17,7 @@ from starhil.protocol.device_model import DeviceModel, device_model, did_you_mea
 from starhil.protocol.icd import InterfaceDefinition, Names, RawTable
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import Layout
-from starhil.protocol.link_schema import LinkModel
+from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel
 from starhil.protocol.messages import ErrorCode, MessageClass, RequestKind
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
@@ -159,7 +159,7 @@ class _Builder:
         rows: dict[str, Row] = {}
         telecommands = self._build_rows("telecommand", rows)
         telemetry = self._build_rows("telemetry", rows)
-        for row in telecommands:
+        for row in (*telecommands, *telemetry):
             self._attempt(self._check_answers, row, rows)
         definition = self._definition(conventions, telecommands, telemetry)
         self._attempt(self._check_link, definition)
@@ -167,7 +167,15 @@ class _Builder:
 
     def _check_link(self, definition: InterfaceDefinition) -> None:
         """Check that the parts of the links fit one another and the rows."""
-        if definition.link.serial is None:
+        link = definition.link
+        for row in definition.rows:
+            if "echo" in row.answers:
+                where = f"{self._path}: {row.kind} {row.name}: answer 'echo'"
+                if link.serial is not None and isinstance(link.serial.framing, CubeSpaceFraming):
+                    raise IcdError(f"{where}: link.serial has no echoes with framing cubespace")
+                if link.can is not None:
+                    raise IcdError(f"{where}: link.can has no echoes")
+        if link.serial is None:
             return
         try:
             build_serial_stack(definition)

@@ -253,8 +253,10 @@ def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
     Raises
     ------
     ProtocolError
-        The dialect cannot carry the reply (unsolicited telemetry and events exist in dialect c only).
+        The dialect cannot carry the reply (unsolicited telemetry and events exist in dialect c only, echoes in none).
     """
+    if reply.kind is ReplyKind.ECHO:
+        raise ProtocolError(f"serial dialect {dialect} has no echo messages")
     if reply.kind is ReplyKind.BURST:
         return encode_packet(START, bytes((BURST_ID,)) + reply.data)
     if dialect is Dialect.C:

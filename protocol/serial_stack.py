@@ -83,6 +83,33 @@ def build_stack(
     return ComposedStack(link, classes, rows, byte_order, framings=framings, checks=checks)
 
 
+def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | None:
+    """Return the dialect of a unit's serial replies; None if it has no dialects.
+
+    Parameters
+    ----------
+    icd
+        Definition of the unit.
+    wanted
+        What a user has chosen; None for the default: the unit's only dialect, else b.
+
+    Raises
+    ------
+    IcdError
+        The unit does not have what the user has chosen.
+    """
+    framing = None if icd.link.serial is None else icd.link.serial.framing
+    if not isinstance(framing, CubeSpaceFraming):
+        if wanted is not None:
+            raise IcdError(f"unit {icd.name} has no reply dialects; leave the choice of one out")
+        return None
+    if framing.dialect is not None and wanted not in (None, framing.dialect):
+        raise IcdError(
+            f"unit {icd.name} has dialect {framing.dialect} alone; leave the choice of another out"
+        )
+    return Dialect(framing.dialect or wanted or Dialect.B)
+
+
 def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
     """Return the serial link of a unit's definition.
 

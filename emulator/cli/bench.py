@@ -190,7 +190,8 @@ def bus(
         int | None, typer.Option(min=1, max=127, help="CANopen node ID of a running device.")
     ] = None,
     device_address: DeviceAddress = 4,
-    dialect: SerialDialect = "b",
+    dialect: SerialDialect = None,
+    unit: Unit = DEFAULT_UNIT,
     realtime: Annotated[
         bool,
         typer.Option(
@@ -199,7 +200,7 @@ def bus(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Load the links of a device to capacity and measure losses, errors, latency and jitter.
+    """Load the links of a CubeStar to capacity and measure losses, errors, latency and jitter.
 
     Without --can and --serial it starts a CAN hub and an emulator that solves frames at 10 Hz.
     The exit status is 0 only if nothing was lost or wrong and the 99th percentile of the CAN
@@ -207,19 +208,22 @@ def bus(
     """
     from contextlib import nullcontext
 
-    from starhil.emulator.cli.bench_bus import Target, measure, print_figures, started_device
+    from starhil.emulator.cli.bench_bus import Target, check_rows, measure, print_figures, started_device
     from starhil.hil_tests.realtime import set_realtime_priority
     from starhil.protocol.icd import load_unit
     from starhil.protocol.serial_framing import Dialect
 
-    one_of("--dialect", dialect, DIALECTS)
+    if dialect is not None:
+        one_of("--dialect", dialect, DIALECTS)
+    icd = load_unit(unit)
+    check_rows(icd)
     report = _progress()
-    running = Target(can, serial, canopen, device_address, baud, Dialect(dialect))
+    running = Target(can, serial, canopen, device_address, baud, Dialect(dialect or "b"))
     start = can is None and serial is None
-    with started_device(baud, realtime, report) if start else nullcontext(running) as target:
+    with started_device(unit, baud, realtime, report) if start else nullcontext(running) as target:
         if realtime and not start:
             set_realtime_priority()
-        figures = measure(load_unit(), target, seconds, rate, report, realtime=realtime)
+        figures = measure(icd, target, seconds, rate, report, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if as_json:
         print(json.dumps({**figures.as_dict(), "good": good}))

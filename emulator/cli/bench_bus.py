@@ -10,9 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from starhil.hil_tests.bus_load import DEVICE, load_can
+from starhil.hil_tests.bus_load import ASKED, DEVICE, load_can
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
 from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from starhil.hil_tests.realtime import set_realtime_priority
@@ -28,6 +29,32 @@ EVENT_TIMER_MS = 50
 SYNC_S = 0.05
 WARM_UP_S = 60.0
 """Timeout for the emulator to reach tracking."""
+NEEDED = (
+    *ASKED,
+    "identified_stars",
+    "communication_status",
+    "set_hole_map_1",
+    "set_unsolicited",
+    "set_update_rate",
+    "set_mode",
+)
+"""Rows that the load asks for."""
+
+
+def check_rows(icd: InterfaceDefinition) -> None:
+    """Check that a unit has the rows that the load asks for.
+
+    Raises
+    ------
+    BenchError
+        It lacks some.
+    """
+    missing = [name for name in NEEDED if name not in icd.telemetry and name not in icd.telecommands]
+    if missing:
+        raise BenchError(
+            f"bench bus: unit {icd.name} lacks the rows of a CubeStar that load its links ({', '.join(missing)}); "
+            "measure another unit with bench latency"
+        )
 
 
 @dataclass(frozen=True)
@@ -63,7 +90,7 @@ class BusFigures:
 
 
 @contextmanager
-def started_device(baud: int, realtime: bool, report: Callable[[str], None]) -> Iterator[Target]:
+def started_device(unit: str, baud: int, realtime: bool, report: Callable[[str], None]) -> Iterator[Target]:
     """Start a hub and an emulator that solves frames at 10 Hz, each in its own process.
 
     With `realtime`, both and this process get real-time priority; the pipeline worker does not.
@@ -73,6 +100,7 @@ def started_device(baud: int, realtime: bool, report: Callable[[str], None]) -> 
         hub = stack.enter_context(EmulatorProcess(hub_command()))
         command = emulator_command(
             profile="demo",
+            unit=unit,
             serial="auto",
             can=hub.ready["can"],
             state_dir=folder,
@@ -85,7 +113,7 @@ def started_device(baud: int, realtime: bool, report: Callable[[str], None]) -> 
             set_realtime_priority()
             for process in (hub, emulator):
                 set_realtime_priority(process.process.pid)
-        with ObcClient.open(can=hub.ready["can"], device_address=DEVICE) as client:
+        with ObcClient.open(can=hub.ready["can"], device_address=DEVICE, unit=unit) as client:
             client.command("set_update_rate", rate=UPDATE_RATE_HZ)
             client.command("set_mode", mode="lost_in_space")
             client.wait_for("device_status", lambda status: status["mode"] == "tracking", within_s=WARM_UP_S)
@@ -105,12 +133,12 @@ def measure(
     figures = BusFigures()
     if target.can is not None:
         report(f"CAN: {rate:g} frames/s for {seconds:g} s")
-        with count_solved_frames(target, "can", figures):
+        with count_solved_frames(icd, target, "can", figures):
             load = load_can(icd, target.can, seconds, rate, device=target.device, realtime=realtime)
             figures.can = asyncio.run(load)
     if target.serial is not None:
         report(f"serial: {target.baud} Bd both ways for {seconds:g} s")
-        with count_solved_frames(target, "serial", figures):
+        with count_solved_frames(icd, target, "serial", figures):
             figures.serial = asyncio.run(
                 load_serial(icd, target.serial, seconds, target.baud, target.dialect)
             )
@@ -136,12 +164,14 @@ def measure_jitter(
 
 
 @contextmanager
-def count_solved_frames(target: Target, link: str, figures: BusFigures) -> Iterator[None]:
+def count_solved_frames(
+    icd: InterfaceDefinition, target: Target, link: str, figures: BusFigures
+) -> Iterator[None]:
     """Record the frames per second that the device reports as solved during the block, read over CAN."""
     if target.can is None:
         yield
         return
-    with ObcClient.open(can=target.can, device_address=target.device) as client:
+    with ObcClient.open(can=target.can, device_address=target.device, unit=icd) as client:
         first = client.telemetry("device_status")
         yield
         last = client.telemetry("device_status")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,6 +25,17 @@ from starhil.emulator.cli.options import (
 )
 from starhil.emulator.cli.output import output_help
 from starhil.protocol.unit_folders import DEFAULT_UNIT
+
+if TYPE_CHECKING:
+    from starhil.protocol.icd import InterfaceDefinition
+
+
+def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, str | None, int | None]:
+    """Return serial port, CAN channel and CANopen node of a unit; a node if it is given, or is the only link."""
+    serial = None if icd.link.serial is None else "auto"
+    if icd.canopen_only and node is None:
+        node = int(icd.parameters["canopen_node"].default)
+    return serial, None if icd.link.can is None and node is None else "auto", node
 
 
 def command(
@@ -60,7 +71,7 @@ def command(
         Path | None,
         typer.Option(help=output_help("Write an HTML report of what was sent, expected and received.")),
     ] = None,
-    dialect: SerialDialect = "b",
+    dialect: SerialDialect = None,
     baud: Annotated[
         int | None,
         typer.Option(
@@ -92,9 +103,10 @@ def command(
     from starhil.hil_tests.results import prepare_report
     from starhil.protocol.icd import load_unit
 
-    one_of("--dialect", dialect, DIALECTS)
+    if dialect is not None:
+        one_of("--dialect", dialect, DIALECTS)
     if (start or list_only) and serial is None and can is None:
-        serial, can = "auto", "auto"
+        serial, can, canopen = links_of(load_unit(unit or DEFAULT_UNIT), canopen)
     if canopen is not None and can is None:
         raise BenchError("--canopen needs --can: give the channel of the node")
     if not start and not list_only and serial == "auto":
@@ -127,7 +139,7 @@ def command(
         if path is not None:
             prepare_report(path)
     links = (
-        serial and f"serial {serial} (dialect {dialect})",
+        serial and f"serial {serial}" + (f" (dialect {dialect})" if dialect else ""),
         can and f"CAN {can}",
         canopen and f"CANopen node {canopen}",
     )

@@ -10,7 +10,6 @@ from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
 from starhil.protocol.codec import Row
-from starhil.protocol.serial_framing import Dialect
 
 
 class ConsoleClient:
@@ -36,7 +35,7 @@ class ConsoleClient:
         if port.bus == "can":
             link = CanHostLink(port.where, host_address=HOST_ADDRESS, device_address=port.device_address())
         elif port.bus == "serial":
-            link = SerialHostLink(port.icd, port.where, dialect=port.dialect() or Dialect.B)
+            link = SerialHostLink(port.icd, port.where, dialect=port.dialect())
         else:
             from starhil.hil_tests.canopen_link import CanopenHostLink
 

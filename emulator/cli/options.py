@@ -23,7 +23,10 @@ CanChannel: TypeAlias = Annotated[
     ),
 ]
 SerialDialect: TypeAlias = Annotated[
-    str, typer.Option("--dialect", help="Format of serial replies: a, b or c.")
+    str | None,
+    typer.Option(
+        "--dialect", help="Format of serial replies, of a unit that has several: a, b (default) or c."
+    ),
 ]
 HostAddress: TypeAlias = Annotated[int, typer.Option("--host-address", help="CAN address of the OBC.")]
 DeviceAddress: TypeAlias = Annotated[int, typer.Option("--device-address", help="CAN address of the device.")]

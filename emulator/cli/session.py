@@ -41,7 +41,7 @@ def command(
     truth: Annotated[
         Path | None, typer.Option(help="Truth log that the emulator writes (run --truth-log).")
     ] = None,
-    dialect: SerialDialect = "b",
+    dialect: SerialDialect = None,
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
     host_address: HostAddress = 1,
     device_address: DeviceAddress = 4,

@@ -16,6 +16,7 @@ from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import to_reported_frame
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.pipeline.messages import MatchedStar
+from starhil.protocol.conventions import DAY_NS
 from starhil.protocol.device_model import HEALTH, PARAMETER, generic, number_in
 from starhil.protocol.image_transfer import frame_checksum
 from starhil.protocol.messages import ErrorCode
@@ -123,6 +124,9 @@ QUANTITIES["frame.time_seconds"] = lambda shot: (
 )
 QUANTITIES["frame.time_nanoseconds"] = lambda shot: (
     None if shot.exposure_ns is None else shot.exposure_ns % NANOSECONDS
+)
+QUANTITIES["frame.time_of_day"] = lambda shot: (
+    None if shot.frame is None else shot.frame.mid_unix_ns % DAY_NS / NANOSECONDS
 )
 
 

@@ -26,6 +26,8 @@ BY_PARAMETERS = "parameters"
 class Requests:
     """Executes telecommands and answers telemetry requests for the rows of the interface definition.
 
+    Refusals carry an `ErrorCode`; each link turns it into what stands for it on its bus.
+
     Parameters
     ----------
     device
@@ -154,10 +156,10 @@ class Requests:
 
     def _answer(self, request: Request, code: ErrorCode) -> Reply:
         kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-        return self._reply(request, kind, code=self.device.icd.error_number(code))
+        return self._reply(request, kind, code=code)
 
     def _reply(
-        self, request: Request, kind: ReplyKind, data: bytes = b"", code: ErrorCode | int = ErrorCode.OK
+        self, request: Request, kind: ReplyKind, data: bytes = b"", code: ErrorCode = ErrorCode.OK
     ) -> Reply:
         uptime_ns, time_ns = self._times()
         return Reply(

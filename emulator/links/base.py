@@ -7,6 +7,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
@@ -14,7 +15,7 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import LinkFault, Reply, Request
+from starhil.protocol.messages import ErrorCode, LinkFault, Reply, Request
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
@@ -144,7 +145,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         style = self._reply_style()  # the answer to a change of format is still sent in the old one
 
         def answer_later(reply: Reply) -> None:
-            self._send(reply, style)
+            self._answer(reply, style)
             if self._pending_request is event:
                 self._pending_request = None
                 self._dispatch_waiting()
@@ -154,7 +155,13 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._pending_request = event
             return
         for reply in replies:
-            self._send(reply, style)
+            self._answer(reply, style)
+
+    def _answer(self, reply: Reply, style: Style) -> None:
+        """Send an answer, with the unit's own number of an error."""
+        if isinstance(reply.code, ErrorCode):
+            reply = replace(reply, code=self._device.icd.error_number(reply.code))
+        self._send(reply, style)
 
     def _schedule_flush(self) -> None:
         """Schedule a flush while a message is incomplete."""

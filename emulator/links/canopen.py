@@ -111,7 +111,7 @@ class DeviceApplication:
         replies = self._requests.handle(self._device.icd.request(row, payload), done)
         if replies is None:
             return deferred
-        for reply in replies[:1]:
+        for reply in replies:
             check_status(reply.code, row.name)
         return None
 

@@ -1,33 +1,115 @@
-"""CAN conformance: identifiers, lengths, segments, and what is not for the device."""
+"""CAN conformance: identifiers, lengths, segments, and what is not for the device, with the rows of any unit."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, Final
 
 from starhil.hil_tests.conformance.can_probe import (
     TELECOMMAND_SEGMENT,
     CanProbe,
+    CanWire,
     identifier_of,
     segments,
 )
-from starhil.hil_tests.conformance.case import CaseArea, check, check_equal, rule
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, LONG_PAUSE_S
+from starhil.hil_tests.conformance.case import Case, CaseArea, CaseSkipped, check, check_equal, rule
+from starhil.hil_tests.conformance.link_probe import LONG_PAUSE_S
+from starhil.hil_tests.conformance.row_cases import bad_values
 from starhil.hil_tests.conformance.wire_tables import Exchange, FlagRow, add_exchange_cases, add_flag_cases
 from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.codec import Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode
 
 SEGMENT_RULE: Final = "more than 8 bytes: 7 and a counter down to 0, no padding (libCubeObc)"
 TYPES: Final = "message types 0 to 12 (libCubeObc)"
 
 OTHER_HOST: Final = 0x4D
-IDENTIFICATION: Final = 128
 COMBINED: Final = 211
 COMBINED_SIZE: Final = 54
+CUBESTAR: Final = frozenset({128, 230, 211, 200, 60, 103, 96, 2, 112, 37})
+"""Rows, and gaps between them, that are taken for a case where they fit."""
+LONGEST: Final = 56
+"""Most bytes of the telemetry whose segments are looked at: 8 segments."""
 
-FRAMES: Final = CaseArea[CanProbe](
-    "frames", "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
-)
-REPLY_SEGMENTS: Final = CaseArea[CanProbe]("segments", SEGMENT_RULE)
-SEGMENTS: Final = CaseArea[CanProbe]("segments", SEGMENT_RULE, intrusive=True)
+
+class CanRows:
+    """Rows of a unit that the cases ask for; None where it has no such row.
+
+    Attributes
+    ----------
+    single, small
+        Telemetry that fits a frame, and of fewer than 8 bytes.
+    long
+        Telemetry in segments.
+    unknown_telemetry, unknown_telecommand
+        Identifiers that the unit does not have.
+    empty
+        Telecommand without data that may be sent at any time.
+    refused
+        Telecommand that fits a frame, and data with a value that it must refuse.
+    eight
+        Same, with 8 bytes.
+    short
+        Telecommand of 2 to 8 bytes.
+    longest
+        Telecommand with the most bytes.
+    """
+
+    def __init__(self, icd: InterfaceDefinition) -> None:
+        telemetry, commands = list(icd.telemetry.values()), list(icd.telecommands.values())
+        bad = [(row, data) for row in commands for data in _bad_data(row) if len(data) <= 8]
+        self.single = _first(row for row in telemetry if row.size <= 8)
+        self.small = _first(row for row in telemetry if row.size < 8)
+        self.long = _first(
+            sorted((row for row in telemetry if 8 < row.size <= LONGEST), key=lambda row: -row.size)
+        )
+        self.unknown_telemetry = _gap(range(128, 256), {row.id for row in telemetry})
+        self.unknown_telecommand = _gap(range(128), {row.id for row in commands})
+        self.empty = _first(row for row in commands if not row.size and row.action != "reset")
+        self.refused = _first(row for row, _ in bad)
+        self.eight = _first(row for row, data in bad if len(data) == 8)
+        self.short = _first(row for row in commands if 2 <= row.size <= 8)
+        self.longest = _first(sorted((row for row in commands if row.size > 8), key=lambda row: -row.size))
+
+    def texts(self, icd: InterfaceDefinition) -> dict[str, str]:
+        """Return what stands for the names in braces in the table of frames; a row that is missing has no name there."""
+        found = {name: f"{row.id:02X}" for name, row in vars(self).items() if isinstance(row, Row)}
+        found |= {name: f"{number:02X}" for name, number in vars(self).items() if isinstance(number, int)}
+        for name in ("single", "small"):
+            row = getattr(self, name)
+            if row is not None:
+                found |= {f"{name}_data": ".." * row.size, f"{name}_size": str(row.size)}
+        for name in ("refused", "eight"):
+            row = getattr(self, name)
+            if row is not None:
+                data = next(data for data in _bad_data(row)).hex().upper()
+                found |= {f"{name}_data": data, f"{name}_first": data[:14], f"{name}_rest": data[14:]}
+        for name in ("invalid_id", "invalid_length", "invalid_parameter"):
+            found[name] = f"{int(icd.error_number(ErrorCode[name.upper()])):02X}"
+        return found
+
+
+def _bad_data(row: Row) -> list[bytes]:
+    return [data for field in row.named_fields.values() for _, data in bad_values(row, field)]
+
+
+def _first(rows: Iterable[Row]) -> Row | None:
+    """Return the row of a CubeStar if it is among these, else the first."""
+    found = list(rows)
+    return next((row for row in found if row.id in CUBESTAR), found[0] if found else None)
+
+
+def _gap(numbers: range, known: set[int]) -> int | None:
+    gaps = [number for number in numbers if number not in known]
+    return next((number for number in gaps if number in CUBESTAR), gaps[0] if gaps else None)
+
+
+FRAME_RULE: Final = "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
+REPLY_SEGMENTS: Final = CaseArea[CanWire]("segments", SEGMENT_RULE)
+SEGMENTS: Final = CaseArea[CanWire]("segments", SEGMENT_RULE, intrusive=True)
 UNSOLICITED: Final = CaseArea[CanProbe](
     "unsolicited", "types 10 to 12 (libCubeObc); their use: R20, docs/rules.md", intrusive=True
 )
@@ -42,37 +124,52 @@ IGNORED: Final = ((2, "an acknowledge"), (3, "a telecommand refusal"), (5, "tele
                   (13, "type 13"), (31, "type 31"))  # fmt: skip
 
 EXCHANGES: Final = (
-    Exchange("telemetry", "a request of telemetry is answered with type 5, addresses exchanged", ("0480HHDD#",), ("0580DDHH#................",)),
-    Exchange("telemetry-6", "telemetry of 6 bytes has 6 bytes, no padding", ("04E6HHDD#",), ("05E6DDHH#............",)),
-    Exchange("unknown-telemetry", "an unknown telemetry identifier is refused with type 6 and the code", ("04C8HHDD#",), ("06C8DDHH#01",), clause=TYPES),
-    Exchange("other-device", "a frame for another address is not answered", ("0480HHFE#",)),
-    Exchange("other-device-zero", "a frame for address 0 is not answered", ("0480HH00#",)),
+    Exchange("telemetry", "a request of telemetry is answered with type 5, addresses exchanged", ("04{single}HHDD#",), ("05{single}DDHH#{single_data}",)),
+    Exchange("telemetry-{small_size}", "telemetry of {small_size} bytes has {small_size} bytes, no padding", ("04{small}HHDD#",), ("05{small}DDHH#{small_data}",)),
+    Exchange("unknown-telemetry", "an unknown telemetry identifier is refused with type 6 and the code", ("04{unknown_telemetry}HHDD#",), ("06{unknown_telemetry}DDHH#{invalid_id}",), clause=TYPES),
+    Exchange("other-device", "a frame for another address is not answered", ("04{single}HHFE#",)),
+    Exchange("other-device-zero", "a frame for address 0 is not answered", ("04{single}HH00#",)),
     Exchange("standard", "a frame with an 11-bit identifier is not answered", ("480#", "604#")),
-    Exchange("remote", "a remote frame is not answered", ("0480HHDD#R",)),
-    *(Exchange(f"type-{kind}", f"{words} is not answered", (f"{kind:02X}80HHDD#00",), clause=TYPES) for kind, words in IGNORED),
-    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", ("0180HHDD#",), clause=rule(6)),
-    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", ("0402HHDD#",), clause=rule(6)),
-    Exchange("two-at-once", "two requests back to back are answered in order", ("0480HHDD#", "04E6HHDD#"), ("0580DDHH#................", "05E6DDHH#............")),
+    Exchange("remote", "a remote frame is not answered", ("04{single}HHDD#R",)),
+    *(Exchange(f"type-{kind}", f"{words} is not answered", (f"{kind:02X}{{single}}HHDD#00",), clause=TYPES) for kind, words in IGNORED),
+    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", ("01{single}HHDD#",), clause=rule(6)),
+    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", ("04{short}HHDD#",), clause=rule(6)),
+    Exchange("two-at-once", "two requests back to back are answered in order", ("04{single}HHDD#", "04{small}HHDD#"), ("05{single}DDHH#{single_data}", "05{small}DDHH#{small_data}")),
 )  # fmt: skip
 
 INTRUSIVE_EXCHANGES: Final = (
-    Exchange("ack", "an accepted telecommand is answered with type 2 and no data", ("0167HHDD#",), ("0267DDHH#",), clause=TYPES),
-    Exchange("nack", "a refused telecommand is answered with type 3 and one byte", ("0160HHDD#4D",), ("0360DDHH#03",), clause=TYPES),
-    Exchange("eight", "a telecommand of 8 bytes goes in one frame", ("0170HHDD#0200000000000100",), ("0370DDHH#03",), clause=SEGMENT_RULE),
-    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", ("0770HHDD#0200000000000101", "0770HHDD#0000"), ("0370DDHH#03",), clause=rule(7)),
-    Exchange("segmented-unknown", "an unknown telecommand in segments is refused once, after the last", ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B00"), ("033CDDHH#01",), clause=SEGMENT_RULE),
-    Exchange("segmented-full-last", "the last segment may hold 7 bytes", ("073CHHDD#0001020304050601", "073CHHDD#0708090A0B0C0D00"), ("033CDDHH#01",), clause=SEGMENT_RULE),
+    Exchange("ack", "an accepted telecommand is answered with type 2 and no data", ("01{empty}HHDD#",), ("02{empty}DDHH#",), clause=TYPES),
+    Exchange("nack", "a refused telecommand is answered with type 3 and one byte", ("01{refused}HHDD#{refused_data}",), ("03{refused}DDHH#{invalid_parameter}",), clause=TYPES),
+    Exchange("eight", "a telecommand of 8 bytes goes in one frame", ("01{eight}HHDD#{eight_data}",), ("03{eight}DDHH#{invalid_parameter}",), clause=SEGMENT_RULE),
+    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", ("07{eight}HHDD#{eight_first}01", "07{eight}HHDD#{eight_rest}00"), ("03{eight}DDHH#{invalid_parameter}",), clause=rule(7)),
+    Exchange("segmented-unknown", "an unknown telecommand in segments is refused once, after the last", ("07{unknown_telecommand}HHDD#0001020304050601", "07{unknown_telecommand}HHDD#0708090A0B00"), ("03{unknown_telecommand}DDHH#{invalid_id}",), clause=SEGMENT_RULE),
+    Exchange("segmented-full-last", "the last segment may hold 7 bytes", ("07{unknown_telecommand}HHDD#0001020304050601", "07{unknown_telecommand}HHDD#0708090A0B0C0D00"), ("03{unknown_telecommand}DDHH#{invalid_id}",), clause=SEGMENT_RULE),
 )  # fmt: skip
 
 
-add_exchange_cases(FRAMES, EXCHANGES)
-add_exchange_cases(FRAMES, INTRUSIVE_EXCHANGES, intrusive=True)
+def _frame_cases(icd: InterfaceDefinition) -> list[Case[CanWire]]:
+    """Return the cases of the tables of frames for which the unit has the rows."""
+    texts = CanRows(icd).texts(icd)
+    area = CaseArea[CanWire]("frames", FRAME_RULE)
+    add_exchange_cases(area, _filled(EXCHANGES, texts))
+    add_exchange_cases(area, _filled(INTRUSIVE_EXCHANGES, texts), intrusive=True)
+    area.case("askers", "each asker gets the answer at its own address")(askers)
+    return area.cases
 
 
-@FRAMES.case("askers", "each asker gets the answer at its own address")
-def askers(probe: CanProbe) -> None:
+def _filled(table: Iterable[Exchange], texts: dict[str, str]) -> Iterator[Exchange]:
+    """Yield the rows of a table of which each name in braces has a text, with these texts."""
+    for row in table:
+        with suppress(KeyError):
+            sent, answers = (tuple(text.format(**texts) for text in part) for part in (row.sent, row.answers))
+            name, title = row.id.format(**texts), row.title.format(**texts)
+            yield replace(row, id=name, title=title, sent=sent, answers=answers)
+
+
+def askers(probe: CanWire) -> None:
+    """Ask from three addresses."""
     for source in (OTHER_HOST, probe.host, 0xFF):
-        probe.post_as(source, IDENTIFICATION)
+        probe.post_as(source, needed(CanRows(probe.icd).single, "telemetry of up to 8 bytes").id)
     seen = [probe.next_answer() for _ in range(3)]
     check_equal([(answer.kind, answer.other) for answer in seen], [("telemetry", OTHER_HOST), ("telemetry", probe.host), ("telemetry", 0xFF)], "answers to")  # fmt: skip
 
@@ -80,26 +177,33 @@ def askers(probe: CanProbe) -> None:
 # --- segments of the answer ---
 
 
-@REPLY_SEGMENTS.case(
-    "reply",
-    "54 bytes come in 8 segments that count 7 to 0, the last with 5 bytes and its counter",
-)
-def segmented_reply(probe: CanProbe) -> None:
-    probe.post(COMBINED)
-    frames = [probe.next_frame() for _ in range(8)]
-    identifier = identifier_of(8, COMBINED, probe.device, probe.host)
-    seen = [
-        (frame.id, len(frame.data), frame.data[-1] if frame.data else -1)
-        for frame in frames
-        if frame is not None
-    ]
-    check_equal(seen, [(identifier, 8, left) for left in range(7, 0, -1)] + [(identifier, 6, 0)], "segments")
+def _segmented_reply(row: Row) -> Case[CanWire]:
+    count = -(-row.size // 7)
+    rest = row.size - 7 * (count - 1)
+
+    def run(probe: CanWire) -> None:
+        probe.post_as(probe.host, row.id)
+        frames = [probe.next_frame() for _ in range(count)]
+        identifier = identifier_of(8, row.id, probe.device, probe.host)
+        seen = [
+            (frame.id, len(frame.data), frame.data[-1] if frame.data else -1)
+            for frame in frames
+            if frame is not None
+        ]
+        wanted = [(identifier, 8, left) for left in range(count - 1, 0, -1)] + [(identifier, rest + 1, 0)]
+        check_equal(seen, wanted, "segments")
+
+    title = (
+        f"{row.size} bytes come in {count} segments that count {count - 1} to 0, "
+        f"the last with {rest} bytes and its counter"
+    )
+    return Case("segments.reply", "segments", title, SEGMENT_RULE, run)
 
 
 @REPLY_SEGMENTS.case("all-rows", "every row goes in one frame up to 8 bytes, in segments above")
-def all_rows(probe: CanProbe) -> None:
+def all_rows(probe: CanWire) -> None:
     for row in probe.icd.telemetry.values():
-        probe.post(row.id)
+        probe.post_as(probe.host, row.id)
         frame = probe.next_frame()
         check(frame is not None, f"an answer to {row.id}", "nothing")
         if frame is not None:
@@ -129,34 +233,39 @@ def unsolicited_segments(probe: CanProbe) -> None:
 # --- segments of telecommands ---
 
 
-def _segment_frames(probe: CanProbe, number: int, data: bytes, source: int | None = None) -> list[CanFrame]:
-    identifier = identifier_of(
-        TELECOMMAND_SEGMENT, number, probe.host if source is None else source, probe.device
-    )
+def _unknown_frames(probe: CanWire, data: bytes, source: int | None = None) -> list[CanFrame]:
+    """Return the segments of a telecommand that does not exist: its refusal shows that a message was complete."""
+    number = CanRows(probe.icd).unknown_telecommand
+    if number is None:
+        raise CaseSkipped("the unit has a telecommand of each identifier")
+    source = probe.host if source is None else source
+    identifier = identifier_of(TELECOMMAND_SEGMENT, number, source, probe.device)
     return [CanFrame(identifier, part) for part in segments(data)]
 
 
-def _send(probe: CanProbe, frames: list[CanFrame]) -> None:
+def needed(row: Row | None, what: str) -> Row:
+    """Return a row; the case is skipped if the unit has none."""
+    if row is None:
+        raise CaseSkipped(f"the unit has no {what}")
+    return row
+
+
+def _send(probe: CanWire, frames: list[CanFrame]) -> None:
     for frame in frames:
         probe.send(frame)
 
 
-UNKNOWN: Final = 60
-"""A telecommand that does not exist: its refusal shows that a message was complete."""
 LONG: Final = bytes(range(30))
 
 
-def _expect_one_refusal(probe: CanProbe) -> None:
-    answer = probe.next_answer()
-    check(
-        answer.kind == "nack" and answer.code == INVALID_ID, f"one refusal of {UNKNOWN} with code 1", answer
-    )
+def _expect_one_refusal(probe: CanWire) -> None:
+    probe.expect_answer("nack", "one refusal of an unknown telecommand", ErrorCode.INVALID_ID)
     probe.expect_silence("one message was sent")
 
 
 @SEGMENTS.case("lost", "a message with a lost segment has no effect, the next one has")
-def lost_segment(probe: CanProbe) -> None:
-    frames = _segment_frames(probe, UNKNOWN, LONG)
+def lost_segment(probe: CanWire) -> None:
+    frames = _unknown_frames(probe, LONG)
     for lost in range(len(frames)):
         _send(probe, frames[:lost] + frames[lost + 1 :])
         # a message without its first segment looks like a shorter one
@@ -182,8 +291,8 @@ FAULTY: Final = (
 
 def _add_faulty_case(name: str, title: str, order: tuple[int, ...]) -> None:
     @SEGMENTS.case(name, title)
-    def run(probe: CanProbe) -> None:
-        frames = _segment_frames(probe, UNKNOWN, LONG)
+    def run(probe: CanWire) -> None:
+        frames = _unknown_frames(probe, LONG)
         _send(probe, [frames[place] for place in order] or [CanFrame(frames[0].id)])
         probe.expect_silence(title)
         _send(probe, frames)
@@ -195,9 +304,9 @@ for _faulty in FAULTY:
 
 
 @SEGMENTS.case("half", "an incomplete message is dropped after a time-out", rule(2))
-def half_message(probe: CanProbe) -> None:
+def half_message(probe: CanWire) -> None:
     """The last segment arrives too late (the last two would form a message)."""
-    frames = _segment_frames(probe, UNKNOWN, LONG)
+    frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:-1])
     probe.sleep(LONG_PAUSE_S)
     _send(probe, frames[-1:])
@@ -207,34 +316,35 @@ def half_message(probe: CanProbe) -> None:
 
 
 @SEGMENTS.case("pause", "a pause of 0.1 s between segments does no harm", rule(1))
-def pause_between(probe: CanProbe) -> None:
-    for frame in _segment_frames(probe, UNKNOWN, LONG):
+def pause_between(probe: CanWire) -> None:
+    for frame in _unknown_frames(probe, LONG):
         probe.send(frame)
         probe.sleep(0.1)
     _expect_one_refusal(probe)
 
 
 @SEGMENTS.case("restart", "a message may restart before its end", rule(8))
-def restarted_message(probe: CanProbe) -> None:
-    frames = _segment_frames(probe, UNKNOWN, LONG)
+def restarted_message(probe: CanWire) -> None:
+    frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:2] + frames)
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("two-hosts", "segments of two hosts do not mix", FRAMES.clause)
-def two_hosts(probe: CanProbe) -> None:
-    ours, theirs = _segment_frames(probe, UNKNOWN, LONG), _segment_frames(probe, UNKNOWN, LONG, OTHER_HOST)
+@SEGMENTS.case("two-hosts", "segments of two hosts do not mix", FRAME_RULE)
+def two_hosts(probe: CanWire) -> None:
+    ours, theirs = _unknown_frames(probe, LONG), _unknown_frames(probe, LONG, OTHER_HOST)
     for one, other in zip(ours, theirs, strict=True):
         _send(probe, [one, other])
     seen = [probe.next_answer() for _ in range(2)]
-    check_equal([(answer.kind, answer.code, answer.other) for answer in seen], [("nack", INVALID_ID, probe.host), ("nack", INVALID_ID, OTHER_HOST)], "answers")  # fmt: skip
+    code = int(probe.icd.error_number(ErrorCode.INVALID_ID))
+    check_equal([(answer.kind, answer.code, answer.other) for answer in seen], [("nack", code, probe.host), ("nack", code, OTHER_HOST)], "answers")  # fmt: skip
 
 
 @SEGMENTS.case(
-    "request-between", "a request between segments is answered at once and does no harm", FRAMES.clause
+    "request-between", "a request between segments is answered at once and does no harm", FRAME_RULE
 )
-def request_between(probe: CanProbe) -> None:
-    frames = _segment_frames(probe, UNKNOWN, LONG)
+def request_between(probe: CanWire) -> None:
+    frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:2])
     probe.expect_alive()
     _send(probe, frames[2:])
@@ -242,19 +352,19 @@ def request_between(probe: CanProbe) -> None:
 
 
 @SEGMENTS.case("overlong", "a message that is too long has no effect, the next one has", rule(4))
-def overlong(probe: CanProbe) -> None:
+def overlong(probe: CanWire) -> None:
     """1750 bytes; the buffer of the published host software has 512."""
-    _send(probe, _segment_frames(probe, UNKNOWN, bytes(250 * 7)))
+    _send(probe, _unknown_frames(probe, bytes(250 * 7)))
     probe.expect_silence("the message was too long")
-    _send(probe, _segment_frames(probe, UNKNOWN, LONG))
+    _send(probe, _unknown_frames(probe, LONG))
     _expect_one_refusal(probe)
 
 
 @SEGMENTS.case("long", "a message of 500 bytes is taken and refused for its length", rule(4))
-def long_message(probe: CanProbe) -> None:
-    """set_star_config has 53 bytes."""
-    row = probe.icd.telecommands["set_star_config"]
-    probe.expect_refusal(row.id, bytes(500), INVALID_LENGTH)
+def long_message(probe: CanWire) -> None:
+    row = needed(CanRows(probe.icd).longest, "telecommand of more than 8 bytes")
+    probe.post_as(probe.host, row.id, bytes(500))
+    probe.expect_answer("nack", f"refusal of {row.name} for its length", ErrorCode.INVALID_LENGTH)
 
 
 # --- errors are flagged ---
@@ -277,16 +387,20 @@ def no_flag(probe: CanProbe) -> None:
     for text in ("0480HHFE#", "1F80HHFE#00", "480#0102", "0480HHDD#R", "073CHHFE#00"):
         probe.send_text(text)
     probe.expect_silence("they are not for the device")
-    _send(probe, _segment_frames(probe, UNKNOWN, LONG))
+    _send(probe, _unknown_frames(probe, LONG))
     _expect_one_refusal(probe)
     status = probe.telemetry("communication_status")
     check(not status["can_telecommand_error"], "no flag", "can_telecommand_error")
 
 
-CASES: Final = (
-    *FRAMES.cases,
-    *REPLY_SEGMENTS.cases,
-    *UNSOLICITED.cases,
-    *SEGMENTS.cases,
-    *ERRORS.cases,
-)
+def can_cases(icd: InterfaceDefinition, *, cubestar: bool) -> list[Case[Any]]:
+    """Make the cases of a unit with a CAN link; those on its unsolicited telemetry and error flags are for a CubeStar."""
+    long = CanRows(icd).long
+    return [
+        *_frame_cases(icd),
+        *([] if long is None else [_segmented_reply(long)]),
+        *REPLY_SEGMENTS.cases,
+        *(UNSOLICITED.cases if cubestar else []),
+        *SEGMENTS.cases,
+        *(ERRORS.cases if cubestar else []),
+    ]

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import Final
 
-from starhil.hil_tests.conformance.case import check
+from starhil.hil_tests.conformance.case import CaseFailed, check
 from starhil.hil_tests.conformance.link_probe import (
     BURST_ID,
     FIRST_TELEMETRY,
     Answer,
     AnswerKind,
     LinkProbe,
+    PortProbe,
     ProbeTimes,
 )
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode
 
 TELECOMMAND: Final = 1
 TELEMETRY_REQUEST: Final = 4
@@ -39,8 +41,8 @@ def segments(data: bytes) -> list[bytes]:
     return [part + bytes([len(parts) - 1 - number]) for number, part in enumerate(parts)]
 
 
-class CanProbe(LinkProbe):
-    """Talks over a CAN bus.
+class CanWire(PortProbe):
+    """Sends requests and decodes answers on a CAN bus, whatever the rows of the unit.
 
     Parameters
     ----------
@@ -68,10 +70,6 @@ class CanProbe(LinkProbe):
         self.device = device
         self.unsolicited: list[CanFrame] = []
         self._frames: list[CanFrame] = []
-
-    def post(self, identifier: int, data: bytes = b"") -> None:
-        """Send a request without waiting."""
-        self.post_as(self.host, identifier, data)
 
     def post_as(self, source: int, identifier: int, data: bytes = b"") -> None:
         """Send a request from another address than the tester's own."""
@@ -157,6 +155,14 @@ class CanProbe(LinkProbe):
         """Return the next unread answer."""
         return self._read(self.times.answer_s if timeout_s is None else timeout_s)
 
+    def expect_answer(self, kind: AnswerKind, what: str, code: ErrorCode | None = None) -> Answer:
+        """Take the next answer, which must be of a kind, and with a code if one is given."""
+        answer = self.next_answer()
+        number = None if code is None else int(self.icd.error_number(code))
+        if answer.kind != kind or number not in (None, answer.code):
+            raise CaseFailed(what, str(answer))
+        return answer
+
     def _read(self, timeout_s: float) -> Answer:
         frame = self.next_frame(timeout_s)
         if frame is None:
@@ -197,3 +203,11 @@ class CanProbe(LinkProbe):
             frame = self.next_frame()
         seen = b"" if frame is None else frame.data
         return Answer("malformed", data=data + seen, identifier=number, other=other)
+
+
+class CanProbe(CanWire, LinkProbe):
+    """Talks to a CubeStar over a CAN bus."""
+
+    def post(self, identifier: int, data: bytes = b"") -> None:
+        """Send a request without waiting."""
+        self.post_as(self.host, identifier, data)

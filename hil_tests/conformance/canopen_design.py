@@ -9,11 +9,12 @@ from starhil.hil_tests.conformance.canopen_pdo import (
     SYNCHRONOUS,
     entry,
     first,
+    limits,
     send_sync,
     set_up,
     writable,
 )
-from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe, size_of
+from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe
 from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 
 DESIGN: Final = CaseArea[CanopenProbe]("canopen.design", "interface definition: canopen.toml", intrusive=True)
@@ -26,7 +27,7 @@ def write_event(probe: CanopenProbe) -> None:
     before = probe.read(item.index, item.subindex)
     probe.command(START)
     probe.wait_for(identifier, 0.1)
-    changed = int(item.max or 1).to_bytes(size_of(item) or 1, "little")
+    _, changed = limits(item, before)
     probe.set(item.index, item.subindex, changed)
     check_equal(probe.expect(identifier, "TPDO after the write"), changed, "data")
     probe.set(item.index, item.subindex, before)

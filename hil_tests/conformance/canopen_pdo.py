@@ -60,12 +60,19 @@ def writable(probe: CanopenProbe) -> ODVariable:
             and item.max is not None
         ):
             before = probe.read(item.index, item.subindex)
-            limits = [int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max)]
-            accepted = [probe.write(item.index, item.subindex, limit) == 0 for limit in limits]
+            both = limits(item, before)
+            accepted = [probe.write(item.index, item.subindex, limit) == 0 for limit in both]
             probe.set(item.index, item.subindex, before)
             if all(accepted):
                 return item
     raise CaseSkipped("the EDS has no object for an RPDO that accepts its limits")
+
+
+def limits(item: ODVariable, before: bytes) -> tuple[bytes, bytes]:
+    """Return both limits of an object as it carries them, last the one that is not its present value."""
+    size = size_of(item) or 1
+    low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
+    return (high, low) if high == before else (low, high)
 
 
 def set_up(

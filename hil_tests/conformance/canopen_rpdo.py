@@ -9,6 +9,7 @@ from starhil.hil_tests.conformance.canopen_pdo import (
     SYNCHRONOUS,
     entry,
     first,
+    limits,
     send_sync,
     set_up,
     writable,
@@ -22,7 +23,6 @@ from starhil.hil_tests.conformance.canopen_probe import (
     VALUE_ABORTS,
     Abort,
     CanopenProbe,
-    size_of,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
@@ -32,11 +32,10 @@ RPDO: Final = CaseArea[CanopenProbe]("canopen.rpdo", "CiA 301 7.2.2.2", intrusiv
 @RPDO.case("event", "event-driven RPDO acts at once")
 def rpdo_event(probe: CanopenProbe) -> None:
     item = writable(probe)
-    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
     probe.command(START)
-    for limit in (item.min, item.max):
-        data = int(limit or 0).to_bytes(size, "little")
+    for data in limits(item, before):
         probe.send(identifier, data)
         check_equal(probe.read(item.index, item.subindex), data, "value")
     probe.set(item.index, item.subindex, before)
@@ -45,12 +44,8 @@ def rpdo_event(probe: CanopenProbe) -> None:
 @RPDO.case("gate", "RPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
 def rpdo_gate(probe: CanopenProbe) -> None:
     item = writable(probe)
-    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
-    data = next(
-        value
-        for value in (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
-        if value != before
-    )
+    before = probe.read(item.index, item.subindex)
+    _, data = limits(item, before)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], 255)
     for command in (PRE_OPERATIONAL, STOP):
         probe.command(command)
@@ -62,15 +57,15 @@ def rpdo_gate(probe: CanopenProbe) -> None:
 @RPDO.case("synchronous", "synchronous RPDO acts at the next SYNC")
 def rpdo_synchronous(probe: CanopenProbe) -> None:
     item = writable(probe)
-    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
-    low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
+    before = probe.read(item.index, item.subindex)
+    earlier, last = limits(item, before)
     identifier = set_up(probe, first(probe, 0x1400), [entry(item)], SYNCHRONOUS)
     probe.command(START)
-    probe.send(identifier, low)
-    probe.send(identifier, high)
+    probe.send(identifier, earlier)
+    probe.send(identifier, last)
     check_equal(probe.read(item.index, item.subindex), before, "value before the SYNC")
     send_sync(probe)
-    check_equal(probe.read(item.index, item.subindex), high, "value after the SYNC")
+    check_equal(probe.read(item.index, item.subindex), last, "value after the SYNC")
     probe.set(item.index, item.subindex, before)
 
 
@@ -82,7 +77,7 @@ def rpdo_short(probe: CanopenProbe) -> None:
     emergency = probe.number(0x1014) & 0x7FF
     probe.command(START)
     probe.drain()
-    probe.send(identifier, int(item.max or 0).to_bytes(size_of(item) or 1, "little"))
+    probe.send(identifier, limits(item, before)[1])
     check_equal(probe.expect(emergency, "EMCY 8210h")[:2], b"\x10\x82", "error code")
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
@@ -106,10 +101,10 @@ def place_holder(probe: CanopenProbe) -> None:
     if 0x0006 not in probe.od:
         raise CaseSkipped("the EDS allows no dummy entry of 16 bits")
     item = writable(probe)
-    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
+    before = probe.read(item.index, item.subindex)
     identifier = set_up(probe, first(probe, 0x1400), [0x0006_0010, entry(item)], 255)
     probe.command(START)
-    data = int(item.max or 0).to_bytes(size, "little")
+    _, data = limits(item, before)
     probe.send(identifier, b"\x55\xaa" + data)
     check_equal(probe.read(item.index, item.subindex), data, "value")
     probe.set(item.index, item.subindex, before)

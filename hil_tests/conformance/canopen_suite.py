@@ -18,7 +18,10 @@ from starhil.hil_tests.conformance import (
     canopen_tpdo,
 )
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
 from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.suites import is_cubestar
+from starhil.protocol.icd import InterfaceDefinition
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_eds.CASES,
@@ -33,3 +36,15 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
     *canopen_store_lss.CASES,
     *canopen_design.CASES,
 )
+"""Those of CiA 301, whatever the unit."""
+
+
+def canopen_suite(icd: InterfaceDefinition) -> tuple[Case[CanopenProbe], ...]:
+    """Return the cases for a unit on CANopen: a CubeStar's rows are tested over its other links.
+
+    Raises
+    ------
+    IcdError
+        The unit has no CANopen.
+    """
+    return CANOPEN_CASES if is_cubestar(icd) else (*CANOPEN_CASES, *canopen_unit_cases(icd))

@@ -14,6 +14,7 @@ from starhil.hil_tests.conformance.canopen_pdo import (
     constant,
     entry,
     first,
+    limits,
     send_sync,
     set_up,
     writable,
@@ -71,9 +72,8 @@ def acyclic(probe: CanopenProbe) -> None:
     probe.drain()
     send_sync(probe)
     probe.expect_silence(identifier, "TPDO without an event")
-    size = size_of(item) or 1
-    changed = int(item.max or 1).to_bytes(size, "little")
     before = probe.read(item.index, item.subindex)
+    _, changed = limits(item, before)
     probe.set(item.index, item.subindex, changed)
     probe.expect_silence(identifier, "TPDO before the SYNC", 0.05)
     send_sync(probe)
@@ -107,7 +107,7 @@ def event(probe: CanopenProbe) -> None:
     probe.wait_for(identifier, 0.1)
     send_sync(probe)
     probe.expect_silence(identifier, "event-driven TPDO at SYNC")
-    changed = int(item.max or 1).to_bytes(size_of(item) or 1, "little")
+    _, changed = limits(item, before)
     probe.set(item.index, item.subindex, changed)
     check_equal(after_event(probe, identifier), changed, "data")
     probe.set(item.index, item.subindex, before)
@@ -128,17 +128,17 @@ def event_timer(probe: CanopenProbe) -> None:
 def inhibit(probe: CanopenProbe) -> None:
     item = writable(probe)
     identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
-    before, size = probe.read(item.index, item.subindex), size_of(item) or 1
-    low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
+    before = probe.read(item.index, item.subindex)
+    last, changed = limits(item, before)
     probe.command(START)
     probe.wait_for(identifier, 0.3)
     probe.wait_for(NOBODY, 0.15)
-    probe.set(item.index, item.subindex, low)
-    check_equal(after_event(probe, identifier, 3.0), low, "data")
+    probe.set(item.index, item.subindex, changed)
+    check_equal(after_event(probe, identifier, 3.0), changed, "data")
     start = probe.port.now()
-    probe.set(item.index, item.subindex, low)
-    probe.set(item.index, item.subindex, high)
-    check_equal(probe.expect(identifier, "second TPDO"), high, "data")
+    probe.set(item.index, item.subindex, changed)
+    probe.set(item.index, item.subindex, last)
+    check_equal(probe.expect(identifier, "second TPDO"), last, "data")
     check(0.08 <= probe.port.now() - start <= 0.16, "0.1 s between them", f"{probe.port.now() - start:.3f} s")
     probe.set(item.index, item.subindex, before)
 

@@ -22,7 +22,8 @@ from starhil.hil_tests.conformance.runner import (
 )
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, is_cubestar, serial_suite
-from starhil.hil_tests.conformance.unit_probe import UnitProbe
+from starhil.hil_tests.conformance.unit_can_probe import CanUnitProbe
+from starhil.hil_tests.conformance.unit_probe import SerialUnitProbe
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
@@ -31,7 +32,9 @@ from starhil.hil_tests.results import FAILED
 from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.values import IcdError
 
 DEFAULT_BAUD: Final = 115200
 
@@ -47,7 +50,7 @@ class ConformanceRequest:
     eds: Path | None = None
     start: bool = False
     profile: str | None = None
-    dialect: str = "b"
+    dialect: str | None = None
     baud: int | None = None
     host_address: int = 1
     device_address: int = 4
@@ -65,17 +68,22 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     Raises
     ------
     BenchError
-        No link is given, or a pattern matches no case.
+        No link is given, the unit does not have the dialect, or a pattern matches no case.
     """
     cases: list[Case[Any]] = []
+    if request.dialect is not None:
+        try:
+            chosen_dialect(icd, request.dialect)
+        except IcdError as error:
+            raise BenchError(f"--dialect {request.dialect}: {error}") from None
     if request.serial is not None:
         cases += serial_suite(icd)
     if request.can is not None and (icd.link.can is not None or request.canopen_node is None):
         cases += can_suite(icd)
     if request.canopen_node is not None:
-        from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
+        from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 
-        cases += CANOPEN_CASES
+        cases += canopen_suite(icd)
     if not cases:
         raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
     return select_cases(cases, request.patterns, safe_only=request.safe_only)
@@ -181,8 +189,13 @@ def _run_on_links(
         if mine and can is not None:
             bus = stack.enter_context(live_can(can, request.speed))
             addresses = {"host": request.host_address, "device": request.device_address}
-            can_probe = CanProbe(bus, icd, times=request.times, **addresses)
-            run_cases(can_probe, mine, on_outcome, port=f"{can} at address {request.device_address}")
+            new_probe = CanProbe if is_cubestar(icd) else CanUnitProbe
+            run_cases(
+                new_probe(bus, icd, times=request.times, **addresses),
+                mine,
+                on_outcome,
+                port=f"{can} at address {request.device_address}",
+            )
         mine = [item for item in cases if item.id.startswith("canopen.")]
         if mine and can is not None:
             _run_canopen(request, icd, can, mine, on_outcome)
@@ -190,10 +203,11 @@ def _run_on_links(
 
 def _serial_probe(
     request: ConformanceRequest, icd: InterfaceDefinition, port: Port[bytes], baud: int | None
-) -> SerialProbe | UnitProbe:
+) -> SerialProbe | SerialUnitProbe:
+    style = chosen_dialect(icd, request.dialect)
     if is_cubestar(icd):
-        return SerialProbe(port, icd, dialect=request.dialect, baud=baud, times=request.times)
-    return UnitProbe(port, icd, times=request.times)
+        return SerialProbe(port, icd, dialect=style or "b", baud=baud, times=request.times)
+    return SerialUnitProbe(port, icd, style=style, times=request.times)
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:
@@ -225,7 +239,7 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
         serial="off" if request.serial is None else request.serial,
         can=channel,
         seed=1,
-        settings=[f"links.serial.dialect={request.dialect}"],
+        settings=[] if request.dialect is None else [f"links.serial.dialect={request.dialect}"],
         state_dir=folder,
         extra=extra,
     )

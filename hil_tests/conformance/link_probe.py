@@ -97,8 +97,8 @@ class ProbeTimes:
     image_s: float = 20.0
 
 
-class LinkProbe(ABC):
-    """Talks to one device over one link."""
+class PortProbe(ABC):
+    """A port, its clock, and waiting on it, whatever is asked over it."""
 
     link: str
     """`serial` or `can`."""
@@ -108,7 +108,54 @@ class LinkProbe(ABC):
         self.icd = icd
         self.times = times or ProbeTimes()
         self.log: list[str] = []
-        self._found: UnitSettings | None = None
+
+    def drain(self) -> None:
+        """Discard everything received."""
+        while self.port.receive(0.0) is not None:
+            pass
+
+    @abstractmethod
+    def _receive(self, timeout_s: float) -> bool:
+        """Keep what arrives next; return whether anything came in time."""
+
+    def now(self) -> float:
+        """Time of the port, s."""
+        return self.port.now()
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass; received data are kept."""
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0:
+            self._receive(left)
+
+    @abstractmethod
+    def expect_silence(self, why: str, seconds: float | None = None) -> None:
+        """Fail the case if anything comes within a time."""
+
+    @abstractmethod
+    def expect_alive(self) -> None:
+        """Fail the case unless the next good request is answered."""
+
+    # --- around a case ---
+
+    def begin(self, *, intrusive: bool) -> None:  # noqa: ARG002 (the same for all cases)
+        """Start a case with an empty line."""
+        self.drain()
+
+    def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
+        """End a case: nothing more may come."""
+        if passed:
+            self.expect_silence("the case is over", self.times.quiet_s / 4)
+
+    def recover(self) -> None:
+        """Let time-outs of the device pass after a failed case."""
+        self.sleep(RECOVERY_S)
+
+
+class LinkProbe(PortProbe):
+    """Talks to one CubeStar over one link."""
+
+    _found: UnitSettings | None = None
 
     # --- the link ---
 
@@ -139,25 +186,6 @@ class LinkProbe(ABC):
     @abstractmethod
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
         """Return the messages of unsolicited telemetry that come within a time."""
-
-    def drain(self) -> None:
-        """Discard everything received."""
-        while self.port.receive(0.0) is not None:
-            pass
-
-    @abstractmethod
-    def _receive(self, timeout_s: float) -> bool:
-        """Keep what arrives next; return whether anything came in time."""
-
-    def now(self) -> float:
-        """Time of the port, s."""
-        return self.port.now()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass; received data are kept."""
-        end = self.now() + seconds
-        while (left := end - self.now()) > 0:
-            self._receive(left)
 
     # --- requests ---
 
@@ -320,21 +348,6 @@ class LinkProbe(ABC):
             self._found.restore(self)
         except CaseFailed as failure:
             raise CaseFailed(f"the stored parameters back as found ({self._found})", failure.seen) from None
-
-    # --- around a case ---
-
-    def begin(self, *, intrusive: bool) -> None:  # noqa: ARG002 (the same for all cases)
-        """Start a case with an empty line."""
-        self.drain()
-
-    def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
-        """End a case: nothing more may come."""
-        if passed:
-            self.expect_silence("the case is over", self.times.quiet_s / 4)
-
-    def recover(self) -> None:
-        """Let time-outs of the device pass after a failed case."""
-        self.sleep(RECOVERY_S)
 
 
 def checked_values(row: Row, data: bytes) -> dict[str, Value]:

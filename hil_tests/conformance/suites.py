@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Final
 
-from starhil.hil_tests.conformance import behaviour_cases, can_cases, image_cases, serial_cases, traffic_cases
-from starhil.hil_tests.conformance.can_probe import CanProbe
+from starhil.hil_tests.conformance import behaviour_cases, image_cases, serial_cases, traffic_cases
+from starhil.hil_tests.conformance.can_cases import can_cases
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.row_cases import row_cases
-from starhil.hil_tests.conformance.unit_cases import unit_cases
+from starhil.hil_tests.conformance.unit_cases import unit_cases, unit_row_cases
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -38,19 +38,19 @@ def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
     return _named("serial", *((serial_cases.CASES, _common(icd)) if is_cubestar(icd) else (unit_cases(icd),)))
 
 
-def can_suite(icd: InterfaceDefinition) -> tuple[Case[CanProbe], ...]:
-    """Return the cases for a CubeStar on CAN.
+def can_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
+    """Return the cases for a unit on CAN: those of a CubeStar, or those that its definition yields.
 
     Raises
     ------
     BenchError
-        The unit is not one.
+        The unit has no CAN link.
     """
-    if not is_cubestar(icd):
-        raise BenchError(
-            f"unit {icd.name}: there are no cases for its CAN link; those for its serial line are run with --serial"
-        )
-    return _named("can", can_cases.CASES, _common(icd))
+    if icd.link.can is None:
+        raise BenchError(f"unit {icd.name}: has no CAN link")
+    cubestar = is_cubestar(icd)
+    rows = _common(icd) if cubestar else unit_row_cases(icd, clause="[link.can]")
+    return _named("can", can_cases(icd, cubestar=cubestar), rows)
 
 
 def _common(icd: InterfaceDefinition) -> list[Case[Any]]:

@@ -1,13 +1,14 @@
-"""The tester's side of any unit on a serial line, by the link in its definition."""
+"""The tester's side of any unit, by its definition: its rows on any link, and its serial line."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
-from starhil.hil_tests.conformance.link_probe import RECOVERY_S, ProbeTimes, checked_values
+from starhil.hil_tests.conformance.link_probe import PortProbe, ProbeTimes, checked_values
 from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
@@ -22,7 +23,135 @@ PAUSE: Final = 1.6
 """Silence after which a message has surely timed out, in time-outs."""
 
 
-class UnitProbe:
+class UnitProbe(PortProbe):
+    """Asks a unit for its rows over a link.
+
+    Attributes
+    ----------
+    lively
+        Row by which the unit shows that it answers.
+    """
+
+    def __init__(self, port: Port[Any], icd: InterfaceDefinition, times: ProbeTimes | None) -> None:
+        super().__init__(port, icd, times)
+        self.lively = min(icd.telemetry.values(), key=lambda row: row.size)
+        self._settings: list[tuple[Row, bytes]] = []
+
+    # --- the link ---
+
+    @abstractmethod
+    def post(self, request: Request, *, answered: bool = True) -> None:
+        """Send a request without waiting; `answered` unless no answer is expected."""
+
+    @abstractmethod
+    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+        """Return the next reply, None if none comes in time."""
+
+    @abstractmethod
+    def unsolicited_replies(self, seconds: float) -> list[Reply]:
+        """Return the messages of unsolicited telemetry that come within a time."""
+
+    def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- for links on which it depends
+        """Return whether replies of a class can say that a request is refused."""
+        return True
+
+    @property
+    def has_codes(self) -> bool:
+        """Whether a refusal carries a code."""
+        return True
+
+    # --- requests ---
+
+    def request(self, row: Row, data: bytes = b"") -> Request:
+        """Return the request of a row."""
+        return self.icd.request(row, data)
+
+    def ask(self, request: Request) -> Reply | LinkFault | None:
+        """Send a request and return the answer; one in several parts counts as its last."""
+        self.post(request)
+        answer = self.next_reply()
+        while isinstance(answer, Reply) and not answer.final:
+            answer = self.next_reply()
+        return answer
+
+    def telemetry(self, row: Row) -> Reply:
+        """Return the telemetry of a row; anything else fails the case."""
+        self.post(self.request(row))
+        return self.expect_telemetry(row)
+
+    def expect_telemetry(self, row: Row) -> Reply:
+        """Take the next answer, which must be the telemetry of a row."""
+        answer = self.next_reply()
+        what = f"telemetry {row.name} of {row.size} bytes"
+        if not isinstance(answer, Reply) or answer.kind is not ReplyKind.TELEMETRY:
+            raise CaseFailed(what, describe(answer))
+        if (answer.id, answer.klass, len(answer.data)) != (row.id, row.klass, row.size):
+            raise CaseFailed(what, describe(answer))
+        return answer
+
+    def values(self, row: Row) -> dict[str, Value]:
+        """Return the checked values of a telemetry row."""
+        return checked_values(row, self.telemetry(row).data)
+
+    def command(self, row: Row, data: bytes) -> None:
+        """Send a telecommand that must be accepted."""
+        answer = self.ask(self.request(row, data))
+        accepted = isinstance(answer, Reply) and answer.kind is ReplyKind.ACK and answer.id == row.id
+        check(accepted, f"acknowledge of {row.name}", describe(answer))
+
+    def expect_refusal(self, request: Request, code: ErrorCode) -> None:
+        """Send a request that must be refused, or not answered where the unit's replies cannot refuse."""
+        what = f"{request.klass} {request.id}".strip()
+        if not self.can_refuse(request.klass):
+            self.post(request, answered=False)
+            self.expect_silence(f"no reply can refuse {what}")
+            return
+        answer = self.ask(request)
+        refused = isinstance(answer, Reply) and answer.kind is ReplyKind.NACK
+        check(refused, f"refusal of {what}", describe(answer))
+        if isinstance(answer, Reply) and self.has_codes:
+            check_equal(int(answer.code), int(self.icd.error_number(code)), f"code of the refusal of {what}")
+
+    def expect_alive(self) -> None:
+        """Fail the case unless the next good request is answered."""
+        self.drain()
+        self.telemetry(self.lively)
+
+    # --- around a run ---
+
+    def silence(self, *, booting: bool) -> str | None:
+        """Return the invalid answer to three requests, None if one is answered correctly."""
+        end = self.now() + (self.times.boot_s if booting else 0.0)
+        while True:
+            self.drain()
+            answer = self.ask(self.request(self.lively))
+            if isinstance(answer, Reply) and len(answer.data) == self.lively.size:
+                return None
+            if self.now() >= end:
+                return describe(answer)
+
+    def settings(self) -> Sequence[tuple[Row, Row]]:
+        """Return the telecommands whose values a telemetry row reports, with that row."""
+        rows = ((row, next(iter(row.named_fields.values()), None)) for row in self.icd.telemetry.values())
+        return [
+            (self.icd.telecommands[field.telecommand], row)
+            for row, field in rows
+            if field is not None and field.telecommand is not None
+        ]
+
+    def prepare(self) -> None:
+        """Note the settings that can be read."""
+        self._settings = [(command, self.telemetry(row).data) for command, row in self.settings()]
+
+    def restore(self) -> None:
+        """Put the settings back."""
+        self.recover()
+        self.drain()
+        for command, data in self._settings:
+            self.command(command, data)
+
+
+class SerialUnitProbe(UnitProbe):
     """Talks over a serial port.
 
     Parameters
@@ -45,30 +174,14 @@ class UnitProbe:
         style: Dialect | None = None,
         times: ProbeTimes | None = None,
     ) -> None:
-        self.port = port
-        self.icd = icd
+        super().__init__(port, icd, times)
         self.stack = build_serial_stack(icd)
-        self.times = times or ProbeTimes()
-        self.log: list[str] = []
         self.timeout_s = icd.link.serial.timeout if icd.link.serial is not None else 0.5
-        self.lively = min(icd.telemetry.values(), key=lambda row: row.size)
-        """Row by which the unit shows that it answers."""
         self.style = style or getattr(self.stack, "dialect", None)
         """Dialect of the replies, of a unit that has dialects."""
-        self._settings: list[tuple[Row, bytes]] = []
         self.drain()
 
     # --- the line ---
-
-    def now(self) -> float:
-        """Time of the port, s."""
-        return self.port.now()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass; received data are kept."""
-        end = self.now() + seconds
-        while (left := end - self.now()) > 0:
-            self._receive(left)
 
     def sleep_past_timeout(self) -> None:
         """Let a message that has begun time out."""
@@ -81,8 +194,7 @@ class UnitProbe:
 
     def drain(self) -> None:
         """Discard everything received and expected."""
-        while self.port.receive(0.0) is not None:
-            pass
+        super().drain()
         self.raw = b""
         """All bytes received since the last drain."""
         self._received = bytearray()
@@ -130,65 +242,18 @@ class UnitProbe:
             if len(self._expected) == 1:
                 self._expect_next()
 
-    def request(self, row: Row, data: bytes = b"") -> Request:
-        """Return the request of a row."""
-        return self.icd.request(row, data)
+    def post(self, request: Request, *, answered: bool = True) -> None:
+        """Send a request without waiting."""
+        if answered:
+            self.expecting(request)
+        self.send(self.stack.encode_request(request))
 
-    def next_answer(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
         """Return the next reply, None if none comes in time; one with data in several parts as one."""
         end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
         while not self._replies and (left := end - self.now()) > 0:
             self._receive(left)
         return self._replies.popleft() if self._replies else None
-
-    def ask(self, request: Request) -> Reply | LinkFault | None:
-        """Send a request and return the answer."""
-        self.expecting(request)
-        self.send(self.stack.encode_request(request))
-        answer = self.next_answer()
-        while isinstance(answer, Reply) and not answer.final:
-            answer = self.next_answer()
-        return answer
-
-    def telemetry(self, row: Row) -> Reply:
-        """Return the telemetry of a row; anything else fails the case."""
-        request = self.request(row)
-        self.expecting(request)
-        self.send(self.stack.encode_request(request))
-        return self.expect_telemetry(row)
-
-    def expect_telemetry(self, row: Row) -> Reply:
-        """Take the next answer, which must be the telemetry of a row."""
-        answer = self.next_answer()
-        what = f"telemetry {row.name} of {row.size} bytes"
-        if not isinstance(answer, Reply) or answer.kind is not ReplyKind.TELEMETRY:
-            raise CaseFailed(what, describe(answer))
-        if (answer.id, answer.klass, len(answer.data)) != (row.id, row.klass, row.size):
-            raise CaseFailed(what, describe(answer))
-        return answer
-
-    def values(self, row: Row) -> dict[str, Value]:
-        """Return the checked values of a telemetry row."""
-        return checked_values(row, self.telemetry(row).data)
-
-    def command(self, row: Row, data: bytes) -> None:
-        """Send a telecommand that must be accepted."""
-        answer = self.ask(self.request(row, data))
-        accepted = isinstance(answer, Reply) and answer.kind is ReplyKind.ACK and answer.id == row.id
-        check(accepted, f"acknowledge of {row.name}", describe(answer))
-
-    def expect_refusal(self, request: Request, code: ErrorCode) -> None:
-        """Send a request that must be refused, or not answered where the unit's replies cannot refuse."""
-        what = f"{request.klass} {request.id}".strip()
-        if not self.can_refuse(request.klass):
-            self.send(self.stack.encode_request(request))
-            self.expect_silence(f"no reply can refuse {what}")
-            return
-        answer = self.ask(request)
-        refused = isinstance(answer, Reply) and answer.kind is ReplyKind.NACK
-        check(refused, f"refusal of {what}", describe(answer))
-        if isinstance(answer, Reply) and self.has_codes:
-            check_equal(int(answer.code), int(self.icd.error_number(code)), f"code of the refusal of {what}")
 
     def can_refuse(self, klass: str) -> bool:
         """Return whether replies of a class can say that a request is refused."""
@@ -208,62 +273,11 @@ class UnitProbe:
         self.sleep(self.times.quiet_s if seconds is None else seconds)
         check(len(self.raw) == before, f"nothing ({why})", self.raw[before:][:SHOWN_BYTES])
 
-    def expect_alive(self) -> None:
-        """Fail the case unless the next good request is answered."""
-        self.drain()
-        self.telemetry(self.lively)
-
-    def receive_unsolicited(self, seconds: float) -> list[Reply]:
+    def unsolicited_replies(self, seconds: float) -> list[Reply]:
         """Return the messages of unsolicited telemetry that come within a time."""
         self._unsolicited.clear()
         self.sleep(seconds)
         return list(self._unsolicited)
-
-    # --- around a run and a case ---
-
-    def silence(self, *, booting: bool) -> str | None:
-        """Return the invalid answer to three requests, None if one is answered correctly."""
-        end = self.now() + (self.times.boot_s if booting else 0.0)
-        while True:
-            self.drain()
-            answer = self.ask(self.request(self.lively))
-            if isinstance(answer, Reply) and len(answer.data) == self.lively.size:
-                return None
-            if self.now() >= end:
-                return describe(answer)
-
-    def settings(self) -> Sequence[tuple[Row, Row]]:
-        """Return the telecommands whose values a telemetry row reports, with that row."""
-        rows = ((row, next(iter(row.named_fields.values()), None)) for row in self.icd.telemetry.values())
-        return [
-            (self.icd.telecommands[field.telecommand], row)
-            for row, field in rows
-            if field is not None and field.telecommand is not None
-        ]
-
-    def prepare(self) -> None:
-        """Note the settings that can be read."""
-        self._settings = [(command, self.telemetry(row).data) for command, row in self.settings()]
-
-    def restore(self) -> None:
-        """Put the settings back."""
-        self.recover()
-        self.drain()
-        for command, data in self._settings:
-            self.command(command, data)
-
-    def begin(self, *, intrusive: bool) -> None:  # noqa: ARG002 (the same for all cases)
-        """Start a case with an empty line."""
-        self.drain()
-
-    def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
-        """End a case: nothing more may come."""
-        if passed:
-            self.expect_silence("the case is over", self.times.quiet_s / 4)
-
-    def recover(self) -> None:
-        """Let time-outs of the device pass after a failed case."""
-        self.sleep(RECOVERY_S)
 
 
 def describe(answer: Reply | LinkFault | None) -> str:

@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from starhil.hil_tests.conformance.can_probe import CanWire
 from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 
 ProbeType = TypeVar("ProbeType", bound=LinkProbe)
+WireType = TypeVar("WireType", bound=LinkProbe | CanWire)
 
 FLAG_NAMES: Final = (
     "telecommand_overrun",
@@ -46,16 +48,16 @@ class Exchange:
 
 
 def add_exchange_cases(
-    area: CaseArea[ProbeType], rows: Iterable[Exchange], *, intrusive: bool = False
+    area: CaseArea[WireType], rows: Iterable[Exchange], *, intrusive: bool = False
 ) -> None:
     """Add one case per row."""
     for row in rows:
         _add_exchange_case(area, row, intrusive)
 
 
-def _add_exchange_case(area: CaseArea[ProbeType], row: Exchange, intrusive: bool) -> None:
+def _add_exchange_case(area: CaseArea[WireType], row: Exchange, intrusive: bool) -> None:
     @area.case(row.id, row.title, row.clause, intrusive=intrusive)
-    def run(probe: ProbeType) -> None:
+    def run(probe: WireType) -> None:
         probe.expecting(*row.answers)
         for text in row.sent:
             probe.send_text(text)

@@ -87,14 +87,25 @@ class StandInApplication:
         self.images: dict[str, GreyImage] = {}
         self.taken: list[str] = []
         self.commands: list[tuple[str, dict[str, Value]]] = []
+        self._reported = {
+            command: [
+                row.name
+                for row in icd.telemetry.values()
+                if any(field.telecommand == command for field in row.named_fields.values())
+            ]
+            for command in icd.telecommands
+        }
 
     def telemetry(self, row: Row) -> bytes:
         """Return the preset values, encoded."""
         return row.encode(self.rows.get(row.name, {}))
 
     def telecommand(self, row: Row, payload: bytes) -> None:
-        """Record the telecommand."""
-        self.commands.append((row.name, dict(row.decode(payload))))
+        """Record the telecommand; telemetry that reports its values has them from now on."""
+        values = dict(row.decode(payload))
+        self.commands.append((row.name, values))
+        for name in self._reported[row.name]:
+            self.rows[name] = {**self.rows.get(name, {}), **values}
 
     def parameter(self, name: str) -> Value:
         """Return the stored value."""

@@ -62,6 +62,7 @@ class PdoDefault:
     name: str
     enabled: bool = False
     can_id: int | None = None
+    relative: bool = True
     transmission_type: int = EVENT_DRIVEN
     inhibit: int = 0
     event_ms: int = 0
@@ -243,7 +244,9 @@ def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
         od,
         f"RPDO {number + 1} communication parameter: {default.name}",
         [
-            variable("COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=bool(can_id)),
+            variable(
+                "COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=default.relative and bool(can_id)
+            ),
             variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
             variable("Event timer", index, 5, U16, "rw", default.event_ms),
         ],
@@ -259,7 +262,9 @@ def _add_tpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
         od,
         f"TPDO {number + 1} communication parameter: {default.name}",
         [
-            variable("COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=bool(can_id)),
+            variable(
+                "COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=default.relative and bool(can_id)
+            ),
             variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
             variable("Inhibit time", index, 3, U16, "rw", default.inhibit),
             variable("Event timer", index, 5, U16, "rw", default.event_ms),

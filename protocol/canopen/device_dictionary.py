@@ -161,7 +161,8 @@ class DeviceDictionary(Dictionary):
             self._place_members(objects, placed)
         else:
             key = (placed.index, 0)
-            objects.add_object(self._value_variable(placed.name, key, placed.value, placed.telecommand))
+            member = self._value_variable(placed.name, key, placed.value, placed.telecommand, placed.type)
+            objects.add_object(member)
             self._names[f"{placed.index:04x}"] = key
 
     def _place_requests(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
@@ -188,13 +189,36 @@ class DeviceDictionary(Dictionary):
             for field in fields:
                 self._bind_reader(key, row, field.name, partial(self._read_slot, row, slot))
             self._placed[row.kind, row.name, slot.index] = key
+            if placed.telecommand is not None:
+                member.access_type = "rw"
+                command = self._setter_of(placed, row)
+                self._writers[key] = partial(self._execute_field, command, row, slot)
+                self._placed[command.kind, command.name, slot.index] = key
             members.append(member)
         add_record(objects, placed.name, members)
 
-    def _value_variable(self, name: str, key: Key, value: str | None, telecommand: str | None) -> ODVariable:
+    def _setter_of(self, placed: PlacedObject, row: Row) -> Row:
+        """Return the telecommand that sets a record, whose values its telemetry row reports and nothing else."""
+        command = self.icd.telecommands[str(placed.telecommand)]
+        reported = {field.telecommand for field in row.named_fields.values()}
+        if reported != {command.name} or row.size != command.size:
+            raise IcdError(
+                f"canopen.toml: {placed.index:04X}h: telemetry {row.name} must include {command.name} alone"
+            )
+        return command
+
+    def _execute_field(self, command: Row, row: Row, slot: Slot, payload: bytes) -> Deferred | None:
+        """Execute a telecommand with the values that its row reports, one of them changed."""
+        data = bytearray(self.row_bytes(row))
+        data[span_of(slot)] = in_order(slot, payload)
+        return self._execute(command, bytes(data))
+
+    def _value_variable(
+        self, name: str, key: Key, value: str | None, telecommand: str | None, type_: str | None = None
+    ) -> ODVariable:
         """Return the variable that reads a field, executes a telecommand when written, or both."""
         if telecommand is not None:
-            member = self._telecommand_variable(name, key, self.icd.telecommands[telecommand])
+            member = self._telecommand_variable(name, key, self.icd.telecommands[telecommand], type_)
         if value is not None:
             row, slot, fields = self._slot_of(value)
             if telecommand is None:
@@ -295,14 +319,21 @@ class DeviceDictionary(Dictionary):
             members.append(member)
         add_record(objects, placed.name, members)
 
-    def _telecommand_variable(self, name: str, key: Key, row: Row) -> ODVariable:
+    def _telecommand_variable(self, name: str, key: Key, row: Row, type_: str | None = None) -> ODVariable:
         """Return the variable whose write executes a telecommand.
 
-        The client writes the only value, all bytes, or 1 if the telecommand has no data.
+        The client writes the only value, all bytes (as a number if a type is given), or 1 if the telecommand has no data.
         """
-        scalar = len(row.slots) == 1 and row.slots[0].type != "bytes"
+        scalar = type_ is None and len(row.slots) == 1 and row.slots[0].type != "bytes"
         self._placed[row.kind, row.name, row.slots[0].index if scalar else None] = key
-        if row.size == 0:
+        if type_ is not None:
+            if type_size(DATA_TYPES[type_]) != row.size:
+                raise IcdError(
+                    f"canopen.toml: {key[0]:04X}h: {row.name} has {row.size} bytes, not those of {type_}"
+                )
+            member = variable(name, *key, DATA_TYPES[type_], "wo", mappable=True)
+            self._writers[key] = partial(self._execute, row)
+        elif row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
             self._writers[key] = partial(self._execute_without_data, row)
         elif scalar:
@@ -359,6 +390,7 @@ class DeviceDictionary(Dictionary):
             name=model.name,
             enabled=model.enabled,
             can_id=model.can_id,
+            relative=model.relative,
             transmission_type=model.transmission_type,
             inhibit=round(model.inhibit_ms * 10),
             event_ms=model.event_ms,

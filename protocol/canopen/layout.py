@@ -55,8 +55,11 @@ class PlacedObject(_Model):
     name: str
     requests: bool = False
     telemetry: str | None = None
+    """Record of the row's fields; with a telecommand that it includes, each of them sets this one and keeps the others."""
     value: str | None = None
     telecommand: str | None = None
+    type: Literal["u8", "u16", "u32", "u64"] | None = None
+    """Number that holds all bytes of the telecommand, so that a PDO can carry it."""
     parameters: bool = False
     image: Literal["frame", "stored"] | None = None
     packed: list[PackedField] = []
@@ -67,7 +70,7 @@ class PlacedObject(_Model):
         kinds = [
             bool(self.requests),
             self.telemetry is not None,
-            self.value is not None or self.telecommand is not None,
+            self.telemetry is None and (self.value is not None or self.telecommand is not None),
             self.parameters,
             self.image is not None,
             bool(self.packed),
@@ -78,6 +81,10 @@ class PlacedObject(_Model):
                 "needs exactly one of requests, telemetry, value and/or telecommand, parameters, image, packed, "
                 "members"
             )
+        if self.type is not None and (
+            self.telecommand is None or self.value is not None or self.telemetry is not None
+        ):
+            raise ValueError("`type` is for a telecommand alone")
         return self
 
 
@@ -88,6 +95,8 @@ class PdoModel(_Model):
     enabled: bool = False
     can_id: Annotated[int, Field(ge=0x181, le=0x57F)] | None = None
     """CAN ID, to which the node-ID is added; the predefined one of the first four PDOs unless given."""
+    relative: bool = True
+    """Whether the node-ID is added to `can_id`."""
     transmission_type: Annotated[int, Field(ge=0, le=255)] = 255
     inhibit_ms: Annotated[float, Field(ge=0, le=6553.5)] = 0
     event_ms: Annotated[int, Field(ge=0, le=0xFFFF)] = 0

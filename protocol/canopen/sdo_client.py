@@ -77,9 +77,7 @@ def row_transfer(dictionary: DeviceDictionary, row: Row, data: bytes = b"") -> S
     entries = dictionary.entries_of(row)
     if row.kind == "telemetry":
         return _read(row, entries)
-    key, slot = entries[0]
-    value = data if slot is None else in_order(slot, data)
-    return download(*key, value or _EXECUTE)
+    return _write(data, entries)
 
 
 def _read(row: Row, entries: Sequence[tuple[Key, Slot | None]]) -> SdoTransfer:
@@ -90,6 +88,14 @@ def _read(row: Row, entries: Sequence[tuple[Key, Slot | None]]) -> SdoTransfer:
             return value
         data[span_of(slot)] = in_order(slot, value)
     return bytes(data)
+
+
+def _write(data: bytes, entries: Sequence[tuple[Key, Slot | None]]) -> SdoTransfer:
+    for key, slot in entries:
+        part = data if len(entries) == 1 or slot is None else data[span_of(slot)]
+        value = part if slot is None else in_order(slot, part)
+        yield from download(*key, value if data else _EXECUTE)
+    return b""
 
 
 def requests_of(transfer: SdoTransfer) -> list[bytes]:

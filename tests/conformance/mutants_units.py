@@ -10,7 +10,7 @@ from starhil.emulator.device.device import Device
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from tests.conformance.mutant_seams import Damage, handling, incoming, outgoing
+from tests.conformance.mutant_seams import Damage, handling, incoming, only_acknowledged, outgoing
 from tests.conformance.simulated import SimulatedUnit
 
 Change = Callable[[Reply, Device], Reply | None]
@@ -85,11 +85,11 @@ def with_code(old: ErrorCode, code: ErrorCode | None) -> Damage:
     """Give refusals another code, or accept what would be refused."""
 
     def changed(reply: Reply, device: Device) -> Reply:
-        if reply.kind is not ReplyKind.NACK or int(reply.code) != int(device.icd.error_number(old)):
+        if reply.kind is not ReplyKind.NACK or reply.code is not old:
             return reply
         if code is None:
             return dataclasses.replace(reply, kind=ReplyKind.ACK, code=ErrorCode.OK)
-        return dataclasses.replace(reply, code=device.icd.error_number(code))
+        return dataclasses.replace(reply, code=code)
 
     return replies(changed)
 
@@ -188,7 +188,7 @@ def cut_to_size(device: Device, request: Request, handle: Callable[[Request], li
 def without_limits(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
     return [
         dataclasses.replace(reply, kind=ReplyKind.ACK, code=ErrorCode.OK)
-        if reply.kind is ReplyKind.NACK and reply.code == device.icd.error_number(ErrorCode.INVALID_PARAMETER)
+        if reply.kind is ReplyKind.NACK and reply.code is ErrorCode.INVALID_PARAMETER
         else reply
         for reply in handle(request)
     ]
@@ -320,42 +320,33 @@ def mutants() -> Iterator[UnitMutant]:
     yield from gen2()
 
 
-def gen2() -> Iterator[UnitMutant]:
-    """Mutants of the framing `1F 7F … 1F FF` at a unit that is no CubeStar."""
+def gen2(link: str = "serial") -> Iterator[UnitMutant]:
+    """Mutants of a unit that is no CubeStar on the links of one: its rows, and the framing `1F 7F … 1F FF`."""
 
     def stuffing_missing(data: bytes) -> list[bytes]:
         return [data[:2] + data[2:-2].replace(b"\x1f\x1f", b"\x1f") + data[-2:]]
 
-    length = "serial.lengths.set_unix_time.long"
+    one = "framing.one" if link == "serial" else "frames.telemetry"
+    length, setting = "lengths.set_unix_time.long", "settings.unsolicited_telemetry"
     found: dict[str, tuple[str, Damage]] = {
-        "replies come twice": ("serial.framing.one", outgoing(twice)),
-        "a stray byte follows each reply": (
-            "serial.framing.reply-form",
-            outgoing(lambda data: [data + b"\x42"]),
-        ),
-        "replies are missing": ("serial.recovery.flood", every_fifth_missing()),
-        "replies carry another identifier": (
-            "serial.framing.one",
-            replies(lambda reply, _device: dataclasses.replace(reply, id=(reply.id or 0) ^ 1)),
-        ),
-        "the last byte of telemetry is missing": (
-            "serial.telemetry.identification",
-            telemetry_data(lambda data, _row: data[:-1]),
-        ),
-        "replies are not stuffed": ("serial.settings.unsolicited_telemetry", outgoing(stuffing_missing)),
-        "stuffed bytes of requests are changed": (
-            "serial.settings.unsolicited_telemetry",
-            incoming(lambda data: [data.replace(b"\x1f\x1f", b"\x1e")]),
-        ),
-        "unknown identifiers are accepted": (
-            "serial.identifiers.unknown",
-            with_code(ErrorCode.INVALID_ID, None),
-        ),
+        "replies come twice": (one, outgoing(twice)),
+        "replies are missing": ("recovery.flood", every_fifth_missing()),
+        "the last byte of telemetry is missing": ("telemetry.identification", telemetry_data(lambda data, _row: data[:-1])),
+        "unknown identifiers are accepted": ("identifiers.unknown", with_code(ErrorCode.INVALID_ID, None)),
         "data of any length are taken": (length, handling(cut_to_size)),
         "a wrong length gets another code": (length, with_code(ErrorCode.INVALID_LENGTH, ErrorCode.BUSY)),
-    }
+        "limits are not checked": ("limits.set_unix_time.nanoseconds.high", handling(without_limits)),
+        "a setting is acknowledged and forgotten": (setting, only_acknowledged(112)),
+    }  # fmt: skip
+    if link == "serial":
+        found |= {
+            "a stray byte follows each reply": ("framing.reply-form", outgoing(lambda data: [data + b"\x42"])),
+            "replies carry another identifier": (one, replies(lambda reply, _device: dataclasses.replace(reply, id=(reply.id or 0) ^ 1))),
+            "replies are not stuffed": (setting, outgoing(stuffing_missing)),
+            "stuffed bytes of requests are changed": (setting, incoming(lambda data: [data.replace(b"\x1f\x1f", b"\x1e")])),
+        }  # fmt: skip
     for name, (caught_by, damage) in found.items():
-        yield UnitMutant("cubestar-gen2", name, caught_by, damage)
+        yield UnitMutant("cubestar-gen2", name, f"{link}.{caught_by}", damage)
 
 
 def _as_replies(unit: SimulatedUnit) -> None:

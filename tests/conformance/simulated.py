@@ -6,6 +6,7 @@ import asyncio
 import selectors
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Self
 
 from starhil.emulator.clock import NANOSECONDS
@@ -13,6 +14,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore
 from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
 from starhil.emulator.pipeline.messages import FrameResult, ImageRequest, ImageResult, MatchedStar
@@ -20,10 +22,13 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.conformance.can_probe import CanProbe
+from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import is_cubestar
-from starhil.hil_tests.conformance.unit_probe import UnitProbe
+from starhil.hil_tests.conformance.unit_can_probe import CanUnitProbe
+from starhil.hil_tests.conformance.unit_probe import SerialUnitProbe
+from starhil.protocol.canopen import build_dictionary, build_eds
 from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
@@ -31,6 +36,7 @@ from starhil.protocol.transports.paced import PacedWriter
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
+from tests.protocol.canopen.conftest import import_eds
 
 BAUD = 115200
 BOUND_S = 0.0005
@@ -175,10 +181,14 @@ class TruthImager:
         )  # fmt: skip
 
 
+LINKS: dict[str, Callable[..., Any]] = {"serial": SerialLink, "can": CanLink, "canopen": CanopenLink}
+
+
 class SimulatedUnit:
     """A device in simulated time, with one link and a probe on it; a context manager.
 
-    `damage` is called with the unit before the device is switched on: it is how mutants are made.
+    `damage` is called with the unit before the device is switched on: it is how mutants are made. Another way is to
+    have the device serve another definition than that of the tester: a folder, in `served`.
     """
 
     def __init__(
@@ -187,11 +197,13 @@ class SimulatedUnit:
         damage: Callable[[SimulatedUnit], None] | None = None,
         dialect: str = "b",
         unit: str = DEFAULT_UNIT,
+        served: Path | None = None,
     ) -> None:
         self.loop = SimulatedLoop()
         self.kind = link
         self.dialect = dialect
         self.icd = load_unit(unit)
+        self._served = self.icd if served is None else load_unit(served)
         self._damage = damage
 
     def __enter__(self) -> Self:
@@ -199,9 +211,17 @@ class SimulatedUnit:
         self.loop.run_until_complete(self._start())
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
-        self.probe: SerialProbe | CanProbe | UnitProbe
+        self.probe: SerialProbe | CanProbe | SerialUnitProbe | CanUnitProbe | CanopenProbe
+        if self.kind == "canopen":
+            node = int(self.icd.parameters["canopen_node"].default)
+            eds = build_eds(build_dictionary(self.icd))
+            self.probe = CanopenProbe(port, node, import_eds(eds, node), eds)
+            self.loop.run_until_complete(asyncio.sleep(1.0))
+            return self
         if not is_cubestar(self.icd):
-            self.probe = UnitProbe(port, self.icd, times=times)
+            self.probe = (SerialUnitProbe if self.kind == "serial" else CanUnitProbe)(
+                port, self.icd, times=times
+            )
         elif self.kind == "serial":
             self.probe = SerialProbe(port, self.icd, dialect=self.dialect, baud=BAUD, times=times)
         else:
@@ -213,16 +233,16 @@ class SimulatedUnit:
         self.imager = DirectImager(TruthImager().handle)
         attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
         links = {"serial": {"dialect": self.dialect}}
-        parameters = {} if is_cubestar(self.icd) else {"start_mode": "lost_in_space"}
+        starts = not is_cubestar(self.icd) and self.kind != "canopen"
+        parameters = {"start_mode": "lost_in_space"} if starts else {}
         profile = Profile.model_validate({"links": links, "parameters": parameters})
         self.store = MemoryStore()
         self.device = Device(
-            profile, self.icd, LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
+            profile, self._served, LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
         )
         self.requests = Requests(self.device)
         self.transport = MemoryTransport(self.loop, paced=self.kind == "serial")
-        self.link: SerialLink | CanLink
-        self.link = (SerialLink if self.kind == "serial" else CanLink)(self.requests, self.transport)
+        self.link = LINKS[self.kind](self.requests, self.transport)
         if self._damage is not None:
             self._damage(self)
         self.device.power_on()

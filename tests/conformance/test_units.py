@@ -4,20 +4,36 @@ from __future__ import annotations
 
 import pytest
 
+from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.icd import load_unit
-from tests.conformance.mutants_units import UnitMutant, mutants
+from tests.conformance.mutant_seams import Damage
+from tests.conformance.mutants_oresat import DAMAGES, MISTAKES, Mistake
+from tests.conformance.mutants_units import UnitMutant, gen2, mutants
 from tests.conformance.simulated import SimulatedUnit
+from tests.conformance.test_mutants import MUTANTS
 
-UNITS = ("sagitta", "nos3", "st16", "cubestar-gen2")
+GEN2 = "cubestar-gen2"
+UNITS = ("sagitta", "nos3", "st16", GEN2)
+SUITES = {"serial": serial_suite, "can": can_suite}
+ON_CAN = {case.id: case for case in can_suite(load_unit(GEN2))}
+MUTANTS_ON_CAN = [
+    *(
+        (item.name, item.caught_by, item.damage)
+        for item in MUTANTS
+        if item.caught_by in ON_CAN and ".telemetry." not in item.caught_by
+    ),
+    *((item.name, item.caught_by, item.damage) for item in gen2("can")),
+]
+"""Those of the CAN link of a CubeStar whose case the definition yields, and those of the rows."""
 
 
-@pytest.mark.parametrize("unit", UNITS)
-def test_a_unit_that_ships_passes_every_case_of_its_definition(unit: str) -> None:
-    cases = serial_suite(load_unit(unit))
-    with SimulatedUnit("serial", unit=unit) as simulated:
+@pytest.mark.parametrize(("unit", "link"), [*((unit, "serial") for unit in UNITS), (GEN2, "can")])
+def test_a_unit_that_ships_passes_every_case_of_its_definition(unit: str, link: str) -> None:
+    cases = SUITES[link](load_unit(unit))
+    with SimulatedUnit(link, unit=unit) as simulated:
         outcomes = run_cases(simulated.probe, cases)
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
     assert [o.id for o in outcomes if o.status == "skipped"] == []
@@ -34,8 +50,50 @@ def test_a_mutant_of_a_unit_is_caught_by_its_case(mutant: UnitMutant) -> None:
     assert outcome.seen
 
 
+@pytest.mark.parametrize(
+    ("caught_by", "damage"), [item[1:] for item in MUTANTS_ON_CAN], ids=[item[0] for item in MUTANTS_ON_CAN]
+)
+def test_a_mutant_of_a_unit_on_can_is_caught_by_its_case(caught_by: str, damage: Damage) -> None:
+    with SimulatedUnit("can", damage, unit=GEN2) as simulated:
+        outcome = run_case(simulated.probe, ON_CAN[caught_by])
+    assert outcome.status == "failed", f"{caught_by} passed"
+    assert outcome.expected
+    assert outcome.seen
+
+
+def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
+    with SimulatedUnit("canopen", unit="oresat") as simulated:
+        outcomes = run_cases(simulated.probe, canopen_suite(load_unit("oresat")))
+    assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
+    assert {o.id: o.seen for o in outcomes if o.status == "skipped"} == {
+        "canopen.design.attitude": "the EDS has no object named sequence"
+    }
+    assert len(outcomes) >= 175
+
+
+def caught_on_canopen(simulated: SimulatedUnit, case: str) -> None:
+    cases = {item.id: item for item in canopen_suite(load_unit("oresat"))}
+    with simulated:
+        outcome = run_case(simulated.probe, cases[f"canopen.{case}"])
+    assert outcome.status == "failed", f"{case} passed"
+    assert outcome.expected
+    assert outcome.seen
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_a_mistake_in_a_definition_on_canopen_is_caught_by_its_case(mistake: Mistake, tmp_path) -> None:
+    served = mistake.write(tmp_path)
+    caught_on_canopen(SimulatedUnit("canopen", unit="oresat", served=served), mistake.caught_by)
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_mutant_of_a_unit_on_canopen_is_caught_by_its_case(name: str) -> None:
+    case, damage = DAMAGES[name]
+    caught_on_canopen(SimulatedUnit("canopen", damage, unit="oresat"), case)
+
+
 def test_a_unit_without_cases_for_a_link_is_named() -> None:
     with pytest.raises(BenchError, match="unit oresat: has no serial link"):
         serial_suite(load_unit("oresat"))
-    with pytest.raises(BenchError, match="unit sagitta: there are no cases for its CAN link"):
+    with pytest.raises(BenchError, match="unit sagitta: has no CAN link"):
         can_suite(load_unit("sagitta"))

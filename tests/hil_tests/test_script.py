@@ -113,7 +113,7 @@ def test_a_full_script_is_read_as_it_stands(load):
         ),
         ("[[step]]\ncommand = 'set_mode'\nwith = { mod = 'standby' }", ["'mod'", "did you mean 'mode'"]),
         ("[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }", ["tracing", "tracking"]),
-        ("[[step]]\ncommand = 'set_mode'", ["set_mode.mode", "no value"]),
+        ("[[step]]\ncommand = 'set_mode'", ["set_mode.mode", "missing value"]),
         ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["unknown key 'expct'", "'expect'"]),
         ("[[step]]\nreed = 'rates'", ["exactly one action", "'reed'", "'read'"]),
         ("[[step]]\nread = 'rates'\nwait_s = 1", ["has read and wait_s"]),

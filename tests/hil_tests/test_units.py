@@ -6,7 +6,10 @@ import struct
 import pytest
 
 from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.errors import NackError
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, run_conformance
+from starhil.hil_tests.errors import BenchError, NackError
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, ReplyKind
 
@@ -31,6 +34,17 @@ code = 2
 def row(kind: str, number: int, name: str, fields: str = "", more: str = "") -> str:
     """Text of a row."""
     return f'[[{kind}]]\nid = {number}\nname = "{name}"\ndoc = "d"\nprovenance = "ours"\n{more}\nfields = [{fields}]\n'
+
+
+@pytest.mark.parametrize(
+    ("unit", "message"), [("sagitta", "has no reply dialects"), ("cubestar-gen2", "has dialect c alone")]
+)
+def test_a_dialect_that_the_unit_does_not_have_is_refused(unit, message):
+    request = ConformanceRequest(unit=unit, serial="/dev/null", dialect="b")
+    with pytest.raises(BenchError, match=f"--dialect b: unit {unit} {message}"):
+        run_conformance(request)
+    with pytest.raises(ProtocolError, match=message):
+        ObcClient.open(serial="/dev/null", unit=unit, dialect="b")
 
 
 class FakeLink:

@@ -220,6 +220,12 @@ def test_generation_1_has_nothing_unsolicited(dialect: Dialect, reply: Reply) ->
         encode_reply(reply, dialect)
 
 
+@pytest.mark.parametrize("dialect", Dialect)
+def test_no_dialect_has_echoes(dialect: Dialect) -> None:
+    with pytest.raises(ProtocolError, match=f"serial dialect {dialect} has no echo messages"):
+        encode_reply(Reply(ReplyKind.ECHO, 2), dialect)
+
+
 def test_unknown_error_codes_stay_numbers() -> None:
     receiver = HostReceiver(Dialect.A)
     assert receiver.feed(bytes.fromhex("1F7F02631FFF"), 0.0) == [Reply(ReplyKind.NACK, 2, code=99)]

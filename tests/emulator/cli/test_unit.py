@@ -8,6 +8,8 @@ import re
 import pytest
 from typer.testing import CliRunner
 
+from starhil.emulator.cli.bench import group as bench
+from starhil.emulator.cli.conformance import links_of
 from starhil.emulator.cli.unit import group
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
@@ -15,6 +17,7 @@ from starhil.emulator.profile import Profile, load_profile
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_folders import shipped_units
 
 
@@ -110,12 +113,40 @@ def test_a_bench_that_speaks_another_unit_than_the_profile_says_so():
         ("sagitta", {"serial": {"port": "off"}}, "can.channel: unit sagitta has none of the links"),
         ("nos3", {"canopen": {"node": 5}}, "canopen.node: unit nos3 has no CANopen"),
         ("oresat", {"can": {"channel": "off"}}, "serial.port: unit .* has none of the links"),
+        ("sagitta", {"serial": {"dialect": "b"}}, "links.serial.dialect: unit sagitta has no reply dialects"),
+        (
+            "cubestar-gen2",
+            {"serial": {"dialect": "a"}},
+            "links.serial.dialect: unit cubestar-gen2 has dialect c alone",
+        ),
     ],
 )
 def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch, unit_, links, message):
     monkeypatch.setattr(Emulation, "_make_imager", lambda *_: pytest.fail("the pipeline was started"))
     with pytest.raises(EmulatorError, match=message):
         Emulation(Profile.model_validate({"unit": unit_, "links": links}))
+
+
+@pytest.mark.parametrize(
+    ("name", "node", "links"),
+    [
+        ("cubestar", None, ("auto", "auto", None)),
+        ("cubestar", 44, ("auto", "auto", 44)),
+        ("sagitta", None, ("auto", None, None)),
+        ("cubestar-gen2", None, ("auto", "auto", None)),
+        ("oresat", None, (None, "auto", 0x2C)),
+    ],
+)
+def test_a_conformance_run_takes_the_links_that_the_unit_has(name, node, links):
+    assert links_of(load_unit(name), node) == links
+
+
+def test_the_load_of_the_links_is_refused_for_a_unit_without_its_rows():
+    done = CliRunner().invoke(bench, ["bus", "--unit", "sagitta"])
+    assert isinstance(done.exception, BenchError)
+    assert "unit sagitta lacks the rows of a CubeStar that load its links (identification, " in str(
+        done.exception
+    )
 
 
 def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, caplog):

@@ -9,10 +9,12 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import NackError
+from starhil.protocol.unit_folders import UNITS_FOLDER
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
 
 NODE = 0x2C
 STANDBY, STAR_TRACK = 2, 4
+FILTER = {"enable": 0, "lower_bound": 3, "lower_percentage": 5, "upper_bound": 7, "upper_percentage": 9}
 
 
 def upload(unit: Emulated, index: int, subindex: int = 0) -> bytes:
@@ -123,6 +125,32 @@ def test_card_is_restarted_by_an_entry():
     with_unit("oresat", "canopen", scenario)
 
 
+def test_refusals_keep_the_abort_codes_of_canopen_whatever_the_unit_numbers_and_echoes(tmp_path):
+    definition = (UNITS_FOLDER / "oresat" / "oresat.toml").read_text(encoding="utf-8")
+    echoed = definition.replace(
+        'kind = "telecommand"\n', 'kind = "telecommand"\nanswer = ["echo", "reply"]\n'
+    )
+    (tmp_path / "unit.toml").write_text(f"{echoed}\n[errors]\nother = 99\n", encoding="utf-8")
+
+    def scenario(unit: Emulated) -> None:
+        request = struct.pack("<BHB", 0x2F, 0x3003, 1) + bytes([1, 0, 0, 0])
+        unit.ask_can(0x600 + NODE, request, extended=False)
+        unit.step(0.01)
+        assert download(unit, 0x4000, STAR_TRACK) == 0x08000022  # while it boots
+
+    with_unit(str(tmp_path), "canopen", scenario)
+
+
+def test_time_of_the_c3_card_sets_the_clock():
+    def scenario(unit: Emulated) -> None:
+        operational(unit)
+        unit.ask_can(0x181, struct.pack("<II", 1_800_000_000, 500_000), extended=False)
+        unit.step(0.6)
+        assert struct.unpack("<I", upload(unit, 0x3003, 4))[0] == 1_800_000_001
+
+    with_unit("oresat", "canopen", scenario)
+
+
 def test_unit_whose_only_link_is_canopen_opens_it_by_itself(run):
     async def scenario(emulation, line):
         assert emulation.serial is None
@@ -134,14 +162,18 @@ def test_unit_whose_only_link_is_canopen_opens_it_by_itself(run):
     assert f"canopen={NODE}" in line.split()
 
 
-def test_the_bench_commands_and_reads_the_card_by_name(run):
-    channel = "virtual:oresat-bench"
+def test_the_bench_commands_and_reads_a_card_with_error_numbers_of_its_own_by_name(run, tmp_path):
+    channel, unit = "virtual:oresat-bench", str(tmp_path)
+    definition = (UNITS_FOLDER / "oresat" / "oresat.toml").read_text(encoding="utf-8")
+    (tmp_path / "unit.toml").write_text(f"{definition}\n[errors]\ninvalid_parameter = 99\n", encoding="utf-8")
 
     def drive():
-        with ObcClient.open(can=channel, unit="oresat", timeout_s=20.0) as obc:
+        with ObcClient.open(can=channel, unit=unit, timeout_s=20.0) as obc:
             obc.command("set_status", status="lost_in_space")
             with pytest.raises(NackError, match="invalid_parameter"):
                 obc.command("set_status", status=77, checked=False)
+            obc.command("set_capture_filter", **FILTER)
+            assert obc.telemetry("capture_filter") == FILTER
             return obc.telemetry("status"), obc.telemetry("orientation")["attitude_known"]
 
     async def scenario(emulation, _line):
@@ -149,4 +181,4 @@ def test_the_bench_commands_and_reads_the_card_by_name(run):
         return await asyncio.to_thread(drive)
 
     links = {"serial": {"port": "off"}, "can": {"channel": channel}}
-    assert run(scenario, unit="oresat", links=links) == ({"status": "lost_in_space"}, False)
+    assert run(scenario, unit=unit, links=links) == ({"status": "lost_in_space"}, False)

@@ -20,9 +20,11 @@ NODE = 0x2C
 
 
 class NumberedRows(StandInApplication):
-    """Telemetry of bytes that differ from row to row and within a row."""
+    """Telemetry of bytes that differ from row to row and within a row; settings as they were set."""
 
     def telemetry(self, row):
+        if any(field.telecommand for field in row.named_fields.values()):
+            return super().telemetry(row)
         return bytes((row.id + number) % 251 for number in range(row.size))
 
 

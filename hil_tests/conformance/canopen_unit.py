@@ -1,0 +1,507 @@
+"""Conformance of any unit on CANopen, derived from its definition: entries, telecommands, default PDOs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+from starhil.hil_tests.conformance.canopen_pdo import SYNCHRONOUS, send_sync
+from starhil.hil_tests.conformance.canopen_probe import (
+    NO_RTR,
+    NOBODY,
+    PDO_OFF,
+    PRE_OPERATIONAL,
+    START,
+    VALUE_ABORTS,
+    CanopenProbe,
+)
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.link_probe import checked_values
+from starhil.hil_tests.conformance.row_cases import bad_values
+from starhil.hil_tests.conformance.unit_cases import ATTITUDE_S, CLOCK_S, QUATERNION, clause_of_row, is_valid
+from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedMember, PlacedObject, read_layout
+from starhil.protocol.codec import Field, Row, Slot
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Value
+
+PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
+"""CAN IDs of the first four RPDOs and TPDOs, to which the node-ID is added (CiA 301 7.3.5)."""
+BOOT_S: Final = 15.0
+"""Longest time from a reset to the end of booting."""
+EXPEDITED: Final = 4
+"""Most bytes that an expedited SDO carries."""
+CHANGING: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
+"""How the names of quantities begin that change with each exposure."""
+CLAUSE: Final = "[canopen]"
+
+Run = Callable[[CanopenProbe], None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of the object dictionary, as `[canopen]` places it.
+
+    Attributes
+    ----------
+    name
+        As PDOs refer to it: `INDEX.NAME`, or `INDEX`.
+    size
+        Bytes; 0 where the definition fixes none.
+    row, slot
+        Telemetry that it reads, and which part of it.
+    command, part
+        Telecommand that a write executes, and which part of its data is written; all of it if None.
+    """
+
+    index: int
+    subindex: int
+    name: str
+    size: int
+    row: Row | None = None
+    slot: Slot | None = None
+    command: Row | None = None
+    part: Slot | None = None
+
+    @property
+    def mapping(self) -> int:
+        """Mapping entry of a PDO."""
+        return self.index << 16 | self.subindex << 8 | 8 * self.size
+
+
+def entries(icd: InterfaceDefinition, layout: CanopenModel) -> Iterator[Entry]:
+    """Yield the entries of the application."""
+    for placed in layout.object:
+        index, at = placed.index, f"{placed.index:04x}"
+        if placed.telemetry is not None:
+            row = icd.telemetry[placed.telemetry]
+            command = None if placed.telecommand is None else icd.telecommands[placed.telecommand]
+            named = {field.slot.index for field in row.named_fields.values()}
+            for number, slot in enumerate([slot for slot in row.slots if slot.index in named], 1):
+                (name, *_) = [f.name for f in row.named_fields.values() if f.slot.index == slot.index]
+                part = None if command is None else slot
+                yield Entry(index, number, f"{at}.{name}", slot.size, row, slot, command, part)
+        elif placed.members:
+            subindex = 0
+            for member in placed.members:
+                subindex = member.subindex or subindex + 1
+                yield _entry(icd, member, index, subindex, f"{at}.{member.name.lower()}")
+        elif placed.value is not None or placed.telecommand is not None:
+            yield _entry(icd, placed, index, 0, at)
+        elif placed.parameters:
+            for number, parameter in sorted(icd.parameters_by_id.items()):
+                yield Entry(index, number, f"{at}.{parameter.name}", _bytes_of(parameter.type))
+        for number, packed in enumerate(placed.packed, 1):
+            name = packed.name or packed.source.partition(".")[2]
+            yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type))
+
+
+def _entry(
+    icd: InterfaceDefinition, placed: PlacedMember | PlacedObject, index: int, subindex: int, name: str
+) -> Entry:
+    row, slot, size = None, None, 0
+    if placed.value is not None:
+        row_name, _, field = placed.value.partition(".")
+        row = icd.telemetry[row_name]
+        slot = row.named_fields[field].slot
+        size = slot.size
+    command = None if placed.telecommand is None else icd.telecommands[placed.telecommand]
+    if command is not None:
+        size = size or command.size
+    if isinstance(placed, PlacedMember) and placed.parameter is not None:
+        size = _bytes_of(icd.parameters[placed.parameter].type)
+    return Entry(index, subindex, name, size, row, slot, command)
+
+
+def _bytes_of(type_: str) -> int:
+    return 1 if type_ in ("bool", "enum8") else int(type_[1:]) // 8
+
+
+def canopen_unit_cases(icd: InterfaceDefinition) -> list[Case[CanopenProbe]]:
+    """Make the cases of a unit with CANopen."""
+    layout = read_layout(icd)
+    found = list(entries(icd, layout))
+    return [
+        *_rows(icd, found),
+        *_commands(found),
+        *_records(found),
+        *_limits(found),
+        *_pdos(layout, found),
+    ]
+
+
+def _case(
+    area: str, name: str, title: str, run: Run, clause: str = CLAUSE, *, safe: bool = False
+) -> Case[CanopenProbe]:
+    area = f"canopen.{area}"
+    return Case(f"{area}.{name}", area, title, clause, run, intrusive=not safe)
+
+
+# --- reading and writing ---
+
+
+def _turned(slot: Slot | None, data: bytes) -> bytes:
+    """Change bytes between the order of a slot and that of CANopen, little-endian."""
+    return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
+
+
+def _read(probe: CanopenProbe, entry: Entry) -> bytes:
+    """Read an entry, which must have its size; return it in the order of its row."""
+    data = probe.read(entry.index, entry.subindex)
+    check_equal(len(data), entry.size, f"bytes of {entry.name}h")
+    return _turned(entry.slot, data)
+
+
+def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
+    """Read the entries of a row twice or more, until no new sample has come in between."""
+    seen = [b"", row.encode()]
+    for _ in range(10):
+        data = bytearray(row.encode())
+        for entry in found:
+            if entry.row is row and entry.slot is not None:
+                data[entry.slot.offset : entry.slot.offset + entry.slot.size] = _read(probe, entry)
+        seen.append(bytes(data))
+        if seen[-1] == seen[-2]:
+            break
+    return seen[-1]
+
+
+def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Value]) -> None:
+    """Write an entry that executes a telecommand, which must be taken."""
+    probe.set(entry.index, entry.subindex, _written(entry, command, command.encode(values)))
+
+
+def _written(entry: Entry, command: Row, data: bytes) -> bytes:
+    """Return what is written to an entry to execute a telecommand with this data."""
+    part = command.slots[0] if entry.part is None and len(command.slots) == 1 else entry.part
+    if not data:
+        return b"\x01"
+    return data if part is None else _turned(part, data[part.offset : part.offset + part.size])
+
+
+@contextmanager
+def _seeing(probe: CanopenProbe, found: list[Entry]) -> Iterator[None]:
+    """Have the unit look for stars, if an entry starts that; the mode is put back."""
+    for entry in found:
+        command, field = entry.command, _argument(entry, "mode")
+        if (
+            command is not None
+            and command.action == "set_mode"
+            and field is not None
+            and entry.row is not None
+        ):
+            before = probe.read(entry.index, entry.subindex)
+            _write(probe, entry, command, {field.name: "lost_in_space"})
+            try:
+                yield
+            finally:
+                probe.set(entry.index, entry.subindex, before)
+            return
+    yield
+
+
+def _argument(entry: Entry, name: str) -> Field | None:
+    fields = entry.command.named_fields.values() if entry.command is not None else ()
+    return next((field for field in fields if field.argument == name), None)
+
+
+# --- telemetry ---
+
+
+def _rows(icd: InterfaceDefinition, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    for row in icd.telemetry.values():
+        if not any(entry.row is row for entry in found):
+            continue
+        title = f"the entries of {row.name} have its sizes and values within its limits"
+        yield _case("rows", row.name, title, _values(row, found), clause_of_row(row), safe=True)
+        bound = {field.value: name for name, field in row.named_fields.items() if field.value}
+        if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
+            title = f"{row.name} has a quaternion of length 1 when it is valid"
+            yield _case("attitude", row.name, title, _unit_length(row, bound, found), clause_of_row(row))
+
+
+def _values(row: Row, found: list[Entry]) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        checked_values(row, _read_row(probe, row, found))
+
+    return run
+
+
+def _unit_length(row: Row, bound: dict[str, str], found: list[Entry]) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        with _seeing(probe, found):
+            end = probe.port.now() + ATTITUDE_S
+            while True:
+                seen = checked_values(row, _read_row(probe, row, found))
+                if is_valid(seen[bound["attitude.valid"]]):
+                    break
+                if probe.port.now() > end:
+                    raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
+                probe.wait_for(NOBODY, 0.1)
+        length = sum(float(seen[bound[name]]) ** 2 for name in QUATERNION) ** 0.5
+        check(abs(length - 1.0) < 1e-5, "a quaternion of length 1", f"{length:.7f}")
+
+    return run
+
+
+# --- telecommands ---
+
+
+def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    for entry in found:
+        command = entry.command
+        if command is None or entry.part is not None or entry.size > EXPEDITED:
+            continue
+        if command.action == "reset":
+            title = f"{command.name} restarts the node"
+            mode = next((item for item in found if item.row is not None and _reports(item, "mode")), None)
+            yield _case(
+                "commands", command.name, title, _restarts(entry, command, mode), clause_of_row(command)
+            )
+        elif entry.row is not None and entry.slot is not None:
+            title = f"{entry.name}h reports each value of {command.name} that was written"
+            yield _case("commands", command.name, title, _reported(entry, command), clause_of_row(command))
+        elif command.action in (None, "nothing"):
+            title = f"{command.name} is accepted"
+            run = _accepted(entry, command)
+            yield _case("commands", command.name, title, run, clause_of_row(command))
+
+
+def _accepted(entry: Entry, command: Row) -> Run:
+    return lambda probe: _write(probe, entry, command, command.example())
+
+
+def _restarts(entry: Entry, command: Row, mode: Entry | None) -> Run:
+    """Have the unit restart, and wait until the mode that an entry reports is no longer that of booting."""
+
+    def run(probe: CanopenProbe) -> None:
+        probe.drain()
+        _write(probe, entry, command, command.example())
+        probe.expect_boot_up()
+        end = probe.port.now() + BOOT_S
+        while mode is not None and _value(probe, mode) == "boot":
+            check(probe.port.now() < end, f"the end of booting within {BOOT_S:g} s", "boot")
+            probe.wait_for(NOBODY, 0.1)
+
+    return run
+
+
+def _value(probe: CanopenProbe, entry: Entry) -> Value | None:
+    """Return the value of the first field that an entry reads."""
+    if entry.row is None:
+        return None
+    return entry.row.decode(_read_row(probe, entry.row, [entry]))[_fields(entry)[0].name]
+
+
+def _fields(entry: Entry) -> list[Field]:
+    """Return the fields of telemetry that an entry reads."""
+    fields = () if entry.row is None else entry.row.named_fields.values()
+    return [field for field in fields if entry.slot is not None and field.slot.index == entry.slot.index]
+
+
+def _reports(entry: Entry, *quantities: str) -> bool:
+    """Return whether an entry reads a quantity whose name begins like this."""
+    return any(field.value is not None and field.value.startswith(quantities) for field in _fields(entry))
+
+
+def _reported(entry: Entry, command: Row) -> Run:
+    """Write all values of an enumeration, else both limits; the previous value is put back."""
+    (name, field), *_ = command.named_fields.items()
+    values: list[Value] = list(field.physical_limits) if field.enum is None else list(field.enum.values)
+
+    def run(probe: CanopenProbe) -> None:
+        before = probe.read(entry.index, entry.subindex)
+        for value in values:
+            data = _written(entry, command, command.encode({name: value}))
+            probe.set(entry.index, entry.subindex, data)
+            check_equal(
+                probe.read(entry.index, entry.subindex), data, f"{entry.name}h after writing {value!s}:"
+            )
+        probe.set(entry.index, entry.subindex, before)
+
+    return run
+
+
+def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    """Make the cases of records whose entries set one telecommand together."""
+    for command in {
+        entry.command.name: entry.command for entry in found if entry.command and entry.part
+    }.values():
+        members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
+        title = (
+            f"each entry of {command.name} keeps what was written to it, whatever is written to the others"
+        )
+        yield _case("records", command.name, title, _kept(command, members), clause_of_row(command))
+
+
+def _kept(command: Row, members: list[Entry]) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        before = [probe.read(entry.index, entry.subindex) for entry in members]
+        for end in (1, 0):
+            for entry in members:
+                probe.set(entry.index, entry.subindex, _limit(command, entry, end))
+            for entry in members:
+                seen = probe.read(entry.index, entry.subindex)
+                check_equal(seen, _limit(command, entry, end), f"{entry.name}h after all were written:")
+        for entry, data in zip(members, before, strict=True):
+            probe.set(entry.index, entry.subindex, data)
+
+    return run
+
+
+def _limit(command: Row, entry: Entry, end: int) -> bytes:
+    """Return the bytes of the lowest (0) or highest (1) values of the fields of an entry."""
+    values = dict(command.example())
+    for name, field in command.named_fields.items():
+        if field.kind in ("integer", "float", "bits") and entry.part is not None:
+            values[name] = field.physical_limits[end]
+    return _written(entry, command, command.encode(values))
+
+
+def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    for entry in found:
+        command = entry.command
+        if command is None or entry.size > EXPEDITED:
+            continue
+        for name, field in command.named_fields.items():
+            if entry.part is not None and entry.part.index != field.slot.index:
+                continue
+            for why, data in bad_values(command, field):
+                title = f"{entry.name}h with {name} {why} is refused"
+                run = _refused(entry, _written(entry, command, data))
+                yield _case("limits", f"{command.name}.{name}.{why}", title, run, clause_of_row(command))
+
+
+def _refused(entry: Entry, data: bytes) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        before = probe.read(entry.index, entry.subindex) if entry.row is not None else b""
+        probe.expect_refusal(entry.index, entry.subindex, data, len(data), *VALUE_ABORTS)
+        if entry.row is not None:
+            check_equal(probe.read(entry.index, entry.subindex), before, f"{entry.name}h, unchanged:")
+
+    return run
+
+
+# --- PDOs ---
+
+
+def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    by_name = {entry.name.lower(): entry for entry in found}
+    for first, models in ((0x1400, layout.rpdo), (0x1800, layout.tpdo)):
+        kind = "tpdos" if first == 0x1800 else "rpdos"
+        for number, model in enumerate(models):
+            mapped = [by_name[name.lower()] for name in model.objects]
+            index, label = first + number, f"{kind[:4].upper()} {number + 1} ({model.name})"
+            title = f"{label} has the CAN ID, transmission, timers and mapping of the definition"
+            yield _case(kind, f"{number + 1}.default", title, _default(index, model, mapped), safe=True)
+            if not mapped:
+                continue
+            if first == 0x1800:
+                title = f"{label} carries what its objects read"
+                yield _case(kind, f"{number + 1}.data", title, _carries(index, mapped))
+            if (
+                first == 0x1800
+                and model.enabled
+                and not model.event_ms
+                and any(_reports(entry, *CHANGING) for entry in mapped)
+            ):
+                title = f"{label} is sent as frames are taken"
+                yield _case(kind, f"{number + 1}.frames", title, _sent_with_frames(index, model, found))
+            if first == 0x1400 and model.enabled:
+                yield from _clock(index, model, mapped, found)
+
+
+def _can_id(probe: CanopenProbe, index: int, model: PdoModel) -> int:
+    predefined = PREDEFINED[index & ~0x1FF]
+    number = index & 0x1FF
+    if model.can_id is None:
+        return predefined[number] + probe.node if number < len(predefined) else 0
+    return model.can_id + (probe.node if model.relative else 0)
+
+
+def _default(index: int, model: PdoModel, mapped: list[Entry]) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        at = f"{index:04X}h"
+        flags = 0 if model.enabled else PDO_OFF
+        cob_id = probe.number(index, 1) & ~NO_RTR
+        check_equal(f"{cob_id:08X}", f"{flags | _can_id(probe, index, model):08X}", f"{at}:01h")
+        check_equal(probe.number(index, 2), model.transmission_type, f"{at}:02h, transmission type")
+        if index >= 0x1800:
+            check_equal(probe.number(index, 3), round(model.inhibit_ms * 10), f"{at}:03h, inhibit time")
+        check_equal(probe.number(index, 5), model.event_ms, f"{at}:05h, event timer")
+        count = probe.number(index + 0x200, 0)
+        seen = [f"{probe.number(index + 0x200, number):08X}" for number in range(1, count + 1)]
+        check_equal(seen, [f"{entry.mapping:08X}" for entry in mapped], f"{index + 0x200:04X}h")
+
+    return run
+
+
+def _carries(index: int, mapped: list[Entry]) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        probe.quiet()
+        identifier = probe.number(index, 1) & 0x7FF
+        probe.set(index, 2, SYNCHRONOUS, 1)
+        probe.set(index, 1, NO_RTR | identifier)
+        probe.command(START)
+
+        def read() -> bytes:
+            return b"".join(probe.read(entry.index, entry.subindex) for entry in mapped)
+
+        for _ in range(10):  # until nothing has changed between the readings
+            before = read()
+            probe.drain()
+            send_sync(probe)
+            data, after = probe.expect(identifier, "TPDO after a SYNC"), read()
+            if before == after:
+                break
+        check_equal(data, after, "data")
+
+    return run
+
+
+def _sent_with_frames(index: int, model: PdoModel, found: list[Entry]) -> Run:
+    def run(probe: CanopenProbe) -> None:
+        with _seeing(probe, found):
+            probe.command(START)
+            identifier = _can_id(probe, index, model)
+            times = [probe.expect(identifier, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
+        probe.command(PRE_OPERATIONAL)
+        check_equal(len(times), 3, "TPDOs")
+
+    return run
+
+
+def _clock(
+    index: int, model: PdoModel, mapped: list[Entry], found: list[Entry]
+) -> Iterator[Case[CanopenProbe]]:
+    """Make the case of an RPDO that sets the clock, if an entry reads it."""
+    clock = next((item for item in found if _reports(item, "clock.seconds")), None)
+    (entry, *others) = mapped
+    seconds = _argument(entry, "seconds")
+    if (
+        clock is None
+        or others
+        or entry.command is None
+        or seconds is None
+        or entry.command.action != "set_clock"
+    ):
+        return
+    command, name, reading = entry.command, seconds.name, clock
+
+    def run(probe: CanopenProbe) -> None:
+        def read() -> int:
+            return probe.number(reading.index, reading.subindex)
+
+        def send(value: int) -> None:
+            probe.send(_can_id(probe, index, model), command.encode({**command.example(), name: value}))
+
+        before, began = read(), probe.port.now()
+        probe.command(START)
+        send(CLOCK_S)
+        seen = read()
+        send(before + round(probe.port.now() - began))
+        check(0 <= seen - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", seen)
+
+    title = f"RPDO {(index & 0x1FF) + 1} ({model.name}) sets the clock"
+    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, clause_of_row(command))

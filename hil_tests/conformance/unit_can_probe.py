@@ -1,0 +1,50 @@
+"""The tester's side of any unit on CAN with the CubeSpace layout of CAN IDs, by its definition."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from starhil.hil_tests.conformance.can_probe import CanWire
+from starhil.hil_tests.conformance.case import CaseFailed
+from starhil.hil_tests.conformance.link_probe import Answer, AnswerKind
+from starhil.hil_tests.conformance.unit_probe import UnitProbe
+from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
+
+KINDS: Final[dict[AnswerKind, ReplyKind]] = {
+    "ack": ReplyKind.ACK,
+    "nack": ReplyKind.NACK,
+    "telemetry": ReplyKind.TELEMETRY,
+    "burst": ReplyKind.BURST,
+    "unsolicited": ReplyKind.UNSOLICITED,
+}
+
+
+class CanUnitProbe(CanWire, UnitProbe):
+    """Asks a unit for its rows over a CAN bus."""
+
+    def post(self, request: Request, *, answered: bool = True) -> None:  # noqa: ARG002 -- answers name their row
+        """Send a request without waiting."""
+        self.post_as(self.host, request.id, request.data)
+
+    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+        """Return the next reply, None if none comes in time."""
+        answer = self.next_answer(timeout_s)
+        if answer.kind == "none":
+            return None
+        if answer.kind == "malformed":
+            return LinkFault(FaultKind.CAN_TYPE, answer.data.hex(" "))
+        return _reply(answer)
+
+    def unsolicited_replies(self, seconds: float) -> list[Reply]:
+        """Return the messages of unsolicited telemetry that come within a time."""
+        return [_reply(answer) for answer in self.receive_unsolicited(seconds)]
+
+    def expect_silence(self, why: str, seconds: float | None = None) -> None:
+        """Fail the case if anything comes within a time."""
+        answer = self.unexpected_answer(self.times.quiet_s if seconds is None else seconds)
+        if answer.kind != "none":
+            raise CaseFailed(f"nothing ({why})", str(answer))
+
+
+def _reply(answer: Answer) -> Reply:
+    return Reply(KINDS[answer.kind], answer.identifier, answer.data, answer.code)
