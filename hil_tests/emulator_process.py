@@ -33,6 +33,7 @@ def emulator_command(
     unit: str | None = None,
     serial: str = "auto",
     can: str = "off",
+    dialect: str | None = None,
     seed: int | None = None,
     settings: Sequence[str] = (),
     state_dir: Path | None = None,
@@ -46,6 +47,8 @@ def emulator_command(
     if unit is not None:
         command += ["--unit", unit]
     command += ["--serial", serial, "--can", can]
+    if dialect is not None:
+        command += ["--dialect", dialect]
     if seed is not None:
         command += ["--seed", str(seed)]
     for setting in settings:

@@ -71,6 +71,7 @@ def starhil_emulator(
             unit=request.config.getoption("--starhil-unit"),
             serial="auto",
             can=channel,
+            dialect=request.config.getoption("--starhil-dialect"),
             seed=request.config.getoption("--starhil-seed"),
             state_dir=folder / "state",
             truth_log=folder / "truth.csv",

@@ -207,6 +207,7 @@ def _emulator(
             unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
+            dialect=options.dialect,
             seed=wanted.seed,
             settings=wanted.settings,
             state_dir=state,

@@ -238,8 +238,8 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
         unit=request.unit,
         serial="off" if request.serial is None else request.serial,
         can=channel,
+        dialect=request.dialect,
         seed=1,
-        settings=[] if request.dialect is None else [f"links.serial.dialect={request.dialect}"],
         state_dir=folder,
         extra=extra,
     )

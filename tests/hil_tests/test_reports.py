@@ -80,6 +80,18 @@ def test_a_port_where_nothing_answers_ends_the_conformance_run_with_its_reports(
     assert f"not run: nothing answers on {port}" in html.read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    ("module", "words"), [(session_run, ("session", "first_light")), (conformance_run, ("conformance",))]
+)
+def test_an_emulator_started_for_a_run_speaks_the_dialect_of_the_run(module, words, monkeypatch):
+    def refuse(command):
+        raise BenchError(" ".join(command))
+
+    monkeypatch.setattr(module, "EmulatorProcess", refuse)
+    outcome = run_command(*words, "--start", "--serial", "auto", "--dialect", "c")
+    assert " --dialect c " in str(outcome.exception)
+
+
 def test_a_report_into_a_device_leaves_the_device(tmp_path):
     null, full = tmp_path / "null", tmp_path / "full"
     null.symlink_to("/dev/null")
