@@ -14,8 +14,6 @@ from starhil.emulator.cli.options import DIALECTS, AsJson, DeviceAddress, Serial
 from starhil.emulator.cli.output import output_help, prepare_output
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
-_MIN_TABLE_WIDTH: Final = 134
-
 Column: TypeAlias = tuple[str, Callable[[Any], str]]
 """Heading of a table's column, and how a row is shown in it."""
 
@@ -31,15 +29,17 @@ def _progress() -> Callable[[str], None]:
     return Console(stderr=True).print
 
 
-def _print_table(columns: Sequence[Column], rows: Iterable[Any], *, min_width: int = 0) -> None:
+def _print_table(columns: Sequence[Column], rows: Iterable[Any]) -> None:
+    """Print a table in its full width, also where the terminal is narrower."""
+    from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(*(heading for heading, _ in columns))
+    table = Table(*(heading for heading, _ in columns), box=SIMPLE)
     for row in rows:
         table.add_row(*(show(row) for _, show in columns))
     console = Console()
-    console.width = max(console.width, min_width)
+    console.width = max(console.width, Console(width=1000).measure(table).maximum)
     console.print(table)
 
 
@@ -314,7 +314,7 @@ def identify(
     if as_json:
         print(json.dumps(answer))
         return
-    _print_table(_IDENTIFY_COLUMNS, answer["rows"], min_width=_MIN_TABLE_WIDTH)
+    _print_table(_IDENTIFY_COLUMNS, answer["rows"])
     for name, why in answer["skipped"].items():
         print(f"{name}: skipped, {why}")
 
