@@ -171,7 +171,7 @@ def write_whole(path: Path, data: bytes) -> None:
         It cannot be written.
     """
     if _is_stdout(path):
-        # the descriptor itself: a file behind it, opened anew, would be written from its beginning
+        # the descriptor itself: a file opened again by its name would be written from its beginning
         sys.stdout.flush()
         with os.fdopen(os.dup(_STDOUT), "wb") as stream:
             stream.write(data)
