@@ -1,0 +1,195 @@
+"""The console's OBC: telecommands, rows read, the session and the candump log that are saved, units and their links."""
+
+import asyncio
+import tomllib
+from types import SimpleNamespace
+
+import pytest
+
+from starhil.emulator.console.obc import ConsoleObc, Exchange
+from starhil.hil_tests.script import load_script
+from starhil.protocol.candump import parse_candump
+from starhil.protocol.icd import load_unit
+from tests.emulator.console.pages import OPTIONS, Page
+
+LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
+
+
+def test_a_telecommand_goes_over_a_link_and_its_outcome_comes_back(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            shown = await page.ask(do="encode", row="set_mode", values={"mode": "lost_in_space"})
+            assert shown["serial"] == "1F 7F 60 02 1F FF"
+            assert shown["cansend"] == ["0160FD04#02"]
+            sent = await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
+            assert sent["outcome"] == "ok"
+            assert sent["latency_ms"] > 0
+            assert emulation.device.counters.telecommands == 1
+            assert emulation.device.modes.mode == "lost_in_space"
+            refused = await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
+            assert (refused["outcome"], refused["refused"]) == ("invalid_parameter", True)
+            problem = await page.ask(do="encode", row="set_update_rate", values={"rate": "500"})
+            assert "set_update_rate.rate: 500.0 is outside 0.01 to 100 Hz" in problem["problem"]
+            wrong = await page.ask(do="send", row="set_update_rate", values={"rate": "fast"})
+            assert wrong["error"] == "rate: 'fast' is not a number"
+            assert (await page.ask(do="send", row="no_such", values={}))[
+                "error"
+            ] == "no_such: no such telecommand"
+            assert emulation.device.counters.telecommands == 2
+
+    run(scenario, options=OPTIONS)
+
+
+def test_only_the_rows_that_a_page_shows_are_read(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            assert emulation.device.counters.telemetry == 0
+            await page.ask(do="subscribe", rows=["device_status", "quaternion", "no_such_row"])
+            status = await page.message("telemetry", lambda item: item["row"] == "device_status")
+            assert status["values"]["mode"] == "standby"
+            await page.message("telemetry", lambda item: item["row"] == "quaternion")
+            assert {item["row"] for item in page.messages if item["type"] == "telemetry"} == {
+                "device_status",
+                "quaternion",
+            }
+
+    run(scenario, options=OPTIONS)
+
+
+def test_what_the_console_sent_is_a_session_script(run, tmp_path):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            assert "nothing was sent yet" in await page.get("/session.toml")
+            await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
+            await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
+            await page.ask(do="send", row="clear_counters", values={})
+            await page.ask(do="read", row="device_status")
+            path = tmp_path / "session.toml"
+            path.write_text(await page.get("/session.toml"))
+            script = load_script(path, load_unit())
+            mode, rate, *others = [step for step in script.steps if not step.name.startswith("wait")]
+            assert mode.action.values == {"mode": "lost_in_space"}
+            assert rate.action.refused == "invalid_parameter"
+            assert len(others) == 2
+            await page.ask(do="clear_session")
+            assert "nothing was sent yet" in await page.get("/session.toml")
+
+    run(scenario, options=OPTIONS)
+
+
+class SlowClient:
+    """An OBC whose device answers after a while."""
+
+    def __init__(self, clock):
+        self.clock = clock
+
+    async def exchange(self, _row, _data):
+        self.clock.now_s += 0.8
+        return Exchange("ok", latency_s=0.8)
+
+
+def test_a_pause_between_two_telecommands_is_a_step_and_a_slow_reply_is_none():
+    clock = SimpleNamespace(now_s=100.0)
+    obc = ConsoleObc(SlowClient(clock), load_unit(), lambda: clock.now_s)
+
+    async def scenario():
+        await obc.send("clear_counters", {})
+        await obc.send("clear_counters", {})
+        clock.now_s += 1.5
+        await obc.send("clear_counters", {})
+
+    asyncio.run(scenario())
+    steps = tomllib.loads(obc.session("Pauses"))["step"]
+    assert steps == [
+        {"command": "clear_counters"},
+        {"command": "clear_counters"},
+        {"wait_s": 1.5},
+        {"command": "clear_counters"},
+    ]
+
+
+def test_the_wire_is_decoded_for_those_who_look_and_saved_as_a_candump_log(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", wire=True)
+            peer = open(emulation.ready_fields["serial"], "r+b", buffering=0)  # noqa: PTH123, SIM115
+            peer.write(bytes.fromhex("1F7FE61FFF"))
+            request = await page.message(
+                "wire", lambda item: any("quaternion?" in line["text"] for line in item["lines"])
+            )
+            line = next(line for line in request["lines"] if "quaternion?" in line["text"])
+            assert (line["bus"], line["out"], line["raw"]) == ("serial", False, "1F 7F E6 1F FF")
+            await page.message(
+                "wire", lambda item: any(line["text"].startswith("quaternion q_x") for line in item["lines"])
+            )
+            peer.close()
+
+    run(scenario, options=OPTIONS)
+
+
+def test_the_candump_log_has_the_frames_of_the_bus(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", wire=True)
+            await page.ask(do="send", row="clear_counters", values={})
+            text = await page.get("/wire.log")
+            ids = [parse_candump(line)[1].id for line in text.splitlines()]
+            assert ids == [0x0167FD04, 0x026704FD]
+
+    run(
+        scenario,
+        options=OPTIONS,
+        links={"serial": {"port": "off"}, "can": {"channel": "virtual:console-test"}},
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "links"),
+    [
+        ("sagitta", {"serial": {"port": "auto"}}),
+        ("st16", {"serial": {"port": "auto"}}),
+        ("cubestar-gen2", {"can": {"channel": "virtual:console-unit"}}),
+        ("oresat", {"can": {"channel": "virtual:console-unit"}}),
+        ("oresat", {}),
+    ],
+)
+def test_a_unit_of_any_kind_is_reached_over_the_link_that_it_has(run, unit, links):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            hello = page.messages[0]
+            assert hello["unit"]["name"] == emulation.icd.name
+            for row in hello["telemetry"][:3]:
+                answer = await page.ask(do="read", row=row["name"])
+                assert answer["outcome"] == "ok"
+                assert answer["values"]
+
+    run(scenario, options=OPTIONS, unit=unit, links={**LINKS_OFF, **links})
+
+
+def test_a_unit_with_canopen_only_is_commanded_by_sdo(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            shown = await page.ask(do="encode", row="set_status", values={"status": "4"})
+            assert (shown["serial"], shown["cansend"]) == ("", ["62C#2F00400004000000"])
+            await page.ask(do="subscribe", wire=True)
+            assert (await page.ask(do="send", row="set_status", values={"status": "4"}))["outcome"] == "ok"
+            assert emulation.device.modes.mode == "lost_in_space"
+            traced = await page.message("wire", lambda item: item["lines"])
+            assert traced["lines"][0]["raw"] == shown["cansend"][0]
+            refused = await page.ask(do="send", row="set_status", values={"status": "77"})
+            assert (refused["outcome"], refused["refused"]) == ("invalid_parameter", True)
+            assert (await page.ask(do="read", row="status"))["values"] == {"status": "lost_in_space"}
+
+    run(
+        scenario,
+        options=OPTIONS,
+        unit="oresat",
+        links={**LINKS_OFF, "can": {"channel": "virtual:console-sdo"}},
+    )
