@@ -19,8 +19,10 @@ from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
-from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area, add_earth, add_glare
+from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area
+from starhil.emulator.sky.light_grid import add_glare
 from starhil.emulator.sky.objects import PointSource, SkyObjects
+from starhil.emulator.sky.wide_earth import add_earth
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, companions

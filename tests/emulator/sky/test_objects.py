@@ -10,8 +10,10 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sky.directions import icrs_vector
-from starhil.emulator.sky.light import AreaPainter, add_area, add_earth, add_glare
+from starhil.emulator.sky.light import AreaPainter, add_area
+from starhil.emulator.sky.light_grid import add_glare
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
+from starhil.emulator.sky.wide_earth import add_earth
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
