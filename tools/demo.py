@@ -181,7 +181,8 @@ def main() -> int:
     begin = time.monotonic()
     try:
         with EmulatorProcess(command, ready_within_s=READY_WITHIN_S) as emulator:
-            console.print(f"Emulator ready after {time.monotonic() - begin:.1f} s: {emulator.ready}")
+            where = " ".join(f"{key}={value}" for key, value in emulator.ready.items())
+            console.print(f"Emulator ready after {time.monotonic() - begin:.1f} s: {where}")
             legs = (
                 Leg("demo_serial", "serial", emulator.ready["serial"]),
                 Leg("demo_can", "can", emulator.ready["can"]),
