@@ -201,6 +201,10 @@ def main() -> int:
     console.print(
         f"Images: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_512.png; logs in the same folders."
     )
+    console.print(
+        "Next: .venv/bin/starhil run --serial auto --can off, then open the port of its ready line with your OBC software; "
+        "with --view, a page shows what it sees."
+    )
     return 0 if good else 1
 
 
