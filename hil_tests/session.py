@@ -110,26 +110,33 @@ class SessionRunner:
         self._truth_log = None if path is None else TruthLogReader(path)
 
     def run(self) -> SessionResult:
-        """Run all steps; after a failed one skip the rest unless the script sets `keep_going`."""
+        """Run all steps; after a failed one skip the rest unless the script sets `keep_going`.
+
+        A signal, whether it comes in a step or while a result is shown, ends the run; what has
+        run keeps its result.
+        """
         begin = time.monotonic()
+        planned = [(step, link) for step in self._script.steps for link in self._links_of(step)]
         results: list[StepResult] = []
-        reason = ""
         interruption = None
-        for step in self._script.steps:
-            for link in self._links_of(step):
-                if reason:
-                    result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
-                else:
-                    try:
-                        result = self._run_step(step, link)
-                    except Interrupted as signalled:
-                        interruption = signalled
-                        reason = f"not run: {signalled.reason}"
-                        result = StepResult(step.number, step.name, link, SKIPPED, reason, 0.0)
-                if result.status == FAILED and not self._script.keep_going:
-                    reason = "an earlier step failed"
-                results.append(result)
-                self._on_result(result)
+
+        def record(result: StepResult) -> None:
+            results.append(result)
+            self._on_result(result)
+
+        def skip_rest(reason: str) -> None:
+            for step, link in planned[len(results) :]:
+                record(StepResult(step.number, step.name, link, SKIPPED, reason, 0.0))
+
+        try:
+            for step, link in planned:
+                record(self._run_step(step, link))
+                if results[-1].status == FAILED and not self._script.keep_going:
+                    break
+            skip_rest("an earlier step failed")
+        except Interrupted as signalled:
+            interruption = signalled
+            skip_rest(f"not run: {signalled.reason}")
         return SessionResult(self._script.title, tuple(results), time.monotonic() - begin, interruption)
 
     def _links_of(self, step: Step) -> tuple[str, ...]:

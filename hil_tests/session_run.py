@@ -114,10 +114,12 @@ def run_session(request: SessionRequest) -> SessionResult:
         )
         show(end)
         result = replace(result, results=(*result.results, end))
-    except Interrupted as interruption:  # before the first step
-        reason = f"not run: {interruption.reason}"
-        skipped = tuple(StepResult(step.number, step.name, "", SKIPPED, reason, 0.0) for step in script.steps)
-        result = SessionResult(script.title, skipped, 0.0, interruption)
+    except Interrupted as interruption:  # before the first step, or after the last one
+        if result is None:
+            reason = f"not run: {interruption.reason}"
+            skipped = (StepResult(step.number, step.name, "", SKIPPED, reason, 0.0) for step in script.steps)
+            result = SessionResult(script.title, tuple(skipped), 0.0)
+        result = replace(result, interruption=interruption)
     if request.junit is not None:
         write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
     if not request.quiet:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
 import threading
 from xml.etree import ElementTree as ET
 
@@ -14,10 +15,11 @@ from starhil.emulator.cli.app import build_app
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.bench import Bench, LinkOptions
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import SessionRunner
-from starhil.hil_tests.session_run import _printer
+from starhil.hil_tests.session_run import SessionRequest, _printer, run_session
 from starhil.protocol.candump import read_candump
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
@@ -154,6 +156,42 @@ def test_after_a_failed_step_the_rest_is_skipped_unless_told_otherwise(device, t
     with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
         result = SessionRunner(load_script(path, ICD), bench, tmp_path).run()
     assert [item.status for item in result.results] == ["failed", "skipped"]
+
+
+@pytest.mark.parametrize("moment", [0, 1])
+def test_what_has_run_keeps_its_result_when_a_signal_comes_as_it_is_shown(device, tmp_path, moment):
+    path = tmp_path / "s.toml"
+    path.write_text("[[step]]\nread = 'rates'\n" * 3)
+    shown = []
+
+    def show(result):
+        shown.append(result)
+        if len(shown) == moment + 1:
+            raise Interrupted(signal.SIGTERM)
+
+    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
+        result = SessionRunner(load_script(path, ICD), bench, tmp_path, on_result=show).run()
+    assert [item.status for item in result.results] == ["passed"] * (moment + 1) + ["skipped"] * (2 - moment)
+    assert result.results[-1].detail == "not run: interrupted by SIGTERM"
+    assert result.interruption is not None
+    assert shown == list(result.results)
+
+
+def test_a_signal_after_the_last_step_loses_no_result(device, tmp_path, monkeypatch):
+    script, junit = tmp_path / "s.toml", tmp_path / "j.xml"
+    script.write_text("[[step]]\nread = 'rates'\n")
+    close = Bench.close_clients
+
+    def interrupted_close(bench):
+        close(bench)
+        raise Interrupted(signal.SIGTERM)
+
+    monkeypatch.setattr(Bench, "close_clients", interrupted_close)
+    options = LinkOptions(serial=device.open_serial())
+    result = run_session(SessionRequest(script, options=options, folder=tmp_path, junit=junit, quiet=True))
+    assert [item.status for item in result.results] == ["passed"]
+    assert not result.passed
+    assert ET.parse(junit).getroot().get("skipped") == "0"
 
 
 def test_captured_values_are_used_later(play, device):
