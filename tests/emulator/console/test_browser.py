@@ -218,12 +218,14 @@ def test_nothing_leaves_the_window_at_any_size(page):
 
 
 def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
-    """Frames as of eight hours at 5 Hz pass through the page's store."""
+    """Frames as of eight hours at 5 Hz pass through a store of the page's kind, which nobody draws from."""
     kept = page.evaluate(
         """() => {
-            const { store } = starhil;
+            const { hello } = starhil.store;
+            const store = new starhil.store.constructor();
+            store.message(hello);
             const blob = new Blob([new Uint8Array(16)]);
-            const width = store.hello.columns.length;
+            const width = hello.columns.length;
             const begin = store.now + 1;
             let most = 0;
             for (let number = 0; number < 8 * 3600 * 5; number++) {
@@ -242,8 +244,24 @@ def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
     assert kept["rows"] == 36_000
     assert kept["numbers"] == 72_000
     assert kept["most"] <= 62 + 721
-    page.reload()
-    page.wait_for_selector("#link[data-state=connected]")
+
+
+def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    said, painted = page.evaluate(
+        """async () => {
+            const { store, sky } = starhil;
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            const { time, head } = store.image;
+            store.images.push({ time: time + 1e-6, head, blob: new Blob([new Uint8Array(16)]) });
+            await sky.show();
+            return [sky.notice.innerText, sky.painted];
+        }"""
+    )
+    assert said == "this image cannot be decoded"
+    page.wait_for_function("painted => starhil.sky.painted > painted", arg=painted)
+    assert not page.locator("#no-frame").is_visible()
 
 
 def test_a_wrong_token_and_another_origin_get_403(emulator):
