@@ -12,8 +12,8 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Final, Self
 from urllib.parse import unquote
 
@@ -41,23 +41,19 @@ def emulator_command(
     extra: Sequence[str] = (),
 ) -> list[str]:
     """Return the command line of an emulator that ends with this process."""
-    command = [*_starhil_command(), "run"]
-    if profile is not None:
-        command.append(profile)
-    if unit is not None:
-        command += ["--unit", unit]
-    command += ["--serial", serial, "--can", can]
-    if dialect is not None:
-        command += ["--dialect", dialect]
-    if seed is not None:
-        command += ["--seed", str(seed)]
-    for setting in settings:
-        command += ["--set", setting]
-    if state_dir is not None:
-        command += ["--state-dir", str(state_dir)]
-    if truth_log is not None:
-        command += ["--truth-log", str(truth_log), "--overwrite"]
-    return [*command, *extra]
+    options = {
+        "--unit": unit,
+        "--serial": serial,
+        "--can": can,
+        "--dialect": dialect,
+        "--seed": seed,
+        "--state-dir": state_dir,
+        "--truth-log": truth_log,
+    }
+    given = [(name, str(value)) for name, value in options.items() if value is not None]
+    given += [("--set", setting) for setting in settings]
+    command = [*_starhil_command(), "run", *([] if profile is None else [profile]), *chain(*given)]
+    return [*command, *([] if truth_log is None else ["--overwrite"]), *extra]
 
 
 def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
@@ -285,18 +281,12 @@ class EmulatorProcess:
     def memory_bytes(self) -> int:
         """Return the resident memory of the process and its workers, bytes."""
         group = self.process.pid
-        total = 0
-        for folder in Path("/proc").iterdir():
-            if folder.name.isdigit():
-                total += _resident(folder, group)
-        return total
+        return sum(_resident(folder, group) for folder in Path("/proc").iterdir() if folder.name.isdigit())
 
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
         if kind is None:
             self.stop()
         else:
