@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel
-from starhil.protocol.values import IcdError
+from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel, Order
+from starhil.protocol.values import SCALAR_SIZES, IcdError
 
-ByteOrder = Literal["little", "big"]
-
-SIZES: Final = {
-    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "bits8": 1, "bits16": 2, "bits32": 4,
-}  # fmt: skip
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around in their field."""
 NANOSECONDS: Final = 1_000_000_000
@@ -39,7 +34,7 @@ class HeaderField:
 
     role: str | None
     size: int
-    order: ByteOrder
+    order: Order
     signed: bool
     const: int | None
     default: int
@@ -103,7 +98,7 @@ class Header:
     def __init__(
         self,
         models: Sequence[HeaderFieldModel],
-        byte_order: ByteOrder,
+        byte_order: Order,
         class_of: Callable[[int], str],
         overhead: Mapping[str, int],
         where: str,
@@ -219,8 +214,8 @@ def _bit_value(bit: _Bit, values: Mapping[str, int]) -> int:
     return value
 
 
-def _field(model: HeaderFieldModel, byte_order: ByteOrder, where: str) -> HeaderField:
-    size = SIZES[model.type]
+def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderField:
+    size = SCALAR_SIZES[model.type.replace("bits", "u")]
     if bool(model.bits) != model.type.startswith("bits"):
         raise IcdError(f"{where}: types bits8, bits16 and bits32 have `bits`, the other types have none")
     if model.role in ("ticks", "time") and round(model.scale * NANOSECONDS) < 1:

@@ -24,7 +24,7 @@ from starhil.hil_tests.conformance.unit_cases import ATTITUDE_S, CLOCK_S, QUATER
 from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedMember, PlacedObject, read_layout
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import Value
+from starhil.protocol.values import SCALAR_SIZES, Value
 
 PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
 """CAN IDs of the first four RPDOs and TPDOs, to which the node-ID is added (CiA 301 7.3.5)."""
@@ -115,7 +115,7 @@ def _entry(
 
 
 def _bytes_of(type_: str) -> int:
-    return 1 if type_ in ("bool", "enum8") else int(type_[1:]) // 8
+    return SCALAR_SIZES.get(type_, 1)
 
 
 def canopen_unit_cases(icd: InterfaceDefinition) -> list[Case[CanopenProbe]]:

@@ -137,7 +137,7 @@ def bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
         return bytes(good[: field.offset] + raw + good[field.offset + field.size :])
 
     if field.kind == "float":
-        form = ("<" if field.slot.order == "little" else ">") + ("f" if field.type == "f32" else "d")
+        form = field.slot.format
         yield "nan", with_raw(struct.pack(form, math.nan))
         yield "infinite", with_raw(struct.pack(form, math.inf))
         low, high = field.physical_limits

@@ -78,8 +78,7 @@ def marks(icd: InterfaceDefinition) -> bytes:
     link = icd.link.serial
     match link.framing if link is not None else None:
         case SlipFraming() as framing:
-            pair = framing.substitutes or (0xDC, 0xDD)
-            return bytes((framing.end, framing.escape, *pair))
+            return bytes((framing.end, framing.escape, *framing.escaped))
         case EscapedFraming() as framing:
             return bytes((framing.escape, framing.start, framing.end))
         case DelimitedFraming() as framing:
@@ -402,8 +401,7 @@ def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
         case "enum":
             return rng.choice(list(field.enum.values)) if field.enum is not None else 0
         case "float":
-            order = "<" if field.slot.order == "little" else ">"
-            (value,) = struct.unpack(order + ("f" if field.type == "f32" else "d"), pattern)
+            (value,) = struct.unpack(field.slot.format, pattern)
             low, high = field.physical_limits
             return float(min(max(value, low), high)) if abs(value) < 1e30 else 0.0
         case _:

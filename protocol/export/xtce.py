@@ -100,7 +100,7 @@ def _commands(parent: ET.Element, icd: InterfaceDefinition) -> None:
                     _type(types, "Argument", name, field)
                     about = {"name": field.name, "argumentTypeRef": f"{name}_type"}
                     if field.default is not None:
-                        about["initialValue"] = _initial(field)
+                        about["initialValue"] = str(field.default)
                     ET.SubElement(listed, "Argument", about | _short(meaning(row, field)))
         container = ET.SubElement(command, "CommandContainer", {"name": f"{row.name}_packet"})
         entries = ET.SubElement(container, "EntryList")
@@ -205,10 +205,6 @@ def _unit(kind: ET.Element, field: Field) -> None:
     units = ET.SubElement(kind, "UnitSet")
     if field.unit:
         ET.SubElement(units, "Unit").text = field.unit
-
-
-def _initial(field: Field) -> str:
-    return str(field.default)
 
 
 def _bits(field: Field) -> int:
