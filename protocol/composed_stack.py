@@ -54,27 +54,21 @@ class _Classes:
 
     classes: Sequence[MessageClass]
     by_name: dict[str, MessageClass] = field(init=False)
-    _requests: dict[int, str] = field(init=False)
-    _replies: dict[int, str] = field(init=False)
+    requests: dict[int, str] = field(init=False)
+    replies: dict[int, str] = field(init=False)
     _unsolicited: set[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.by_name = {item.name: item for item in self.classes}
         coded = [item for item in self.classes if item.code is not None]
-        self._requests = {item.code: item.name for item in coded if item.code is not None}
-        self._replies = {}
+        self.requests = {item.code: item.name for item in coded if item.code is not None}
+        self.replies = {}
         self._unsolicited = set()
         for item in coded:
-            self._replies[self.reply_code(item.name, unsolicited=False)] = item.name
+            self.replies[self.reply_code(item.name, unsolicited=False)] = item.name
             if item.unsolicited is not None:
-                self._replies[item.unsolicited] = item.name
+                self.replies[item.unsolicited] = item.name
                 self._unsolicited.add(item.unsolicited)
-
-    def of_request(self, code: int) -> str:
-        return self._name(self._requests, code)
-
-    def of_reply(self, code: int) -> str:
-        return self._name(self._replies, code)
 
     def unsolicited(self, code: int | None) -> bool:
         return code in self._unsolicited
@@ -92,12 +86,6 @@ class _Classes:
         if item is None or item.code is None:
             raise ProtocolError(f"class {name!r} has no code on this link")
         return item
-
-    @staticmethod
-    def _name(names: Mapping[int, str], code: int) -> str:
-        if code not in names:
-            raise HeaderError(f"no class with code {code}")
-        return names[code]
 
 
 class ComposedStack(SerialStack):
@@ -140,10 +128,10 @@ class ComposedStack(SerialStack):
             self._rows_by_id.setdefault(row.id, row)
         overhead = {"start": len(self.framing.start), "check": self.check.size, "end": len(self.framing.end)}
         self.request_header: Final = Header(
-            link.request_header, byte_order, self.classes.of_request, overhead, "link.serial.request_header"
+            link.request_header, byte_order, self.classes.requests, overhead, "link.serial.request_header"
         )
         self.reply_header: Final = Header(
-            link.reply_header, byte_order, self.classes.of_reply, overhead, "link.serial.reply_header"
+            link.reply_header, byte_order, self.classes.replies, overhead, "link.serial.reply_header"
         )
         self._check_headers()
         longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -87,8 +87,8 @@ class Header:
         Fields as in the definition.
     byte_order
         That of the unit.
-    class_of
-        Returns the name of the class with this code; raises HeaderError.
+    classes
+        Name of the class of each code.
     overhead
         Bytes of `start`, `check` and `end`, for what a length may count.
     where
@@ -99,14 +99,14 @@ class Header:
         self,
         models: Sequence[HeaderFieldModel],
         byte_order: Order,
-        class_of: Callable[[int], str],
+        classes: Mapping[int, str],
         overhead: Mapping[str, int],
         where: str,
     ) -> None:
         self.fields: Final = tuple(
             _field(model, byte_order, f"{where}: {number}") for number, model in enumerate(models, 1)
         )
-        self._class_of = class_of
+        self._classes = classes
         self._overhead = overhead
         self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
         """Roles that the header carries, in messages of any class."""
@@ -135,11 +135,8 @@ class Header:
 
     def length(self, header_size: int, data_size: int) -> int:
         """Return the value of the length field in a message of these sizes."""
-        return self._counted(self._length_field, header_size, data_size)
-
-    @property
-    def _length_field(self) -> HeaderField:
-        return next(field for field in self.fields if field.role == "length")
+        field = next(field for field in self.fields if field.role == "length")
+        return self._counted(field, header_size, data_size)
 
     def pack(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
         """Return the header of a message with this much data.
@@ -186,7 +183,9 @@ class Header:
                 if bit.role is not None:
                     values[bit.role] = found
             if "class" in values and not klass:
-                klass = self._class_of(values["class"])
+                if values["class"] not in self._classes:
+                    raise HeaderError(f"no class with code {values['class']}")
+                klass = self._classes[values["class"]]
             position += field.size
         return Envelope(values, position, klass)
 

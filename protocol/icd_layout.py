@@ -98,7 +98,6 @@ class Layout:
             slot = self._scalar_slot(type_, model.order)
         self._check_numbers(model, where)
         enum, aliases = self._enumeration(model, where, named=type_.startswith("enum"))
-        bound = _minimum_maximum(model)
         return Field(
             name=model.name + suffix if model.name else "",
             kind=_kind(model, type_, enum),
@@ -106,8 +105,8 @@ class Layout:
             unit=model.unit,
             scale=model.scale,
             bias=model.offset,
-            minimum=bound[0],
-            maximum=bound[1],
+            minimum=model.min if model.const is None else model.const,
+            maximum=model.max if model.const is None else model.const,
             enum=enum,
             default=_default(model.default, enum, where),
             parameter=self._definitions.check_parameter(model.parameter, model.unit, where),
@@ -252,10 +251,6 @@ def _kind(model: FieldModel, type_: str, enum: EnumDefinition | None) -> FieldKi
         return "enum"
     kinds: dict[str, FieldKind] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
     return kinds.get(type_, "integer")
-
-
-def _minimum_maximum(model: FieldModel) -> tuple[float | None, float | None]:
-    return (model.min, model.max) if model.const is None else (model.const, model.const)
 
 
 def _numbered(name: str | None, number: int | None, where: str) -> str | None:

@@ -218,6 +218,3 @@ def write_back(probe: CanopenProbe) -> None:
         probe.set(item.index, item.subindex, before)
     if not found:
         raise CaseSkipped("the EDS has no object that takes its limits")
-
-
-CASES: Final = (*OD.cases,)

@@ -277,6 +277,3 @@ def server_parameter(probe: CanopenProbe) -> None:
     probe.require(0x1200)
     check_equal(probe.number(0x1200, 1), 0x600 + probe.node, "1200h:01h")
     check_equal(probe.number(0x1200, 2), 0x580 + probe.node, "1200h:02h")
-
-
-CASES: Final = (*SDO.cases,)

@@ -299,6 +299,3 @@ def download_abort(probe: CanopenProbe) -> None:
 def download_refused(probe: CanopenProbe) -> None:
     probe.expect_abort("c2 00 10 00 04 00 00 00", Abort.READ_ONLY)
     probe.expect_abort("c2 05 00 00 04 00 00 00", Abort.NO_OBJECT)
-
-
-CASES: Final = (*SDO_BLOCK.cases,)

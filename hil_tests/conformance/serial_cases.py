@@ -185,11 +185,3 @@ def pace(probe: SerialProbe) -> None:
     seconds = probe.now() - begin
     if seconds < least - CLOCK_GRAIN_S:
         raise CaseFailed(f"at least {least * 1e3:.2f} ms at {probe.baud} baud", f"{seconds * 1e3:.2f} ms")
-
-
-CASES: Final = (
-    *FRAMING.cases,
-    *STUFFING.cases,
-    *ERRORS.cases,
-    *TIMING.cases,
-)

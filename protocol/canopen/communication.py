@@ -9,6 +9,7 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.cob import BIT_30, EMERGENCY, INVALID, SDO_RECEIVE, SDO_TRANSMIT, SYNC, TIME
+from starhil.protocol.canopen.layout import PdoModel
 from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING
 
 U8: Final = datatypes.UNSIGNED8
@@ -22,7 +23,9 @@ CONSUMERS: Final = 4
 HEARTBEAT_MS: Final = 1000
 RPDO_CAN_IDS: Final = (0x200, 0x300, 0x400, 0x500)
 TPDO_CAN_IDS: Final = (0x180, 0x280, 0x380, 0x480)
-EVENT_DRIVEN: Final = 255
+
+MappedPdo = tuple[PdoModel, Sequence[int]]
+"""Default configuration of a PDO, and its mapping entries: index, sub-index, bits."""
 
 
 @dataclass(frozen=True)
@@ -39,34 +42,6 @@ class Identity:
     revision: int = 0
     serial_number: int = 0
     bit_rates: tuple[int, ...] = (1_000_000,)
-
-
-@dataclass(frozen=True)
-class PdoDefault:
-    """Default configuration of a PDO.
-
-    Attributes
-    ----------
-    enabled
-        Whether the PDO exists.
-    can_id
-        CAN ID, to which the node-ID is added; None for the predefined one, which the first four PDOs have.
-    transmission_type
-        0 to 240 synchronous, 254 or 255 by event.
-    inhibit, event_ms
-        Inhibit time in 100 µs, event timer in ms.
-    mapping
-        Mapping entries: index, sub-index, bits.
-    """
-
-    name: str
-    enabled: bool = False
-    can_id: int | None = None
-    relative: bool = True
-    transmission_type: int = EVENT_DRIVEN
-    inhibit: int = 0
-    event_ms: int = 0
-    mapping: tuple[int, ...] = ()
 
 
 def variable(
@@ -123,7 +98,7 @@ def add_record(
 
 
 def add_communication(
-    od: ObjectDictionary, identity: Identity, rpdos: Sequence[PdoDefault], tpdos: Sequence[PdoDefault]
+    od: ObjectDictionary, identity: Identity, rpdos: Sequence[MappedPdo], tpdos: Sequence[MappedPdo]
 ) -> None:
     """Add the whole communication profile.
 
@@ -155,10 +130,9 @@ def add_communication(
     _add_general(od, identity)
     _add_messages(od)
     _add_services(od, identity)
-    for number, default in enumerate(rpdos):
-        _add_rpdo(od, number, default)
-    for number, default in enumerate(tpdos):
-        _add_tpdo(od, number, default)
+    for kind, pdos in (("RPDO", rpdos), ("TPDO", tpdos)):
+        for number, (model, mapping) in enumerate(pdos):
+            _add_pdo(od, kind, number, model, mapping)
 
 
 def _add_general(od: ObjectDictionary, identity: Identity) -> None:
@@ -229,56 +203,27 @@ def _add_services(od: ObjectDictionary, identity: Identity) -> None:
     )
 
 
-def _can_id(predefined: Sequence[int], number: int, default: PdoDefault) -> int:
-    """Return a PDO's CAN ID without the node-ID, 0 for none."""
-    if default.can_id is not None:
-        return default.can_id
-    return predefined[number] if number < len(predefined) else 0
-
-
-def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
-    index = 0x1400 + number
-    can_id = _can_id(RPDO_CAN_IDS, number, default)
-    cob_id = can_id | (0 if default.enabled else INVALID)
-    add_record(
-        od,
-        f"RPDO {number + 1} communication parameter: {default.name}",
-        [
-            variable(
-                "COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=default.relative and bool(can_id)
-            ),
-            variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
-            variable("Event timer", index, 5, U16, "rw", default.event_ms),
-        ],
-    )
-    _add_mapping(od, 0x1600 + number, f"RPDO {number + 1}", default)
-
-
-def _add_tpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
-    index = 0x1800 + number
-    can_id = _can_id(TPDO_CAN_IDS, number, default)
-    cob_id = BIT_30 | can_id | (0 if default.enabled else INVALID)
-    add_record(
-        od,
-        f"TPDO {number + 1} communication parameter: {default.name}",
-        [
-            variable(
-                "COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=default.relative and bool(can_id)
-            ),
-            variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
-            variable("Inhibit time", index, 3, U16, "rw", default.inhibit),
-            variable("Event timer", index, 5, U16, "rw", default.event_ms),
-            variable("SYNC start value", index, 6, U8, "rw", 0),
-        ],
-    )
-    _add_mapping(od, 0x1A00 + number, f"TPDO {number + 1}", default)
-
-
-def _add_mapping(od: ObjectDictionary, index: int, name: str, default: PdoDefault) -> None:
-    slots = default.mapping + (0,) * (LARGEST_MAPPING - len(default.mapping))
+def _add_pdo(od: ObjectDictionary, kind: str, number: int, model: PdoModel, mapping: Sequence[int]) -> None:
+    """Add the communication and the mapping parameter of an RPDO or a TPDO."""
+    transmits = kind == "TPDO"
+    first, predefined = (0x1800, TPDO_CAN_IDS) if transmits else (0x1400, RPDO_CAN_IDS)
+    index, name = first + number, f"{kind} {number + 1}"
+    can_id = model.can_id or (predefined[number] if number < len(predefined) else 0)
+    cob_id = can_id | (BIT_30 if transmits else 0) | (0 if model.enabled else INVALID)
+    relative = model.relative and bool(can_id)
+    settings = [
+        variable(f"COB-ID used by {kind}", index, 1, U32, "rw", cob_id, relative=relative),
+        variable("Transmission type", index, 2, U8, "rw", model.transmission_type),
+        variable("Event timer", index, 5, U16, "rw", model.event_ms),
+    ]
+    if transmits:
+        settings.insert(2, variable("Inhibit time", index, 3, U16, "rw", round(model.inhibit_ms * 10)))
+        settings.append(variable("SYNC start value", index, 6, U8, "rw", 0))
+    add_record(od, f"{name} communication parameter: {model.name}", settings)
+    index += 0x200
     members = [
         variable(f"Mapped object {subindex}", index, subindex, U32, "rw", value)
-        for subindex, value in enumerate(slots, 1)
+        for subindex, value in enumerate((*mapping, *[0] * (LARGEST_MAPPING - len(mapping))), 1)
     ]
-    count = ("Number of mapped objects", len(default.mapping))
-    add_record(od, f"{name} mapping parameter: {default.name}", members, count=count)
+    count = ("Number of mapped objects", len(mapping))
+    add_record(od, f"{name} mapping parameter: {model.name}", members, count=count)

@@ -13,7 +13,7 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, abort_of
 from starhil.protocol.canopen.communication import (
     Identity,
-    PdoDefault,
+    MappedPdo,
     add_communication,
     add_record,
     set_limits,
@@ -98,8 +98,8 @@ class DeviceDictionary(Dictionary):
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
         for placed in layout.object:
             self._add_object(objects, placed)
-        rpdos = [self._pdo_default(objects, model) for model in layout.rpdo]
-        tpdos = [self._pdo_default(objects, model) for model in layout.tpdo]
+        rpdos = [self._mapped(objects, model) for model in layout.rpdo]
+        tpdos = [self._mapped(objects, model) for model in layout.tpdo]
         self.identity = identity or identity_of(layout)
         add_communication(objects, self.identity, rpdos, tpdos)
         super().__init__(objects)
@@ -267,12 +267,11 @@ class DeviceDictionary(Dictionary):
         if parameter.enum is not None:
             member.value_descriptions = dict(parameter.enum.names)
         self.parameters[parameter.name] = key
-        self._readers[key] = partial(self._read_parameter, parameter, data_type)
+        self._readers[key] = lambda: encode(
+            data_type, parameter.to_number(self.application.parameter(parameter.name))
+        )
         self._writers[key] = partial(self._write_parameter, parameter, data_type)
         return member
-
-    def _read_parameter(self, parameter: Parameter, data_type: int) -> bytes:
-        return encode(data_type, parameter.to_number(self.application.parameter(parameter.name)))
 
     def _write_parameter(self, parameter: Parameter, data_type: int, data: bytes) -> None:
         try:
@@ -335,12 +334,12 @@ class DeviceDictionary(Dictionary):
             self._writers[key] = partial(self._execute, row)
         elif row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
-            self._writers[key] = partial(self._execute_without_data, row)
+            self._writers[key] = lambda _data: self._execute(row, b"")
         elif scalar:
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
             _describe(member, fields)
-            self._writers[key] = partial(self._execute_scalar, row)
+            self._writers[key] = lambda data: self._execute(row, in_order(slot, data))
         else:
             member = variable(name, *key, datatypes.OCTET_STRING, "wo")
             self._sizes[key] = row.size
@@ -356,12 +355,6 @@ class DeviceDictionary(Dictionary):
         except MessageError as error:
             raise abort_of(error) from None
         return self.application.telecommand(row, payload)
-
-    def _execute_scalar(self, row: Row, payload: bytes) -> Deferred | None:
-        return self._execute(row, in_order(row.slots[0], payload))
-
-    def _execute_without_data(self, row: Row, _data: bytes) -> Deferred | None:
-        return self._execute(row, b"")
 
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
         return in_order(slot, self.row_bytes(row)[span_of(slot)])
@@ -379,23 +372,14 @@ class DeviceDictionary(Dictionary):
         slot = row.named_fields[field_name].slot
         return row, slot, [field for field in row.named_fields.values() if field.slot.index == slot.index]
 
-    def _pdo_default(self, objects: ObjectDictionary, model: PdoModel) -> PdoDefault:
+    def _mapped(self, objects: ObjectDictionary, model: PdoModel) -> MappedPdo:
         mapping = []
         for name in model.objects:
             index, subindex = self.key_of(name)
             item = objects[index]
             member = item if isinstance(item, ODVariable) else item[subindex]
             mapping.append(index << 16 | subindex << 8 | (type_size(member.data_type) or 0) * 8)
-        return PdoDefault(
-            name=model.name,
-            enabled=model.enabled,
-            can_id=model.can_id,
-            relative=model.relative,
-            transmission_type=model.transmission_type,
-            inhibit=round(model.inhibit_ms * 10),
-            event_ms=model.event_ms,
-            mapping=tuple(mapping),
-        )
+        return model, mapping
 
 
 class _Packer:
