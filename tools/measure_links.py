@@ -20,6 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from starhil.hil_tests.results import percentile
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.hub import CanHub
 from starhil.protocol.socketcand import format_send
@@ -90,11 +91,6 @@ class Helper:
         """End the process."""
         self.pipe.send("end")
         self.process.join(10)
-
-
-def percentile(values: list[float], share: float) -> float:
-    """Return the value below which a given fraction of the values lies."""
-    return sorted(values)[min(int(share * len(values)), len(values) - 1)]
 
 
 def _trips(times: list[float]) -> dict[str, float]:

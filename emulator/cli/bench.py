@@ -226,7 +226,7 @@ def bus(
         figures = measure(icd, target, seconds, rate, report, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if as_json:
-        print(json.dumps({**figures.as_dict(), "good": good}))
+        print(json.dumps({**dataclasses.asdict(figures), "good": good}))
     else:
         print_figures(figures, good)
     raise typer.Exit(0 if good else 1)
