@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import IO, Final, Self
@@ -56,9 +56,9 @@ def emulator_command(
     return [*command, *([] if truth_log is None else ["--overwrite"]), *extra]
 
 
-def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
-    """Return the command line of a CAN hub that ends with this process; port 0 is a free one."""
-    command = [*_starhil_command(), "hub", "--port", str(port)]
+def hub_command(*, log: Path | None = None) -> list[str]:
+    """Return the command line of a CAN hub at a free port that ends with this process."""
+    command = [*_starhil_command(), "hub", "--port", "0"]
     return command if log is None else [*command, "--log", str(log)]
 
 
@@ -109,8 +109,6 @@ class EmulatorProcess:
         Command line, from `emulator_command`.
     ready_within_s : float
         Time-out of the ready line, s.
-    environment : mapping, optional
-        Additions to the environment.
 
     Attributes
     ----------
@@ -118,18 +116,11 @@ class EmulatorProcess:
         The ready line by key: serial, can, control, seed …
     """
 
-    def __init__(
-        self,
-        command: Sequence[str],
-        *,
-        ready_within_s: float = READY_WITHIN_S,
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, command: Sequence[str], *, ready_within_s: float = READY_WITHIN_S) -> None:
         self.command = list(command)
         self.ready: dict[str, str] = {}
         self.errors: list[str] = []
         self._ready_within_s = ready_within_s
-        self._environment = {**os.environ, **(environment or {})}
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._readers: list[threading.Thread] = []
@@ -168,7 +159,6 @@ class EmulatorProcess:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,
-                env=self._environment,
                 start_new_session=True,
             )
         except OSError as error:

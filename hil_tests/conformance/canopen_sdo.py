@@ -64,7 +64,7 @@ def mux(item: ODVariable) -> str:
 
 def expect_no_transfer(probe: CanopenProbe) -> None:
     """Fail unless a segment request finds no transfer under way."""
-    probe.check_abort(probe.ask("60"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("60"), Abort.COMMAND)
 
 
 @SDO.case("expedited-upload", "expedited upload states its size", "CiA 301 7.2.4.3.6")
@@ -148,7 +148,7 @@ def download_toggle(probe: CanopenProbe) -> None:
     before = probe.read(item.index, item.subindex)
     probe.ask(transfer(0x21, item, b"\x02\0\0\0"))
     probe.check_abort(probe.ask(bytes([0x10 | 5 << 1 | 1, 0x11, 0x11])), Abort.TOGGLE, multiplexer=mux(item))
-    probe.check_abort(probe.ask("01"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("01"), Abort.COMMAND)
     probe.ask(transfer(0x21, item, b"\x02\0\0\0"))
     probe.ask(bytes([6 << 1, 0x11]))
     probe.check_abort(probe.ask(bytes([6 << 1 | 1, 0x11])), Abort.TOGGLE, multiplexer=mux(item))
@@ -192,20 +192,20 @@ def announced_differs(probe: CanopenProbe) -> None:
 
 @SDO.case("unknown-command", "unknown command specifier")
 def unknown_command(probe: CanopenProbe) -> None:
-    probe.check_abort(probe.ask("e0 00 10 00"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("e0 00 10 00"), Abort.COMMAND)
 
 
 @SDO.case("no-transfer", "segments without a transfer")
 def no_transfer(probe: CanopenProbe) -> None:
     for request in ("60", "70", "00", "01", "a1", "a2 01 7f", "a3", "c1"):
-        probe.check_abort(probe.ask(request), Abort.COMMAND, multiplexer="")
+        probe.check_abort(probe.ask(request), Abort.COMMAND)
 
 
 @SDO.case("wrong-segment", "download segment within an upload")
 def wrong_segment(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     probe.ask(upload(item))
-    probe.check_abort(probe.ask("00"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("00"), Abort.COMMAND)
     expect_no_transfer(probe)
 
 

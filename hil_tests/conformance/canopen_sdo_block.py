@@ -163,10 +163,10 @@ def upload_order(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     for request in ("a2 01 01", "a1", "60"):
         _begin(probe, item, 1)
-        probe.check_abort(probe.ask(request), Abort.COMMAND, multiplexer="")
+        probe.check_abort(probe.ask(request), Abort.COMMAND)
     _begin(probe, item, 1)
     _segments(probe, b"\xa3", 1)
-    probe.check_abort(probe.ask("a1"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("a1"), Abort.COMMAND)
 
 
 @SDO_BLOCK.case("threshold", "protocol switch threshold", "CiA 301 7.2.4.3.13")

@@ -49,7 +49,7 @@ class UnitProbe(PortProbe):
         """Send a request without waiting; `answered` unless no answer is expected."""
 
     @abstractmethod
-    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+    def next_reply(self) -> Reply | LinkFault | None:
         """Return the next reply, None if none comes in time."""
 
     @abstractmethod
@@ -242,9 +242,9 @@ class SerialUnitProbe(SerialWire, UnitProbe):
             self.expecting(request)
         self.send(self.stack.encode_request(request))
 
-    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+    def next_reply(self) -> Reply | LinkFault | None:
         """Return the next reply, None if none comes in time; one with data in several parts as one."""
-        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        end = self.now() + self.times.answer_s
         while not self._replies and (left := end - self.now()) > 0:
             self._receive(left)
         return self._replies.popleft() if self._replies else None

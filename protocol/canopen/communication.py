@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.cob import BIT_30, EMERGENCY, INVALID, SDO_RECEIVE, SDO_TRANSMIT, SYNC, TIME
-from starhil.protocol.canopen.layout import PdoModel
+from starhil.protocol.canopen.layout import CanopenModel, PdoModel
 from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING
 
 U8: Final = datatypes.UNSIGNED8
@@ -18,6 +17,9 @@ U32: Final = datatypes.UNSIGNED32
 TEXT: Final = datatypes.VISIBLE_STRING
 DOMAIN: Final = datatypes.DOMAIN
 
+VERSION: Final = "1"
+"""Hardware and software version of the node."""
+SERIAL_NUMBER: Final = 1
 HISTORY_LENGTH: Final = 8
 CONSUMERS: Final = 4
 HEARTBEAT_MS: Final = 1000
@@ -26,22 +28,6 @@ TPDO_CAN_IDS: Final = (0x180, 0x280, 0x380, 0x480)
 
 MappedPdo = tuple[PdoModel, Sequence[int]]
 """Default configuration of a PDO, and its mapping entries: index, sub-index, bits."""
-
-
-@dataclass(frozen=True)
-class Identity:
-    """Identity of the node: objects 1000h, 1008h to 100Ah and 1018h."""
-
-    device_type: int = 0
-    device_name: str = "star sensor"
-    hardware_version: str = "1"
-    software_version: str = "1"
-    vendor_name: str = ""
-    vendor_id: int = 0
-    product_code: int = 0
-    revision: int = 0
-    serial_number: int = 0
-    bit_rates: tuple[int, ...] = (1_000_000,)
 
 
 def variable(
@@ -98,7 +84,7 @@ def add_record(
 
 
 def add_communication(
-    od: ObjectDictionary, identity: Identity, rpdos: Sequence[MappedPdo], tpdos: Sequence[MappedPdo]
+    od: ObjectDictionary, layout: CanopenModel, rpdos: Sequence[MappedPdo], tpdos: Sequence[MappedPdo]
 ) -> None:
     """Add the whole communication profile.
 
@@ -106,17 +92,17 @@ def add_communication(
     ----------
     od
         Object dictionary to which the objects are added.
-    identity
-        Identity of the node.
+    layout
+        Identity of the node, and its bit rates.
     rpdos, tpdos
         The PDOs, numbered from 1.
     """
     information = od.device_information
-    information.vendor_name = identity.vendor_name
-    information.vendor_number = identity.vendor_id
-    information.product_name = identity.device_name
-    information.product_number = identity.product_code
-    information.revision_number = identity.revision
+    information.vendor_name = layout.vendor_name
+    information.vendor_number = layout.vendor_id
+    information.product_name = layout.device_name
+    information.product_number = layout.product_code
+    information.revision_number = layout.revision
     information.order_code = ""
     information.simple_boot_up_master = False
     information.simple_boot_up_slave = True
@@ -126,22 +112,22 @@ def add_communication(
     information.nr_of_RXPDO = len(rpdos)  # type: ignore[assignment]
     information.nr_of_TXPDO = len(tpdos)  # type: ignore[assignment]
     information.LSS_supported = True
-    information.allowed_baudrates = set(identity.bit_rates)
-    _add_general(od, identity)
+    information.allowed_baudrates = set(layout.bit_rates)
+    _add_general(od, layout)
     _add_messages(od)
-    _add_services(od, identity)
+    _add_services(od, layout)
     for kind, pdos in (("RPDO", rpdos), ("TPDO", tpdos)):
         for number, (model, mapping) in enumerate(pdos):
             _add_pdo(od, kind, number, model, mapping)
 
 
-def _add_general(od: ObjectDictionary, identity: Identity) -> None:
+def _add_general(od: ObjectDictionary, layout: CanopenModel) -> None:
     for item in (
-        variable("Device type", 0x1000, 0, U32, "ro", identity.device_type),
+        variable("Device type", 0x1000, 0, U32, "ro", layout.device_type),
         variable("Error register", 0x1001, 0, U8, "ro", 0, mappable=True),
-        variable("Manufacturer device name", 0x1008, 0, TEXT, "const", identity.device_name),
-        variable("Manufacturer hardware version", 0x1009, 0, TEXT, "const", identity.hardware_version),
-        variable("Manufacturer software version", 0x100A, 0, TEXT, "const", identity.software_version),
+        variable("Manufacturer device name", 0x1008, 0, TEXT, "const", layout.device_name),
+        variable("Manufacturer hardware version", 0x1009, 0, TEXT, "const", VERSION),
+        variable("Manufacturer software version", 0x100A, 0, TEXT, "const", VERSION),
     ):
         od.add_object(item)
     errors = [
@@ -183,8 +169,8 @@ def _add_messages(od: ObjectDictionary) -> None:
     add_record(od, "Error behaviour", [behaviour], array=True)
 
 
-def _add_services(od: ObjectDictionary, identity: Identity) -> None:
-    numbers = (identity.vendor_id, identity.product_code, identity.revision, identity.serial_number)
+def _add_services(od: ObjectDictionary, layout: CanopenModel) -> None:
+    numbers = (layout.vendor_id, layout.product_code, layout.revision, SERIAL_NUMBER)
     names = ("Vendor-ID", "Product code", "Revision number", "Serial number")
     members = [
         variable(name, 0x1018, subindex, U32, "ro", number)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -12,7 +11,6 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, abort_of
 from starhil.protocol.canopen.communication import (
-    Identity,
     MappedPdo,
     add_communication,
     add_record,
@@ -65,8 +63,6 @@ class DeviceDictionary(Dictionary):
         The interface definition.
     layout
         Indices of its rows, fields and parameters.
-    identity
-        Identity of the node; that of the layout by default.
 
     Attributes
     ----------
@@ -76,12 +72,7 @@ class DeviceDictionary(Dictionary):
         Parameter → key of its entry.
     """
 
-    def __init__(
-        self,
-        icd: InterfaceDefinition,
-        layout: CanopenModel,
-        identity: Identity | None = None,
-    ) -> None:
+    def __init__(self, icd: InterfaceDefinition, layout: CanopenModel) -> None:
         self.icd = icd
         self.layout = layout
         self.application: Application = StandInApplication(icd)
@@ -100,8 +91,7 @@ class DeviceDictionary(Dictionary):
             self._add_object(objects, placed)
         rpdos = [self._mapped(objects, model) for model in layout.rpdo]
         tpdos = [self._mapped(objects, model) for model in layout.tpdo]
-        self.identity = identity or identity_of(layout)
-        add_communication(objects, self.identity, rpdos, tpdos)
+        add_communication(objects, layout, rpdos, tpdos)
         super().__init__(objects)
         for key, reader in self._readers.items():
             self.entries[key].reader = reader
@@ -420,30 +410,9 @@ class _Packer:
         return enum.values[value]
 
 
-def identity_of(layout: CanopenModel) -> Identity:
-    """Return the identity in the layout."""
-    return Identity(
-        device_type=layout.device_type,
-        device_name=layout.device_name,
-        vendor_name=layout.vendor_name,
-        vendor_id=layout.vendor_id,
-        product_code=layout.product_code,
-        revision=layout.revision,
-        bit_rates=tuple(layout.bit_rates),
-    )
-
-
-def build_dictionary(
-    icd: InterfaceDefinition,
-    layout: CanopenModel | None = None,
-    *,
-    serial_number: int = 1,
-    software_version: str = "1",
-) -> DeviceDictionary:
-    """Build the object dictionary of the device that serves a definition, by default with the definition's layout."""
-    layout = read_layout(icd) if layout is None else layout
-    identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
-    return DeviceDictionary(icd, layout, identity)
+def build_dictionary(icd: InterfaceDefinition) -> DeviceDictionary:
+    """Build the object dictionary of the device that serves a definition, with the definition's layout."""
+    return DeviceDictionary(icd, read_layout(icd))
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
