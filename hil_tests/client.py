@@ -69,10 +69,7 @@ class ObcClient:
 
     @staticmethod
     async def _open(
-        make_link: Callable[[], HostLink[Any]],
-        icd: InterfaceDefinition,
-        timeout_s: float,
-        retries: int,
+        make_link: Callable[[], HostLink[Any]], icd: InterfaceDefinition, timeout_s: float, retries: int
     ) -> AsyncObcClient:
         core = AsyncObcClient(make_link(), icd, timeout_s=timeout_s, retries=retries)
         await core.start()

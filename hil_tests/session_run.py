@@ -186,9 +186,7 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
         wanted = {None: ("serial",), "both": ("serial", "can")}.get(script.link, (script.link,))
         options = replace(
-            options,
-            serial="auto" if "serial" in wanted else None,
-            can="auto" if "can" in wanted else None,
+            options, serial="auto" if "serial" in wanted else None, can="auto" if "can" in wanted else None
         )
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start: without it name the port")

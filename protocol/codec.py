@@ -34,7 +34,7 @@ from starhil.protocol.values import (
 RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
-_CODES: Final = dict(
+STRUCT_CODES: Final = dict(
     zip(("u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"), "BbHhLlQqfd", strict=True)
 )
 """Type of a scalar → its code in a format of `struct`."""
@@ -62,7 +62,7 @@ class Slot:
     @property
     def format(self) -> str:
         """Format of the scalar for `struct`."""
-        return ("<" if self.order == "little" else ">") + _CODES[self.type]
+        return ("<" if self.order == "little" else ">") + STRUCT_CODES[self.type]
 
 
 @dataclass(frozen=True)

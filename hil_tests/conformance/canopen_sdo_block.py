@@ -7,11 +7,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.hil_tests.conformance.canopen_probe import (
-    Abort,
-    CanopenProbe,
-    multiplexer,
-)
+from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, multiplexer
 from starhil.hil_tests.conformance.canopen_sdo import (
     LONGEST_TIMEOUT_S,
     expect_no_transfer,

@@ -122,13 +122,7 @@ def canopen_unit_cases(icd: InterfaceDefinition) -> list[Case[CanopenProbe]]:
     """Make the cases of a unit with CANopen."""
     layout = read_layout(icd)
     found = list(entries(icd, layout))
-    return [
-        *_rows(icd, found),
-        *_commands(found),
-        *_records(found),
-        *_limits(found),
-        *_pdos(layout, found),
-    ]
+    return [*_rows(icd, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
 
 
 def _case(
@@ -256,16 +250,15 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         if command.action == "reset":
             title = f"{command.name} restarts the node"
             mode = next((item for item in found if item.row is not None and _reports(item, "mode")), None)
-            yield _case(
-                "commands", command.name, title, _restarts(entry, command, mode), clause_of_row(command)
-            )
+            run = _restarts(entry, command, mode)
         elif entry.row is not None and entry.slot is not None:
             title = f"{entry.name}h reports each value of {command.name} that was written"
-            yield _case("commands", command.name, title, _reported(entry, command), clause_of_row(command))
+            run = _reported(entry, command)
         elif command.action in (None, "nothing"):
-            title = f"{command.name} is accepted"
-            run = _accepted(entry, command)
-            yield _case("commands", command.name, title, run, clause_of_row(command))
+            title, run = f"{command.name} is accepted", _accepted(entry, command)
+        else:
+            continue
+        yield _case("commands", command.name, title, run, clause_of_row(command))
 
 
 def _accepted(entry: Entry, command: Row) -> Run:

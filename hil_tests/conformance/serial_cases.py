@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from starhil.hil_tests.conformance.case import (
-    CaseArea,
-    CaseFailed,
-    CaseSkipped,
-    check,
-    check_equal,
-    rule,
-)
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
