@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,7 @@ from starhil.protocol.device_model import DeviceModel, device_model, did_you_mea
 from starhil.protocol.icd import InterfaceDefinition, Names, RawTable
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import Layout
-from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel
+from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, Order
 from starhil.protocol.messages import ErrorCode, MessageClass, RequestKind
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
@@ -93,7 +94,7 @@ class _Builder:
         self._sections: list[Section] = []
         self._tables: dict[str, tuple[Path, object]] = {}
         self._plugin = Plugin()
-        self.byte_order: schema.Order = "little"
+        self.byte_order: Order = "little"
 
     def read(self, file: Path) -> None:
         """Read and validate one file."""
@@ -337,12 +338,9 @@ class _Builder:
             model.id, whole.name, whole.type, whole.unit, low, high, whole.default, whole.doc, enum
         )
         try:
-            default = parameter.check(whole.default)
+            self._parameters[whole.name] = replace(parameter, default=parameter.check(whole.default))
         except FieldError as error:
             raise IcdError(f"{where}: default: {error}") from None
-        self._parameters[whole.name] = Parameter(
-            model.id, whole.name, whole.type, whole.unit, low, high, default, whole.doc, enum
-        )
 
     @staticmethod
     def _limits(

@@ -6,30 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final, Protocol
 
-from starhil.protocol.codec import Field, FieldKind, Order, Row, RowKind, Slot
+from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
 from starhil.protocol.icd_schema import BitModel, FieldModel, Scalar
-from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, IcdError
+from starhil.protocol.link_schema import Order
+from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError
 
-_SLOT_TYPES: Final[dict[str, str]] = {
-    "enum8": "u8",
-    "enum16": "u16",
-    "enum32": "u32",
-    "bits8": "u8",
-    "bits16": "u16",
-    "bits32": "u32",
-}
-_SIZES: Final[dict[str, int]] = {
-    "u8": 1,
-    "i8": 1,
-    "u16": 2,
-    "i16": 2,
-    "u32": 4,
-    "i32": 4,
-    "u64": 8,
-    "i64": 8,
-    "f32": 4,
-    "f64": 8,
-}
 NUMBER: Final = "[n]"
 
 
@@ -114,11 +95,9 @@ class Layout:
         if type_ in ("bytes", "text"):
             slot = self._slot("bytes", model.size or 0)
         else:
-            scalar = _SLOT_TYPES.get(type_, type_)
-            slot = self._slot(scalar, _SIZES[scalar], model.order)
+            slot = self._scalar_slot(type_, model.order)
         self._check_numbers(model, where)
         enum, aliases = self._enumeration(model, where, named=type_.startswith("enum"))
-        bound = _minimum_maximum(model)
         return Field(
             name=model.name + suffix if model.name else "",
             kind=_kind(model, type_, enum),
@@ -126,8 +105,8 @@ class Layout:
             unit=model.unit,
             scale=model.scale,
             bias=model.offset,
-            minimum=bound[0],
-            maximum=bound[1],
+            minimum=model.min if model.const is None else model.const,
+            maximum=model.max if model.const is None else model.const,
             enum=enum,
             default=_default(model.default, enum, where),
             parameter=self._definitions.check_parameter(model.parameter, model.unit, where),
@@ -156,8 +135,7 @@ class Layout:
         where = f"{self._where}: field {model.name or 'unused'}"
         if not model.bits or (model.count is not None):
             raise IcdError(f"{where}: type {model.type} needs `bits` and takes no count")
-        scalar = _SLOT_TYPES[str(model.type)]
-        slot = self._slot(scalar, _SIZES[scalar], model.order)
+        slot = self._scalar_slot(str(model.type), model.order)
         shift = 0
         for bit in model.bits:
             here = f"{self._where}: field {bit.name or 'unused'}"
@@ -198,6 +176,11 @@ class Layout:
             const=bit.const,
             aliases=aliases,
         )
+
+    def _scalar_slot(self, type_: str, order: Order | None) -> Slot:
+        """Return the slot of a number, an enumeration or a bit field."""
+        scalar = type_.replace("enum", "u").replace("bits", "u")
+        return self._slot(scalar, SCALAR_SIZES[scalar], order)
 
     def _slot(self, scalar: str, size: int, order: Order | None = None) -> Slot:
         slot = Slot(len(self.slots), scalar, self.size, size, order or self._definitions.byte_order)
@@ -268,10 +251,6 @@ def _kind(model: FieldModel, type_: str, enum: EnumDefinition | None) -> FieldKi
         return "enum"
     kinds: dict[str, FieldKind] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
     return kinds.get(type_, "integer")
-
-
-def _minimum_maximum(model: FieldModel) -> tuple[float | None, float | None]:
-    return (model.min, model.max) if model.const is None else (model.const, model.const)
 
 
 def _numbered(name: str | None, number: int | None, where: str) -> str | None:

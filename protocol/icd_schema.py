@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from starhil.protocol.link_schema import LinkModel
+from starhil.protocol.link_schema import LinkModel, Order
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Provenance = Literal["confirmed", "proxy", "ours"]
@@ -16,7 +16,6 @@ FieldType = Literal[
 ]  # fmt: skip
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
 Kind = Literal["telecommand", "telemetry"]
-Order = Literal["little", "big"]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Scalar = bool | int | float | str
 Code = Annotated[int, Field(ge=0, le=0xFFFF)]

@@ -71,6 +71,13 @@ class SlipFraming(_Model):
     leading_end: bool = True
     """Whether an `end` byte is sent before each frame too."""
 
+    @property
+    def escaped(self) -> tuple[int, int]:
+        """Bytes that follow an escape byte in place of `end` and `escape`."""
+        if self.xor is not None:
+            return self.end ^ self.xor, self.escape ^ self.xor
+        return self.substitutes or (0xDC, 0xDD)
+
 
 class LengthFraming(_Model):
     """`start`, then as many bytes as the header's `length` field says, then `end`."""

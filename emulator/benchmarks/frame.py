@@ -45,9 +45,7 @@ def measure_frames(
     frames: int = 200,
     seed: int = 1,
     rate_deg_s: float = 0.0,
-    sensor: SensorModel | None = None,
-    camera: Camera | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _text: None,
 ) -> list[StageRow]:
     """Measure the processor time of each stage over frames of random attitude, after a warm-up.
 
@@ -61,18 +59,13 @@ def measure_frames(
         Seed of attitudes and noise.
     rate_deg_s : float
         Body rate during the exposures, about an axis across the boresight.
-    sensor, camera : optional
-        Defaults: those of starhil.
     progress : callable, optional
         Receives one line per step.
     """
     if frames < 1:
         raise EmulatorError(f"bench frame: frames must be at least one, not {frames}")
-    sensor = SensorModel() if sensor is None else sensor
-    camera = Camera.from_fov() if camera is None else camera
-    catalog = load_catalog()
-    if progress is not None:
-        progress("warming up")
+    sensor, camera, catalog = SensorModel(), Camera.from_fov(), load_catalog()
+    progress("warming up")
     renderer = Renderer(camera, catalog, sensor, seed)
     identifier = make_identifier("geometric", camera, catalog)
     settings = sensor.detection_settings()
@@ -80,7 +73,7 @@ def measure_frames(
     rate = np.array([math.radians(rate_deg_s), 0.0, 0.0])
     times = []
     for index in range(-_WARM_UP, frames):
-        if progress is not None and index == 0:
+        if index == 0:
             progress(f"timing {frames} frames")
         attitude = random_attitude(rng)
         marks = [time.thread_time()]

@@ -129,8 +129,7 @@ def centroid(
     seed: Seed = 1,
     bits: Annotated[int, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = 8,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf.")),
+        Path | None, typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf."))
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -226,7 +225,7 @@ def bus(
         figures = measure(icd, target, seconds, rate, report, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if as_json:
-        print(json.dumps({**figures.as_dict(), "good": good}))
+        print(json.dumps({**dataclasses.asdict(figures), "good": good}))
     else:
         print_figures(figures, good)
     raise typer.Exit(0 if good else 1)

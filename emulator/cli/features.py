@@ -26,8 +26,7 @@ def command(
     dec: Annotated[float | None, typer.Option(help="Declination of the frame's centre, degrees.")] = None,
     kappa: Annotated[float, typer.Option(help="Brightness limit κ, magnitudes.")] = 11.5,
     direction: Annotated[
-        str,
-        typer.Option(help="Stars kept: faintest (a ≥ κ, as in the thesis) or brightest (a ≤ κ)."),
+        str, typer.Option(help="Stars kept: faintest (a ≥ κ, as in the thesis) or brightest (a ≤ κ).")
     ] = "faintest",
     geometry: Annotated[
         str,

@@ -11,7 +11,7 @@ import urllib.request
 import pytest
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WITHIN_MS = 30_000
@@ -27,7 +27,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def emulator():
     settings = [f"parameters.update_rate={UPDATE_RATE_HZ}"]
-    with PrivateCanBus() as bus:
+    with private_can_bus() as bus:
         command = emulator_command(
             profile="ideal", serial="off", can=bus, seed=1, settings=settings, extra=["--view", "auto"]
         )
