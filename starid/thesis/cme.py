@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.jit import compiled
-from starid.thesis.false_stars import FilterError
+from starid.thesis.false_stars import FilterError, ObservedFrame
 
 MotionModel = Literal["rigid", "affine"]
 
@@ -356,3 +356,13 @@ def estimate_motion(
         float(kept.std(ddof=1)) if kept.size > 1 else 0.0,
         inliers,
     )
+
+
+def matched_motion(
+    before: ObservedFrame, now: ObservedFrame, matches: NDArray[np.int64], *, model: MotionModel = "rigid"
+) -> CameraMotion | None:
+    """Estimate the camera motion from the matches (m, 2) of two frames; None where there are too few for it."""
+    try:
+        return estimate_motion(before.positions[matches[:, 0]], now.positions[matches[:, 1]], model=model)
+    except FilterError:
+        return None

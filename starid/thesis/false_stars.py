@@ -61,6 +61,11 @@ class FilterResult:
     true_now: NDArray[np.bool_]
     matches: NDArray[np.int64]
 
+    @property
+    def matched(self) -> NDArray[np.bool_]:
+        """Which objects of the later frame belong to one of the earlier."""
+        return np.isin(np.arange(self.true_now.size), self.matches[:, 1])
+
 
 class FalseStarFilter(Protocol):
     """What separates true stars from false ones in two successive frames."""

@@ -58,6 +58,13 @@ def pair_features(
             k += 1
 
 
+def pairs_of(frame: ObservedFrame) -> NDArray[np.float64]:
+    """The feature vectors of a frame's pairs, (L, 3)."""
+    vectors = np.empty((pair_count(len(frame)), 3))
+    pair_features(frame.brightness, frame.positions, vectors, np.empty((len(vectors), 2), dtype=np.int64))
+    return vectors
+
+
 @compiled
 def disparity_list(
     before: NDArray[np.float64], now: NDArray[np.float64], disparities: NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -48,22 +49,22 @@ class Confusion:
     true_negative: int = 0
 
     def __add__(self, other: Confusion) -> Confusion:
-        return Confusion(
-            self.true_positive + other.true_positive,
-            self.false_positive + other.false_positive,
-            self.false_negative + other.false_negative,
-            self.true_negative + other.true_negative,
-        )
+        return Confusion(*(int(count) for count in self.counts + other.counts))
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """True positives, false positives, false negatives and true negatives, (4,)."""
+        return np.array(dataclasses.astuple(self), dtype=np.int64)
+
+    def percent(self, indicator: str) -> float:
+        """An indicator by its name, percent."""
+        return 100.0 * float(getattr(self, indicator))
 
     @classmethod
     def of(cls, taken_for_true: NDArray[np.bool_], is_star: NDArray[np.bool_]) -> Confusion:
         """Count one frame."""
-        return cls(
-            int(np.count_nonzero(taken_for_true & is_star)),
-            int(np.count_nonzero(taken_for_true & ~is_star)),
-            int(np.count_nonzero(~taken_for_true & is_star)),
-            int(np.count_nonzero(~taken_for_true & ~is_star)),
-        )
+        taken = (taken_for_true, ~taken_for_true)
+        return cls(*(int(np.count_nonzero(a & b)) for a in taken for b in (is_star, ~is_star)))
 
     @property
     def accuracy(self) -> float:

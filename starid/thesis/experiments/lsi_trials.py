@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.thesis.experiments.comparison import Readings
 from starid.thesis.experiments.experiment import Context, Results
 from starid.thesis.features import extract_features
 from starid.thesis.lsi import LsiEstimate
@@ -33,6 +34,13 @@ _COMPARED_NEIGHBOURS: Final = 256
 
 ON, OFF = "on", "off"
 """The frames as they are, and moved off the grid."""
+
+GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
+
+
+def count_words(count: int, kind: str) -> str:
+    """How many false or missing stars, in words."""
+    return f"{count} {kind} star{'s' if count > 1 else ''}"
 
 
 def centres(every: int = 1) -> NDArray[np.float64]:
@@ -148,3 +156,14 @@ def solve_frames(
 def share(errors: NDArray[np.float64], limit: float) -> float:
     """Share of errors within a limit, percent."""
     return float(100.0 * np.mean(errors <= limit))
+
+
+def shares(
+    result: Results, limit: float, quantity: str = "f", ours: str = "fine", *, beyond: bool = False
+) -> Readings:
+    """Share of errors within a limit, or beyond it, of LSI (MSE) in both readings and of a search of ours, percent."""
+    author, printed, best = (
+        100.0 - within if beyond else within
+        for within in (share(result[f"{quantity}_{kind}"], limit) for kind in ("author_mse", "mse", ours))
+    )
+    return {"author": author, "printed": printed, "ours": best}
