@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.catalog import StarCatalog, load_catalog
+from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
 from starid.geometric.verified import VerifiedIdentifier
+from starid.single_camera import Measured
 from starid.solution import Reason, Solution
-from starid.solver_input import checked_detections
 from starid.thesis.coarse_match import next_candidate
 from starid.thesis.database import DatabaseParameters
 from starid.thesis.database_choice import given_database, obtain_database
@@ -39,12 +38,14 @@ from starid.wahba import solve_wahba
 STARS_PER_FIELD: Final = 60
 """Stars in a field that the default brightness limit of the features aims at."""
 
+WINDOW_PX: Final = 12.0
+"""Window in which a candidate is verified, pixels."""
+
 _FEWEST_STARS: Final = 5
 _MAGNITUDE_GATE: Final = 0.8
 _MOST_VOTERS: Final = 60
 _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
 _ZERO_POINT_STAR: Final = 25
-_WINDOW_PX: Final = 12.0
 _BLEND_PX: Final = 2.0
 _VOTE_SHARE: Final = 0.25
 _SPREAD: Final = 0.8
@@ -164,10 +165,9 @@ class LsiIdentifier(VerifiedIdentifier):
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or LsiOptions(), **changes)
-        self._catalog = load_catalog() if catalog is None else catalog
+        super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
-        self._camera = camera
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
         limit = self._limit_for(share) if options.feature_limit is None else options.feature_limit
@@ -188,16 +188,6 @@ class LsiIdentifier(VerifiedIdentifier):
             camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
         )
         self.last_report = LsiReport(None, 0, 0, math.nan)
-
-    @property
-    def camera(self) -> Camera:
-        """The camera that the positions belong to."""
-        return self._camera
-
-    @property
-    def catalog(self) -> StarCatalog:
-        """The catalogue that `Solution.catalog_index` counts in."""
-        return self._catalog
 
     @property
     def verifier(self) -> Identifier:
@@ -234,51 +224,21 @@ class LsiIdentifier(VerifiedIdentifier):
         xy = self._camera.border(4)[:_FEWEST_STARS] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
-        self._identify(xy, np.ones(len(xy)), None, [0.0])
+        self._first_verified(Measured.of(xy, np.ones(len(xy))), [0.0])
 
-    def identify(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Lost in space: attitude without any knowledge of it.
-
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            As in `Identifier.identify`.
-
-        Raises
-        ------
-        StaridError
-            The arrays do not fit each other, or hold values that are not finite.
-        """
-        begin = time.perf_counter()
-        xy, brightness, _ = checked_detections(xy_px, flux)
-        solution = self._identify(
-            xy, brightness, xy_sigma_px, self._zero_points(brightness), observer_velocity
-        )
+    def _identify(self, measured: Measured) -> Solution:
+        solution = self._first_verified(measured, self._zero_points(measured.flux))
         if solution.valid:
-            self.learn(solution, brightness)
-        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+            self.learn(solution, measured.flux)
+        return solution
 
-    def _identify(
-        self,
-        xy: NDArray[np.float64],
-        brightness: NDArray[np.float64],
-        xy_sigma_px: ArrayLike | None,
-        zero_points: Sequence[float],
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
+    def _first_verified(self, measured: Measured, zero_points: Sequence[float]) -> Solution:
         """First verified answer of the zero points, tried in their order."""
         tried = verified = 0
         coarse: Attitude | None = None
         enough = False
         for zero_point in zero_points:
-            field = self.field_stars(xy, brightness, zero_point)
+            field = self.field_stars(measured.xy, measured.flux, zero_point)
             features = self.features(field)
             if features is None:
                 continue
@@ -290,20 +250,12 @@ class LsiIdentifier(VerifiedIdentifier):
                 if attitude is None:
                     continue
                 verified += 1
-                solution = self.verifier.verify(
-                    xy,
-                    brightness,
-                    attitude,
-                    xy_sigma_px,
-                    window_px=_WINDOW_PX,
-                    observer_velocity=observer_velocity,
-                )
+                solution = self.verify(measured, attitude, WINDOW_PX)
                 if solution.valid:
                     self.last_report = LsiReport(coarse, tried, verified, zero_point)
                     return dataclasses.replace(solution, mode="lost_in_space")
         self.last_report = LsiReport(coarse, tried, verified, math.nan)
-        reason = Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS
-        return Solution.invalid(reason)
+        return Solution.invalid(Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS)
 
     def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
         """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""
