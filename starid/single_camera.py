@@ -9,9 +9,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
@@ -38,14 +38,14 @@ class Measured:
         As in `starid.interface.StarIdentifier.identify`.
     """
 
-    xy: NDArray[np.float64]
-    flux: NDArray[np.float64]
-    sigmas: NDArray[np.float64]
+    xy: Array
+    flux: Array
+    sigmas: Array
     sigmas_known: bool
     observer_velocity: ArrayLike | None
 
     @property
-    def given_sigmas(self) -> NDArray[np.float64] | None:
+    def given_sigmas(self) -> Array | None:
         """The errors, None where none were given."""
         return self.sigmas if self.sigmas_known else None
 

@@ -27,6 +27,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -40,7 +41,6 @@ from starid.single_camera import Measured
 from starid.solution import Reason, Solution
 from starid.wahba import covariance, solve_wahba
 
-Array = NDArray[np.float64]
 Database = tuple[NDArray[np.generic], ...]
 
 BLEND_PX: Final = 2.0
@@ -105,7 +105,7 @@ class GuideStars:
 
     vectors: Array
     magnitude: Array
-    row: NDArray[np.int64]
+    row: Indices
 
     def __len__(self) -> int:
         return len(self.row)
@@ -129,7 +129,7 @@ class Observed:
 
     directions: Array
     magnitude: Array
-    row: NDArray[np.int64]
+    row: Indices
     tolerance: float
 
 
@@ -191,7 +191,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         """Return the arrays that the search reads, made from the guide stars."""
 
     @abstractmethod
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         """Return proposed matches (m, 2): row of an observed star, row of a guide star."""
 
     @property
@@ -275,7 +275,7 @@ class ClassicIdentifier(VerifiedIdentifier):
             np.ascontiguousarray(directions[rows]), magnitude[:count], rows, tolerance_px / self._px_per_rad
         )
 
-    def _raw(self, xy: Array, observed: Observed, pairs: NDArray[np.int64]) -> Solution:
+    def _raw(self, xy: Array, observed: Observed, pairs: Indices) -> Solution:
         """Attitude by least squares of the matched stars, unverified."""
         seen, stars = observed.directions[pairs[:, 0]], self.guide.vectors[pairs[:, 1]]
         attitude = solve_wahba(seen, stars)

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from starid.aberration import checked_beta
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -107,7 +108,7 @@ class Effort:
             elif not 0.0 < value < math.inf:
                 raise StaridError(f"identifier {field.name}: must be a positive number, not {value}")
 
-    def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
+    def numbers(self, camera: Camera, px_per_rad: float) -> Array:
         """Settings of the kernels (`starid.geometric.settings`) for a camera of known focal length."""
         numbers = np.zeros(SETTING_COUNT)
         numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
@@ -209,12 +210,12 @@ class Identifier(SingleCameraIdentifier):
             self._search(self._camera, measured, self._numbers_for(measured)), "lost_in_space"
         )
 
-    def _search(self, camera: Camera, measured: Measured, numbers: NDArray[np.float64]) -> Answer:
+    def _search(self, camera: Camera, measured: Measured, numbers: Array) -> Answer:
         """Search the whole sky with a camera and settings of the kernels."""
         detections = measured.xy, measured.flux, measured.sigmas
         return identify_kernel(self._index, camera.params, *detections, numbers)
 
-    def _numbers_for(self, measured: Measured) -> NDArray[np.float64]:
+    def _numbers_for(self, measured: Measured) -> Array:
         """Settings of the kernels for one call."""
         numbers = self._numbers_with_errors if measured.sigmas_known else self._numbers
         if measured.observer_velocity is None:
@@ -338,11 +339,11 @@ class Identifier(SingleCameraIdentifier):
         return other
 
     @property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Array:
         """Unit vectors (m, 3) of `stars`, as the index holds them."""
         return self._index.stars[:, :3]
 
-    def with_direction(self, row: int, direction: NDArray[np.float64]) -> Identifier:
+    def with_direction(self, row: int, direction: Array) -> Identifier:
         """Identifier whose index holds another direction (3,), not necessarily of unit length, for a row of `stars`."""
         stars = self._index.stars.copy()
         stars[row, :3] = direction

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
@@ -55,7 +56,7 @@ class ImageSolution:
     stars: StarCatalog
     mirrored: bool = False
 
-    def on_image(self, xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def on_image(self, xy_px: Array) -> Array:
         """Convert positions (n, 2) of the solution to positions on the original image."""
         return flipped(xy_px, self.camera.width) if self.mirrored else xy_px
 
@@ -193,6 +194,6 @@ def _refined(
     return outcome.calibration.camera
 
 
-def flipped(xy: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+def flipped(xy: Array, width: int) -> Array:
     """Positions (n, 2) in the image flipped left to right."""
     return np.stack([width - 1.0 - xy[:, 0], xy[:, 1]], axis=1)

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import GreyImage
 from starid.imaging.detection import Detections, DetectionSettings, detect
 
-Counts: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
+Counts: TypeAlias = GreyImage
 
 MOST_STARS: Final = 2000
 """Most detections of each view."""

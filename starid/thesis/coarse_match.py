@@ -11,8 +11,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
 from starid.thesis.frame_sky import stars_near
 
@@ -28,13 +28,13 @@ _INNERMOST: Final = 4.0
 
 @compiled
 def vote_roll(
-    observed: NDArray[np.float64],
-    polar: NDArray[np.float64],
-    near: NDArray[np.float64],
+    observed: Array,
+    polar: Array,
+    near: Array,
     count: int,
     offset_px: float,
     magnitude_gate: float,
-    votes: NDArray[np.float64],
+    votes: Array,
 ) -> tuple[float, float]:
     """Let the stars vote; return the best turn from catalogue to image in radians, and its votes.
 
@@ -77,13 +77,13 @@ def vote_roll(
 
 @compiled
 def pair_stars(
-    observed: NDArray[np.float64],
-    near: NDArray[np.float64],
+    observed: Array,
+    near: Array,
     count: int,
     turn: float,
     tolerance_px: float,
     magnitude_gate: float,
-    pairs: NDArray[np.int64],
+    pairs: Indices,
 ) -> int:
     """Pair observed and catalogue stars from a first turn on, refitting turn and shift; return the number of pairs.
 
@@ -139,14 +139,14 @@ def pair_stars(
 
 @compiled
 def next_candidate(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    observed: NDArray[np.float64],
-    candidates: NDArray[np.float64],
+    stars: Array,
+    bin_start: Indices,
+    frame: Array,
+    observed: Array,
+    candidates: Array,
     start: int,
-    settings: NDArray[np.float64],
-    matched: NDArray[np.int64],
+    settings: Array,
+    matched: Indices,
 ) -> tuple[int, int]:
     """Find the next boresight from place `start` on that the stars vote for; return its place (−1: none) and pairs.
 

@@ -14,6 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.camera import Camera
 from starid.catalog import Band, StarCatalog
 from starid.errors import StaridError
@@ -144,8 +145,8 @@ class FeatureDatabase:
     sky: FrameSky
     features: NDArray[np.uint8]
     theta: NDArray[np.uint8]
-    minimum: NDArray[np.float64]
-    maximum: NDArray[np.float64]
+    minimum: Array
+    maximum: Array
     catalog_identity: str
 
     @property
@@ -158,7 +159,7 @@ class FeatureDatabase:
         """Size of the stored features, bytes."""
         return int(self.features.nbytes)
 
-    def normalise(self, features: FeatureVector | NDArray[np.float64]) -> NDArray[np.float64]:
+    def normalise(self, features: FeatureVector | Array) -> Array:
         """Normalised feature vector, eq. 2.11: 100·(f − min)/(max − min) for each feature over the database, (5,)."""
         vector = (
             features.vector if isinstance(features, FeatureVector) else np.asarray(features, dtype=np.float64)
@@ -166,7 +167,7 @@ class FeatureDatabase:
         return np.asarray((vector - self.minimum) * self.scale, dtype=np.float64)
 
     @cached_property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Array:
         """Normalised units per unit of each feature, (5,); 0 for a feature that is the same everywhere."""
         return normalising_scale(self.minimum, self.maximum)
 
@@ -175,7 +176,7 @@ class FeatureDatabase:
         return self.sky.features(*self.grid.centre(cell))
 
 
-def normalising_scale(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> NDArray[np.float64]:
+def normalising_scale(minimum: Array, maximum: Array) -> Array:
     """100/(max − min) for each feature, 0 where the extremes agree."""
     span = maximum - minimum
     return np.asarray(np.where(span > 0.0, 100.0 / np.where(span > 0.0, span, 1.0), 0.0), dtype=np.float64)
@@ -183,15 +184,15 @@ def normalising_scale(minimum: NDArray[np.float64], maximum: NDArray[np.float64]
 
 @compiled
 def _extremes_of_rows(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    row_dec: NDArray[np.float64],
-    row_ra_step: NDArray[np.float64],
-    row_columns: NDArray[np.int64],
+    stars: Array,
+    bin_start: Indices,
+    frame: Array,
+    row_dec: Array,
+    row_ra_step: Array,
+    row_columns: Indices,
     first_ra: float,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    low: Array,
+    high: Array,
 ) -> None:
     sums = np.empty(8)
     out = np.empty(5)
@@ -207,15 +208,15 @@ def _extremes_of_rows(
 
 @compiled
 def _store_rows(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    row_dec: NDArray[np.float64],
-    row_ra_step: NDArray[np.float64],
-    row_columns: NDArray[np.int64],
+    stars: Array,
+    bin_start: Indices,
+    frame: Array,
+    row_dec: Array,
+    row_ra_step: Array,
+    row_columns: Indices,
     first_ra: float,
-    low: NDArray[np.float64],
-    scale: NDArray[np.float64],
+    low: Array,
+    scale: Array,
     features: NDArray[np.uint8],
     theta: NDArray[np.uint8],
 ) -> None:

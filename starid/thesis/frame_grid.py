@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.errors import StaridError
 from starid.jit import compiled
 
@@ -54,10 +54,10 @@ class FrameGrid:
     geometry: Geometry
     step_deg: float
     first_ra_deg: float
-    row_dec_deg: NDArray[np.float64]
-    row_ra_step_deg: NDArray[np.float64]
-    row_columns: NDArray[np.int64]
-    row_start: NDArray[np.int64]
+    row_dec_deg: Array
+    row_ra_step_deg: Array
+    row_columns: Indices
+    row_start: Indices
 
     @property
     def rows(self) -> int:
@@ -84,7 +84,7 @@ class FrameGrid:
             float(self.row_dec_deg[row]),
         )
 
-    def dictionary(self, cell: int) -> NDArray[np.int64]:
+    def dictionary(self, cell: int) -> Indices:
         """Cells of the 3×3 neighbourhood, (9,), row by row: the dictionary T of eq. 2.30 in terms of cells.
 
         Right ascension wraps. At the first and the last row the block is moved inwards as a whole, so that it has
@@ -99,7 +99,7 @@ class FrameGrid:
 
 
 @compiled
-def cell_row(row_start: NDArray[np.int64], cell: int) -> int:
+def cell_row(row_start: Indices, cell: int) -> int:
     """Row of a cell, by bisection."""
     low = 0
     high = row_start.size - 1
@@ -114,13 +114,13 @@ def cell_row(row_start: NDArray[np.int64], cell: int) -> int:
 
 @compiled
 def dictionary_cells(
-    row_start: NDArray[np.int64],
-    row_columns: NDArray[np.int64],
-    row_ra_step: NDArray[np.float64],
+    row_start: Indices,
+    row_columns: Indices,
+    row_ra_step: Array,
     first_ra: float,
     cell: int,
-    cells: NDArray[np.int64],
-    right_ascension: NDArray[np.float64],
+    cells: Indices,
+    right_ascension: Array,
 ) -> int:
     """Write the nine cells and their right ascensions (degrees, not wrapped); return the first of the three rows."""
     row = cell_row(row_start, cell)

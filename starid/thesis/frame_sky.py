@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.errors import StaridError
 from starid.jit import compiled
 from starid.thesis.features import SUM_COUNT, FeatureVector, add_star, clear_sums, finish_features
@@ -52,9 +52,7 @@ def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) 
 
 
 @compiled
-def stars_of_bins(
-    bin_start: NDArray[np.int64], band: int, first: int, count: int, part: int
-) -> tuple[int, int]:
+def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: int) -> tuple[int, int]:
     """First star, and one past the last, of the bins of a band: up to the end of the band (part 0), or beyond (part 1)."""
     end = min(first + count, RA_BINS)
     start = band * RA_BINS + (first if part == 0 else 0)
@@ -98,12 +96,7 @@ def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) 
 
 @compiled
 def cell_sums(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    ra_deg: float,
-    dec_deg: float,
-    sums: NDArray[np.float64],
+    stars: Array, bin_start: Indices, frame: Array, ra_deg: float, dec_deg: float, sums: Array
 ) -> None:
     """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
     clear_sums(sums)
@@ -127,14 +120,14 @@ def cell_sums(
 
 @compiled
 def stars_near(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
+    stars: Array,
+    bin_start: Indices,
+    frame: Array,
     ra_deg: float,
     dec_deg: float,
     margin: float,
-    found: NDArray[np.float64],
-    rows: NDArray[np.int64],
+    found: Array,
+    rows: Indices,
 ) -> int:
     """List the stars of a circular frame with north up and a margin around it; return how many.
 
@@ -167,13 +160,7 @@ def stars_near(
 
 @compiled
 def cell_features(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    ra_deg: float,
-    dec_deg: float,
-    sums: NDArray[np.float64],
-    out: NDArray[np.float64],
+    stars: Array, bin_start: Indices, frame: Array, ra_deg: float, dec_deg: float, sums: Array, out: Array
 ) -> float:
     """Write the features of the frame centred at (ra, dec) to `out`; return the polar angle in radians."""
     cell_sums(stars, bin_start, frame, ra_deg, dec_deg, sums)
@@ -207,12 +194,12 @@ class FrameSky:
     half_width: float
     full_field: bool
     focal_px: float
-    stars: NDArray[np.float64]
-    bin_start: NDArray[np.int64]
-    source: NDArray[np.int64]
+    stars: Array
+    bin_start: Indices
+    source: Indices
 
     @cached_property
-    def frame(self) -> NDArray[np.float64]:
+    def frame(self) -> Array:
         """The frame's numbers for the kernels, (6,)."""
         reach = self.half_width
         corner = math.sqrt(2.0) if self.full_field else 1.0
@@ -258,9 +245,7 @@ class FrameSky:
             r * math.sin(theta),
         )
 
-    def stars_in_frame(
-        self, ra_deg: float, dec_deg: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def stars_in_frame(self, ra_deg: float, dec_deg: float) -> tuple[Array, Array, Indices]:
         """Brightness (n,), offsets (n, 2) and source rows (n,) of the stars in the frame centred at (ra, dec)."""
         x, y = self.offsets(ra_deg, dec_deg)
         if self.full_field:
@@ -269,7 +254,7 @@ class FrameSky:
             inside = x * x + y * y <= self.half_width * self.half_width
         return self.stars[inside, BRIGHTNESS], np.column_stack([x[inside], y[inside]]), self.source[inside]
 
-    def offsets(self, ra_deg: float, dec_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def offsets(self, ra_deg: float, dec_deg: float) -> tuple[Array, Array]:
         """Offsets x, y of all stars from the frame centre; infinite behind the camera."""
         if self.geometry == "planar":
             x = self.stars[:, RIGHT_ASCENSION] - ra_deg
@@ -286,9 +271,9 @@ class FrameSky:
 
 
 def make_frame_sky(
-    ra_deg: NDArray[np.float64],
-    dec_deg: NDArray[np.float64],
-    brightness: NDArray[np.float64],
+    ra_deg: Array,
+    dec_deg: Array,
+    brightness: Array,
     *,
     geometry: Geometry,
     half_width: float,

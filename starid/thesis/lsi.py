@@ -10,6 +10,7 @@ from typing import Final, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
 from starid.thesis.cell_search import (
     CellArrays,
@@ -77,12 +78,12 @@ class LsiWork(NamedTuple):
         Distance of the nearest cell and number of cells looked at, (2,).
     """
 
-    cells: NDArray[np.int64]
-    dictionary: NDArray[np.float64]
-    places: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    results: NDArray[np.float64]
-    found: NDArray[np.float64]
+    cells: Indices
+    dictionary: Array
+    places: Array
+    weights: Array
+    results: Array
+    found: Array
 
 
 def lsi_work() -> LsiWork:
@@ -126,12 +127,12 @@ class LsiEstimate:
     right_ascension_deg: float
     declination_deg: float
     theta_rad: float
-    omega: NDArray[np.float64]
+    omega: Array
     penalty: float
     error_psi: float
-    reconstruction: NDArray[np.float64]
-    boresight: NDArray[np.float64]
-    pointer: NDArray[np.float64]
+    reconstruction: Array
+    boresight: Array
+    pointer: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +155,13 @@ class LsiSolution:
         Weights and numbers of the two estimates, (2, 9) and (2, 16).
     """
 
-    observation: NDArray[np.float64]
+    observation: Array
     nearest: int
     distance: float
-    cells: NDArray[np.int64]
-    dictionary: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    results: NDArray[np.float64]
+    cells: Indices
+    dictionary: Array
+    weights: Array
+    results: Array
 
     @cached_property
     def mse(self) -> LsiEstimate:
@@ -219,7 +220,7 @@ def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
 
 
 @compiled
-def _flat_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np.float64]) -> None:
+def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     """Combine boresights and angles in the flat plane, with weights scaled to a sum of one."""
     cos_sum = 0.0
     sin_sum = 0.0
@@ -236,7 +237,7 @@ def _flat_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np
 
 
 @compiled
-def _sphere_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np.float64]) -> None:
+def _sphere_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     """Combine boresights and frame-object directions as vectors, so that poles and 0°/360° are like any other place."""
     boresight = np.zeros(3)
     pointer = np.zeros(3)
@@ -274,9 +275,9 @@ def _sphere_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[
 def estimate_from_path(
     searched: SearchedCells,
     cell: int,
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    path: NDArray[np.float64],
+    observation: Array,
+    lambdas: Array,
+    path: Array,
     chosen: tuple[int, int],
     work: LsiWork,
 ) -> None:
@@ -312,11 +313,7 @@ def estimate_from_path(
 
 @compiled
 def estimate_from_cell(
-    searched: SearchedCells,
-    cell: int,
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    work: LsiWork,
+    searched: SearchedCells, cell: int, observation: Array, lambdas: Array, work: LsiWork
 ) -> None:
     """Dictionary, LASSO and estimates about a cell."""
     fill_dictionary(searched, cell, work)
@@ -332,11 +329,7 @@ def estimate_from_cell(
 
 @compiled
 def lsi_kernel(
-    index: CellIndex,
-    searched: SearchedCells,
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    work: LsiWork,
+    index: CellIndex, searched: SearchedCells, observation: Array, lambdas: Array, work: LsiWork
 ) -> int:
     """Search and estimate in one go; return the nearest cell, −1 if there is none."""
     if searched.exact:
@@ -362,12 +355,12 @@ def _angle_gap(code: float, other: float, slack: float) -> float:
 @compiled
 def region_nearest(
     searched: SearchedCells,
-    observation: NDArray[np.float64],
+    observation: Array,
     ra_deg: float,
     dec_deg: float,
     side_deg: float,
     theta: float,
-    found: NDArray[np.float64],
+    found: Array,
 ) -> int:
     """Find the nearest neighbour among the cells of a square region of search; −1 if the region holds no cell.
 
@@ -477,7 +470,7 @@ class LostInSpace:
         """Estimate boresight and roll from the features of one frame, searching the whole database."""
         return self.solve_normalised(self.database.normalise(features))
 
-    def solve_normalised(self, observation: NDArray[np.float64]) -> LsiSolution:
+    def solve_normalised(self, observation: Array) -> LsiSolution:
         """Estimate from a normalised observation ψ̂, (5,).
 
         Raises
@@ -492,7 +485,7 @@ class LostInSpace:
         nearest = lsi_kernel(self.index, self.searched, observation, LAMBDAS, work)
         return _solution(observation, nearest, float(work.found[0]), work)
 
-    def nearest(self, observation: NDArray[np.float64], *, theta_rad: float = math.nan) -> tuple[int, float]:
+    def nearest(self, observation: Array, *, theta_rad: float = math.nan) -> tuple[int, float]:
         """Nearest cell of the whole database and its distance, for a normalised observation; the search alone.
 
         With a polar angle that counts as a sixth feature, 100 for a full turn; the answer then depends on the roll.
@@ -509,9 +502,7 @@ class LostInSpace:
         distances, cells = self.neighbours(observation, 1)
         return int(cells[0]), float(distances[0])
 
-    def neighbours(
-        self, observation: NDArray[np.float64], count: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def neighbours(self, observation: Array, count: int) -> tuple[Array, Indices]:
         """Distances (count,) of the nearest cells by their stored codes, in any order, and these cells; −1 where there are fewer."""
         if self._reference is not None:
             return self._reference.nearest(observation, count)
@@ -521,7 +512,7 @@ class LostInSpace:
 
     def nearest_in_region(
         self,
-        observation: NDArray[np.float64],
+        observation: Array,
         ra_deg: float,
         dec_deg: float,
         side_deg: float,
@@ -537,7 +528,7 @@ class LostInSpace:
         cell = region_nearest(self.searched, observation, ra_deg, dec_deg, side_deg, theta_rad, found)
         return cell, float(found[0]), int(found[1])
 
-    def estimate(self, observation: NDArray[np.float64], cell: int, distance: float) -> LsiSolution:
+    def estimate(self, observation: Array, cell: int, distance: float) -> LsiSolution:
         """Dictionary, LASSO and estimates about a given cell."""
         self._check(observation)
         work = lsi_work()
@@ -550,12 +541,12 @@ class LostInSpace:
             estimate_from_path(self.searched, cell, observation, LAMBDAS, path, chosen, work)
         return _solution(observation, cell, distance, work)
 
-    def _check(self, observation: NDArray[np.float64]) -> None:
+    def _check(self, observation: Array) -> None:
         if observation.shape != (5,) or not np.isfinite(observation).all():
             raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
 
 
-def _solution(observation: NDArray[np.float64], nearest: int, distance: float, work: LsiWork) -> LsiSolution:
+def _solution(observation: Array, nearest: int, distance: float, work: LsiWork) -> LsiSolution:
     return LsiSolution(
         observation, nearest, distance, work.cells, work.dictionary, work.weights, work.results
     )

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -69,9 +69,9 @@ class FieldStars:
         Row of each in the detections given, (n,).
     """
 
-    place: NDArray[np.float64]
-    magnitude: NDArray[np.float64]
-    row: NDArray[np.int64]
+    place: Array
+    magnitude: Array
+    row: Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +257,7 @@ class LsiIdentifier(VerifiedIdentifier):
         self.last_report = LsiReport(coarse, tried, verified, math.nan)
         return Solution.invalid(Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS)
 
-    def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
+    def _zero_points(self, flux: Array) -> list[float]:
         """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""
         if self._given_zero_point is not None:
             return [self._given_zero_point]
@@ -269,16 +269,14 @@ class LsiIdentifier(VerifiedIdentifier):
         guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
         return shown + [guess + step for step in _ZERO_POINT_STEPS]
 
-    def learn(self, solution: Solution, flux: NDArray[np.float64]) -> None:
+    def learn(self, solution: Solution, flux: Array) -> None:
         """Take the zero point that the matched stars of a valid answer show, where none was given."""
         if self._given_zero_point is None and solution.star_count >= _FEWEST_STARS:
             magnitudes = self._catalog.v[solution.catalog_index]
             found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
             self._zero_point = float(np.median(found))
 
-    def field_stars(
-        self, xy: NDArray[np.float64], flux: NDArray[np.float64], zero_point: float
-    ) -> FieldStars:
+    def field_stars(self, xy: Array, flux: Array, zero_point: float) -> FieldStars:
         """Detections with flux in the circular field of the features, brightest first."""
         rows = np.flatnonzero(flux > 0.0)
         directions = self._camera.back_project(xy[rows])
@@ -297,7 +295,7 @@ class LsiIdentifier(VerifiedIdentifier):
             return None
         return extract_features(field.magnitude[bright], field.place[bright])
 
-    def _coarse(self, features: FeatureVector) -> tuple[Attitude, NDArray[np.float64]]:
+    def _coarse(self, features: FeatureVector) -> tuple[Attitude, Array]:
         """Attitude in the thesis's form, one neighbour and LASSO, and its boresight (1, 2) in degrees."""
         solution = self.lost_in_space.solve(features).mse
         x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
@@ -306,7 +304,7 @@ class LsiIdentifier(VerifiedIdentifier):
         place = np.array([[solution.right_ascension_deg, solution.declination_deg]])
         return Attitude.from_matrix(np.stack(rows)), place
 
-    def _candidates(self, features: FeatureVector) -> Iterator[NDArray[np.float64]]:
+    def _candidates(self, features: FeatureVector) -> Iterator[Array]:
         """Boresights (k, 2) in degrees to try: centres of the nearest cells in growing numbers, none twice."""
         observation = self.database.normalise(features)
         most = min(self._neighbours, self.database.cells)
@@ -321,7 +319,7 @@ class LsiIdentifier(VerifiedIdentifier):
             tried = np.concatenate([tried, spots[new]])
             yield centres[new]
 
-    def _spots(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _spots(self, places: Array) -> Array:
         """Number of the spot that each place (n, 2) lies in, on a grid just fine enough for the votes."""
         step = math.degrees(_SPREAD * self._offset_px / self.database.parameters.focal_px)
         band = np.floor((places[:, 1] + 90.0) / step)
@@ -329,22 +327,20 @@ class LsiIdentifier(VerifiedIdentifier):
         return np.asarray(band * _SPOTS_PER_BAND + np.floor(places[:, 0] / 360.0 * columns), dtype=np.float64)
 
     def _attitudes_of(
-        self, field: FieldStars, place: NDArray[np.float64], features: FeatureVector
+        self, field: FieldStars, place: Array, features: FeatureVector
     ) -> Iterator[tuple[Attitude | None, int]]:
         yield from self.attitudes(field, place)
         for places in self._candidates(features):
             yield from self.attitudes(field, places)
 
-    def cell_centres(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    def cell_centres(self, cells: Indices) -> Array:
         """Right ascension and declination of cells, degrees, (n, 2)."""
         grid = self.database.grid
         row = np.searchsorted(grid.row_start, cells, side="right") - 1
         ra = grid.first_ra_deg + (cells - grid.row_start[row]) * grid.row_ra_step_deg[row]
         return np.column_stack([ra % 360.0, grid.row_dec_deg[row]])
 
-    def attitudes(
-        self, field: FieldStars, candidates: NDArray[np.float64]
-    ) -> Iterator[tuple[Attitude | None, int]]:
+    def attitudes(self, field: FieldStars, candidates: Array) -> Iterator[tuple[Attitude | None, int]]:
         """Attitudes of the candidate boresights (k, 2) that the stars vote for, and how many were tried since the last.
 
         The last item has no attitude unless the last candidate gave one.

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -175,7 +175,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         )
         return solution
 
-    def _follow(self, xy: NDArray[np.float64], flux: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float]:
+    def _follow(self, xy: Array, flux: Array) -> tuple[Mask, float]:
         """Which detections are stars, as far as the previous frames show, and the side of the region of search."""
         everything = np.ones(flux.size, dtype=np.bool_)
         if self._filter is None:
@@ -201,7 +201,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         return true_stars, side
 
     def _in_region(
-        self, measured: Measured, true_stars: NDArray[np.bool_], predicted: Attitude, side_deg: float
+        self, measured: Measured, true_stars: Mask, predicted: Attitude, side_deg: float
     ) -> Solution:
         """Verified answer from the cells of the region, the likeliest first."""
         lsi = self.lsi
@@ -232,7 +232,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         return Solution.invalid(Reason.NO_MATCH, mode="tracking")
 
 
-def _spots(predicted: Attitude, side_deg: float) -> NDArray[np.float64]:
+def _spots(predicted: Attitude, side_deg: float) -> Array:
     """Boresights (k, 2) in degrees that cover the region, from its middle outwards."""
     steps = math.ceil(0.5 * side_deg / _SPOT_DEG)
     offsets = np.linspace(-0.5 * side_deg, 0.5 * side_deg, 2 * steps + 1)

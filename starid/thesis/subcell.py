@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
 from starid.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
 from starid.thesis.database import DatabaseError
@@ -35,12 +35,7 @@ _NO_STARS = np.empty((0, 2))
 
 @compiled
 def _residual(
-    arrays: CellArrays,
-    observation: NDArray[np.float64],
-    ra: float,
-    dec: float,
-    sums: NDArray[np.float64],
-    vector: NDArray[np.float64],
+    arrays: CellArrays, observation: Array, ra: float, dec: float, sums: Array, vector: Array
 ) -> float:
     """Write the normalised features at (ra, dec) less the observation to `vector`; return the squared length."""
     cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, sums, vector)
@@ -53,12 +48,7 @@ def _residual(
 
 @compiled
 def newton_from(
-    arrays: CellArrays,
-    observation: NDArray[np.float64],
-    ra: float,
-    dec: float,
-    reach_deg: float,
-    place: NDArray[np.float64],
+    arrays: CellArrays, observation: Array, ra: float, dec: float, reach_deg: float, place: Array
 ) -> float:
     """Improve a boresight until r and σ_r agree; return the squared residual of all five features at the best place.
 
@@ -131,13 +121,7 @@ def newton_from(
 
 @compiled
 def share_seen(
-    arrays: CellArrays,
-    positions: NDArray[np.float64],
-    theta: float,
-    ra: float,
-    dec: float,
-    found: NDArray[np.float64],
-    rows: NDArray[np.int64],
+    arrays: CellArrays, positions: Array, theta: float, ra: float, dec: float, found: Array, rows: Indices
 ) -> float:
     """Share of the observed stars that the catalogue has within 0.75 % of the frame's half width, from a place.
 
@@ -171,13 +155,13 @@ def share_seen(
 def subcell_kernel(
     index: CellIndex,
     arrays: CellArrays,
-    observation: NDArray[np.float64],
-    positions: NDArray[np.float64],
+    observation: Array,
+    positions: Array,
     theta: float,
     reach_deg: float,
-    distances: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    answer: NDArray[np.float64],
+    distances: Array,
+    cells: Indices,
+    answer: Array,
 ) -> int:
     """Try the neighbours from the nearest outwards; return how many starts were made.
 
@@ -284,7 +268,7 @@ class SubcellSearch:
         self._reach = reach_steps * lost_in_space.database.grid.step_deg
         self._neighbours = neighbours
 
-    def solve(self, features: FeatureVector, positions: NDArray[np.float64] | None = None) -> FineEstimate:
+    def solve(self, features: FeatureVector, positions: Array | None = None) -> FineEstimate:
         """Boresight from the features of one frame.
 
         Parameters

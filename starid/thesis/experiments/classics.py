@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.interface import ALGORITHMS, CLASSICS
 from starid.thesis.experiments.classics_sky import SkyName, ThesisSky, thesis_sky
 from starid.thesis.experiments.experiment import (
@@ -122,8 +122,8 @@ def _noise(case: str) -> NoiseModel:
 
 
 def _identify_frames(
-    context: Context, sky: ThesisSky, name: str, solver: Any, noise: NoiseModel, frames: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    context: Context, sky: ThesisSky, name: str, solver: Any, noise: NoiseModel, frames: Array
+) -> tuple[Array, Array]:
     """ε_f of each frame, degrees, NaN where there is no answer, and milliseconds."""
     errors, times = np.full(len(frames), np.nan), np.empty(len(frames))
     rng = context.rng(sky.name, repr(noise))

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import agreement, same, shown
 from starid.thesis.experiments.experiment import (
     Context,
@@ -47,7 +47,7 @@ As a frame near δ = ±90° reaches beyond the pole, where the flat plane ends, 
 makes r grow and n fall at the upper and lower rims of the maps."""
 
 
-def _features(centres: NDArray[np.float64], kappa: float) -> NDArray[np.float64]:
+def _features(centres: Array, kappa: float) -> Array:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without a star."""
     from starid.thesis.frame_sky import cell_features
 

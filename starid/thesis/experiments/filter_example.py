@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Mask
 from starid.thesis.cme import matched_motion
 from starid.thesis.experiments.comparison import same, shown
 from starid.thesis.experiments.experiment import (
@@ -57,7 +57,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return [Part("example")]
 
 
-def _field(limit: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _field(limit: float) -> tuple[Array, Array]:
     """Magnitudes (n,) and α, δ in degrees (n, 2) of the stars of the field to a limit, brightest first."""
     catalog = star_catalog()
     places = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad]))
@@ -84,7 +84,7 @@ def _to_pixels(frame: ObservedFrame) -> ObservedFrame:
     return ObservedFrame(frame.brightness, np.rint(frame.positions / PIXEL_DEG) * PIXEL_DEG)
 
 
-def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[Array, Mask]:
     """All disparities of two frames, (n, 3), and which of them are in the main cluster."""
     first, second = pairs_of(before), pairs_of(now)
     found = np.empty((len(first) * len(second), 3))
@@ -120,7 +120,7 @@ def _cluster_figure(context: Context, result: Results) -> str:
     return save(fig, context.folder / "figure_3_2.png")
 
 
-def _image(brightness: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def _image(brightness: Array, pixels: Array) -> Array:
     """Stars as Gaussians on the detector; intensity falls linearly with magnitude, as in the thesis's 8-bit images."""
     image = np.zeros((_PIXELS, _PIXELS))
     reach = np.arange(-8, 9)

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import agreement, improvement, sampled_mean, shown
 from starid.thesis.experiments.experiment import (
     Context,
@@ -89,7 +89,7 @@ def _work(context: Context, part: Part) -> Results:
     )
 
 
-def _error_map(axes: Any, errors: NDArray[np.float64], limit: float) -> Any:
+def _error_map(axes: Any, errors: Array, limit: float) -> Any:
     from matplotlib.colors import ListedColormap
 
     scheme = ListedColormap(error_colours(np.linspace(0.0, 1.0, 256), 1.0))

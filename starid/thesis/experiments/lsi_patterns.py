@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import Readings, agreement, same, shown
 from starid.thesis.experiments.experiment import Context, Results, Row, write_csv
 from starid.thesis.experiments.lsi_trials import GRID_WORDS, OFF, ON, count_words
@@ -29,7 +29,7 @@ def complete(results: Mapping[str, Results]) -> bool:
     return all(f"{case}-{grid}" in results for case in _CASES for grid in (ON, OFF))
 
 
-def _logarithm(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _logarithm(errors: Array) -> Array:
     return np.asarray(1.0 + np.log10(np.maximum(errors, _LEAST)), dtype=np.float64)
 
 
@@ -50,9 +50,7 @@ def _patterns(context: Context, results: Mapping[str, Results], grid: str) -> st
     return save(fig, context.folder / f"figures_6_20_to_6_27_and_b_{grid}.png")
 
 
-def _below_thresholds(
-    errors: NDArray[np.float64], psi: NDArray[np.float64], thresholds: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _below_thresholds(errors: Array, psi: Array, thresholds: Array) -> tuple[Array, Array]:
     """Mean and standard deviation of the errors whose ε_ψ is below each threshold; NaN where there are none."""
     order = np.argsort(psi)
     counts = np.searchsorted(psi[order], thresholds)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.classics import SHORT, TABLE_6_2
 from starid.thesis.experiments.comparison import improvement, shown
 from starid.thesis.experiments.experiment import (
@@ -55,7 +55,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return parts_of("p{percent:g}-{grid}", percent=parameters["percent"], grid=(ON, OFF))
 
 
-def _milliseconds(count: int, work: Callable[[int], object]) -> NDArray[np.float64]:
+def _milliseconds(count: int, work: Callable[[int], object]) -> Array:
     """Least time of each of `count` calls in several passes, ms."""
     best = np.full(count, np.inf)
     for _ in range(_PASSES):

@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.cme import matched_motion
 from starid.thesis.database import DatabaseParameters, build_database
 from starid.thesis.experiments.comparison import shown
@@ -69,9 +69,7 @@ def _divided() -> DividedField:
     return DividedField(LostInSpace(database), half_width_deg=_HALF_WIDTH_DEG)
 
 
-def _spoiled(
-    rng: np.random.Generator, case: str, brightness: NDArray[np.float64], places: NDArray[np.float64]
-) -> ObservedFrame:
+def _spoiled(rng: np.random.Generator, case: str, brightness: Array, places: Array) -> ObservedFrame:
     """A frame with what a case takes from it or adds to it."""
     if case == "covered":
         seen = places[:, 0] < _COVERED_FROM_DEG

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.cme import MotionModel, matched_motion
 from starid.thesis.experiments.comparison import agreement, sampling
 from starid.thesis.experiments.experiment import (
@@ -109,7 +109,7 @@ def _clean(context: Context, part: Part) -> Results:
     """ε_f, ε_θ and ε_ψ of frames off the grid, searched in the region of table 6.8 about their true places."""
     overlap = part.values["overlap"]
     found: Results = {}
-    frames: NDArray[np.float64] | None = None
+    frames: Array | None = None
     for reading in ("author", "printed"):
         lsi = context.lost_in_space(overlap, _solver(reading))
         if frames is None:
@@ -138,7 +138,7 @@ def _filtered(frames: Sequence[SimulatedFrame]) -> list[FilterResult]:
     return [cluster(before.observed, now.observed) for before, now in itertools.pairwise(frames)]
 
 
-def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]) -> NDArray[np.float64]:
+def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]) -> Array:
     """μ_d and σ_d of the matches, and of all survivors to their nearest neighbours, degrees, (n, 4)."""
     found = np.full((len(results), 4), math.nan)
     for i, (before, now, result) in enumerate(zip(frames[:-1], frames[1:], results, strict=True)):
@@ -181,7 +181,7 @@ def _work(context: Context, part: Part) -> Results:
     return found
 
 
-def _means(numbers: NDArray[np.float64]) -> dict[str, float]:
+def _means(numbers: Array) -> dict[str, float]:
     """Statistics of a run after its first frame, which has no filter."""
     settled = dict(zip(FIELDS, numbers[:, _FIRST:], strict=True))
     side = settled["side"][np.isfinite(settled["side"])]

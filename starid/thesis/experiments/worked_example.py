@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import agreement, improvement, rounding, same
 from starid.thesis.experiments.experiment import (
     Context,
@@ -154,9 +154,7 @@ def _work(context: Context, part: Part) -> Results:
     return {**results, **_author(context)}
 
 
-def _within(
-    ours: NDArray[np.float64], published: Sequence[float], tolerance: float = _HALF_DIGIT
-) -> list[bool]:
+def _within(ours: Array, published: Sequence[float], tolerance: float = _HALF_DIGIT) -> list[bool]:
     return [bool(close) for close in np.abs(ours - np.asarray(published, dtype=float)) <= tolerance]
 
 
@@ -167,8 +165,8 @@ def _list(values: Any, digits: int = 2) -> str:
 def _numbers(
     quantity: str,
     published: Sequence[float],
-    author: NDArray[np.float64],
-    printed: NDArray[np.float64] | None = None,
+    author: Array,
+    printed: Array | None = None,
     *,
     digits: int = 2,
     unit: str = "",
