@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
@@ -19,7 +19,7 @@ from starid.geometric.identifier import Identifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
-from starid.photograph.views import Counts, View, views
+from starid.photograph.views import View, views
 from starid.solution import Reason, Solution
 
 _log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class ImageSolution:
 
 
 def solve_image(
-    image: Counts,
+    image: GreyImage,
     camera: Camera | None = None,
     catalog: StarCatalog | None = None,
     *,
@@ -114,7 +114,7 @@ def solve_image(
 
 
 def _solve_roughly(
-    image: Counts,
+    image: GreyImage,
     camera: Camera,
     sky: StarCatalog,
     fov_tolerance: float,

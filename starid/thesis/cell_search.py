@@ -19,8 +19,8 @@ from starid.arrays import Array, Indices, Indices32
 from starid.jit import compiled
 from starid.thesis.database import CODE_MAX, FeatureDatabase
 from starid.thesis.features import FEATURE_COUNT
-from starid.thesis.frame_grid import cell_row
-from starid.thesis.frame_sky import cell_features
+from starid.thesis.frame_grid import GridArrays, cell_place
+from starid.thesis.frame_sky import SkyArrays, cell_features
 
 MAX_DEPTH: Final = 22
 """Most levels of the tree: four million buckets."""
@@ -60,35 +60,17 @@ class CellIndex(NamedTuple):
 
 
 class CellArrays(NamedTuple):
-    """Plain arrays of a database for compiled code: stars, frame, grid and normalisation."""
+    """Plain arrays of a database for compiled code: stars and frame, grid, and normalisation."""
 
-    stars: Array
-    bin_start: Indices
-    frame: Array
-    row_start: Indices
-    row_columns: Indices
-    row_dec: Array
-    row_ra_step: Array
-    first_ra: float
+    sky: SkyArrays
+    grid: GridArrays
     minimum: Array
     scale: Array
 
 
 def cell_arrays(database: FeatureDatabase) -> CellArrays:
     """Gather the arrays of a database."""
-    grid, sky = database.grid, database.sky
-    return CellArrays(
-        sky.stars,
-        sky.bin_start,
-        sky.frame,
-        grid.row_start,
-        grid.row_columns,
-        grid.row_dec_deg,
-        grid.row_ra_step_deg,
-        grid.first_ra_deg,
-        database.minimum,
-        database.scale,
-    )
+    return CellArrays(database.sky.arrays, database.grid.arrays, database.minimum, database.scale)
 
 
 @compiled
@@ -209,6 +191,22 @@ def _push_children(
 
 
 @compiled
+def _next_vectors(
+    index: CellIndex, query: Array, slack: float, limit: float, stack: Array, top: int
+) -> tuple[int, int, int]:
+    """Take the nearest branch from the stack: the vectors to look at, none where it is cut or halved, and the new top."""
+    top -= 1
+    if stack[top, 2] > limit:
+        return 0, 0, top
+    level, prefix = int(stack[top, 0]), int(stack[top, 1])
+    rest = index.depth - level
+    first, last = index.start[prefix << rest], index.start[(prefix + 1) << rest]
+    if rest > 0 and last - first > _SCAN:
+        return 0, 0, _push_children(index, level, prefix, query, slack, limit, stack, top)
+    return first, last, top
+
+
+@compiled
 def _sift_down(distances: Array, cells: Indices, size: int) -> None:
     """Restore the heap (greatest distance, then greatest cell, on top) after its top was replaced."""
     at = 0
@@ -245,23 +243,10 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
     for i in range(size):
         distances[i] = math.inf
         cells[i] = -1
-    stack = np.empty((_STACK, 3))
-    stack[0, 0] = 0
-    stack[0, 1] = 0
-    stack[0, 2] = 0.0
+    stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
-        top -= 1
-        if stack[top, 2] > distances[0]:
-            continue
-        level = int(stack[top, 0])
-        prefix = int(stack[top, 1])
-        rest = index.depth - level
-        first = index.start[prefix << rest]
-        last = index.start[(prefix + 1) << rest]
-        if rest > 0 and last - first > _SCAN:
-            top = _push_children(index, level, prefix, query, 0.0, distances[0], stack, top)
-            continue
+        first, last, top = _next_vectors(index, query, 0.0, distances[0], stack, top)
         for i in range(first, last):
             d = 0.0
             for f in range(5):
@@ -276,9 +261,8 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
 @compiled
 def exact_vector(arrays: CellArrays, cell: int, sums: Array, out: Array) -> float:
     """Write the normalised features of a cell in full precision to `out`; return its polar angle in radians."""
-    row = cell_row(arrays.row_start, cell)
-    ra = (arrays.first_ra + (cell - arrays.row_start[row]) * arrays.row_ra_step[row]) % 360.0
-    theta = cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra, arrays.row_dec[row], sums, out)
+    ra, dec = cell_place(arrays.grid, cell)
+    theta = cell_features(arrays.sky, ra % 360.0, dec, sums, out)
     for f in range(5):
         out[f] = (out[f] - arrays.minimum[f]) * arrays.scale[f]
     return theta
@@ -310,23 +294,10 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
     vector = np.empty(5)
     best = _exact_distance(arrays, best_cell, observation, sums, vector)
     computed = 1
-    stack = np.empty((_STACK, 3))
-    stack[0, 0] = 0
-    stack[0, 1] = 0
-    stack[0, 2] = 0.0
+    stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
-        top -= 1
-        if stack[top, 2] > best:
-            continue
-        level = int(stack[top, 0])
-        prefix = int(stack[top, 1])
-        rest = index.depth - level
-        first = index.start[prefix << rest]
-        last = index.start[(prefix + 1) << rest]
-        if rest > 0 and last - first > _SCAN:
-            top = _push_children(index, level, prefix, query, _HALF_STEP, best, stack, top)
-            continue
+        first, last, top = _next_vectors(index, query, _HALF_STEP, best, stack, top)
         for i in range(first, last):
             d = 0.0
             for f in range(5):

@@ -14,7 +14,7 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.jit import compiled
-from starid.thesis.frame_sky import stars_near
+from starid.thesis.frame_sky import SkyArrays, stars_near
 
 MAX_STARS: Final = 256
 """Most catalogue stars of a cell that are considered."""
@@ -139,9 +139,7 @@ def pair_stars(
 
 @compiled
 def next_candidate(
-    stars: Array,
-    bin_start: Indices,
-    frame: Array,
+    sky: SkyArrays,
     observed: Array,
     candidates: Array,
     start: int,
@@ -152,7 +150,7 @@ def next_candidate(
 
     Parameters
     ----------
-    stars, bin_start, frame
+    sky
         Stars of a spherical database.
     observed
         x, y in pixels and magnitude of the observed stars, (n, 3).
@@ -174,9 +172,7 @@ def next_candidate(
     votes = np.empty(ROLL_BINS)
     offset, gate, share, fewest = settings[0], settings[1], settings[2], settings[3]
     for place in range(start, candidates.shape[0]):
-        count = stars_near(
-            stars, bin_start, frame, candidates[place, 0], candidates[place, 1], offset, near, rows
-        )
+        count = stars_near(sky, candidates[place, 0], candidates[place, 1], offset, near, rows)
         need = max(fewest, share * min(n, count))
         if min(n, count) < fewest:
             continue

@@ -174,14 +174,11 @@ def extract_features(
     if a.size == 0:
         raise FeatureError("features: no star in the frame; check the pointing and the brightness limit")
     out = np.empty(FEATURE_COUNT)
-    theta = float(frame_features(a, x, y, out))
-    return FeatureVector(
-        n=a.size,
-        A=float(out[1]),
-        r=float(out[2]),
-        sigma_A=float(out[3]),
-        sigma_r=float(out[4]),
-        theta_rad=theta,
-        x=float(out[2] * math.cos(theta)),
-        y=float(out[2] * math.sin(theta)),
-    )
+    return feature_vector(out, float(frame_features(a, x, y, out)))
+
+
+def feature_vector(numbers: Array, theta_rad: float) -> FeatureVector:
+    """Feature vector of the numbers that `finish_features` writes and the angle that it returns."""
+    n, mean, r, sigma_a, sigma_r = numbers.tolist()
+    x, y = r * math.cos(theta_rad), r * math.sin(theta_rad)
+    return FeatureVector(int(n), mean, r, sigma_a, sigma_r, theta_rad, x, y)

@@ -5,14 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.errors import StaridError
 from starid.jit import compiled
-from starid.thesis.features import SUM_COUNT, FeatureVector, add_star, clear_sums, finish_features
+from starid.thesis.features import (
+    SUM_COUNT,
+    FeatureVector,
+    add_star,
+    clear_sums,
+    feature_vector,
+    finish_features,
+)
 from starid.thesis.frame_grid import Geometry
 
 Direction = Literal["faintest", "brightest"]
@@ -33,6 +40,14 @@ in pixels, greatest angle of a star from the centre in degrees, brightness to su
 
 class SkyError(StaridError):
     """Stars or a frame that no database can be made of."""
+
+
+class SkyArrays(NamedTuple):
+    """What the kernels read of a `FrameSky`: its table of stars, the first star of each bin, and the frame's numbers."""
+
+    stars: Array
+    bin_start: Indices
+    frame: Array
 
 
 @compiled
@@ -95,10 +110,9 @@ def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) 
 
 
 @compiled
-def cell_sums(
-    stars: Array, bin_start: Indices, frame: Array, ra_deg: float, dec_deg: float, sums: Array
-) -> None:
+def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> None:
     """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
+    stars, bin_start, frame = sky
     clear_sums(sums)
     half = frame[HALF_WIDTH]
     half2 = half * half
@@ -120,19 +134,13 @@ def cell_sums(
 
 @compiled
 def stars_near(
-    stars: Array,
-    bin_start: Indices,
-    frame: Array,
-    ra_deg: float,
-    dec_deg: float,
-    margin: float,
-    found: Array,
-    rows: Indices,
+    sky: SkyArrays, ra_deg: float, dec_deg: float, margin: float, found: Array, rows: Indices
 ) -> int:
     """List the stars of a circular frame with north up and a margin around it; return how many.
 
     `found` (n, 3) receives x, y in the frame's unit and the magnitude, `rows` (n,) the stars' rows in the table.
     """
+    stars, bin_start, frame = sky
     spherical = frame[SPHERICAL] > 0.5
     limit = (frame[HALF_WIDTH] + margin) ** 2
     reach = frame[HALF_WIDTH] + margin
@@ -159,12 +167,10 @@ def stars_near(
 
 
 @compiled
-def cell_features(
-    stars: Array, bin_start: Indices, frame: Array, ra_deg: float, dec_deg: float, sums: Array, out: Array
-) -> float:
+def cell_features(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array, out: Array) -> float:
     """Write the features of the frame centred at (ra, dec) to `out`; return the polar angle in radians."""
-    cell_sums(stars, bin_start, frame, ra_deg, dec_deg, sums)
-    return finish_features(sums, frame[PIVOT], out)
+    cell_sums(sky, ra_deg, dec_deg, sums)
+    return finish_features(sums, sky.frame[PIVOT], out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +223,11 @@ class FrameSky:
             ]
         )
 
+    @cached_property
+    def arrays(self) -> SkyArrays:
+        """What the kernels read."""
+        return SkyArrays(self.stars, self.bin_start, self.frame)
+
     def features(self, ra_deg: float, dec_deg: float) -> FeatureVector:
         """Feature vector of the frame centred at (ra, dec), degrees, north up.
 
@@ -226,24 +237,12 @@ class FrameSky:
             If no star lies in that frame.
         """
         out = np.empty(5)
-        theta = float(
-            cell_features(self.stars, self.bin_start, self.frame, ra_deg, dec_deg, np.empty(SUM_COUNT), out)
-        )
+        theta = float(cell_features(self.arrays, ra_deg, dec_deg, np.empty(SUM_COUNT), out))
         if out[0] < 1.0:
             raise SkyError(
                 f"sky: no star in the frame at ({ra_deg:.3f}°, {dec_deg:.3f}°) within the brightness limit"
             )
-        r = float(out[2])
-        return FeatureVector(
-            int(out[0]),
-            float(out[1]),
-            r,
-            float(out[3]),
-            float(out[4]),
-            theta,
-            r * math.cos(theta),
-            r * math.sin(theta),
-        )
+        return feature_vector(out, theta)
 
     def stars_in_frame(self, ra_deg: float, dec_deg: float) -> tuple[Array, Array, Indices]:
         """Brightness (n,), offsets (n, 2) and source rows (n,) of the stars in the frame centred at (ra, dec)."""

@@ -29,7 +29,6 @@ from starid.thesis.matlab_lasso import matlab_path
 from starid.thesis.reference import ReferenceSearch, reference_path
 
 Precision = Literal["exact", "stored"]
-Choice = Literal["mse", "1se"]
 Solver = Literal["exact", "matlab", "sklearn"]
 
 _WHOLE_SKY_DEG: Final = 720.0
@@ -173,10 +172,6 @@ class LsiSolution:
         """Estimate at the largest λ within one standard error of the least."""
         return self._estimate(1)
 
-    def choose(self, choice: Choice) -> LsiEstimate:
-        """Estimate by name."""
-        return self.mse if choice == "mse" else self.one_se
-
     def _estimate(self, row: int) -> LsiEstimate:
         numbers, omega = self.results[row], self.weights[row]
         return LsiEstimate(
@@ -196,19 +191,11 @@ class LsiSolution:
 def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
     """Set up the dictionary about a cell: its features, the boresights F of eq. 2.16 and the angles Θ of eq. 2.18."""
     arrays = searched.arrays
-    first_row = dictionary_cells(
-        arrays.row_start,
-        arrays.row_columns,
-        arrays.row_ra_step,
-        arrays.first_ra,
-        cell,
-        work.cells,
-        work.places[0],
-    )
+    first_row = dictionary_cells(arrays.grid, cell, work.cells, work.places[0])
     sums = np.empty(8)
     vector = np.empty(5)
     for j in range(9):
-        work.places[1, j] = arrays.row_dec[first_row + j // 3]
+        work.places[1, j] = arrays.grid.row_dec[first_row + j // 3]
         if searched.exact:
             work.places[2, j] = exact_vector(arrays, work.cells[j], sums, vector)
             for f in range(5):
@@ -304,7 +291,7 @@ def estimate_from_path(
         result[0] = total
         result[4] = math.sqrt(square)
         result[5] = lambdas[chosen[row]]
-        if searched.arrays.frame[0] > 0.5:
+        if searched.arrays.sky.frame[0] > 0.5:
             _sphere_estimate(omega, work, result)
         else:
             _flat_estimate(omega, work, result)
@@ -375,7 +362,7 @@ def region_nearest(
     found
         Output (2,): distance on the normalised scale and number of cells in the region.
     """
-    arrays = searched.arrays
+    arrays, grid = searched.arrays, searched.arrays.grid
     sums = np.empty(8)
     vector = np.empty(5)
     best_cell = -1
@@ -385,18 +372,18 @@ def region_nearest(
     counts_angle = not math.isnan(theta)
     theta_code = theta * _CODES_PER_RADIAN if counts_angle else 0.0
     slack = 0.5 + 1e-9 if searched.exact else 0.0
-    for row in range(arrays.row_dec.size):
-        if abs(arrays.row_dec[row] - dec_deg) > half:
+    for row in range(grid.row_dec.size):
+        if abs(grid.row_dec[row] - dec_deg) > half:
             continue
-        step = arrays.row_ra_step[row]
-        columns = arrays.row_columns[row]
+        step = grid.row_ra_step[row]
+        columns = grid.row_columns[row]
         width = half
-        if arrays.frame[0] > 0.5:
-            width = half / max(math.cos(math.radians(arrays.row_dec[row])), half / 180.0)
-        first = math.ceil((ra_deg - width - arrays.first_ra) / step)
-        last = min(math.floor((ra_deg + width - arrays.first_ra) / step), first + columns - 1)
+        if arrays.sky.frame[0] > 0.5:
+            width = half / max(math.cos(math.radians(grid.row_dec[row])), half / 180.0)
+        first = math.ceil((ra_deg - width - grid.first_ra) / step)
+        last = min(math.floor((ra_deg + width - grid.first_ra) / step), first + columns - 1)
         for place in range(first, last + 1):
-            cell = arrays.row_start[row] + place % columns
+            cell = grid.row_start[row] + place % columns
             if searched.theta[cell] == 255:
                 continue
             count += 1

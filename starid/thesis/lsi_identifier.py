@@ -352,9 +352,7 @@ class LsiIdentifier(VerifiedIdentifier):
         matched = np.empty((voters, 2), dtype=np.int64)
         start = 0
         while start < len(candidates):
-            place, count = next_candidate(
-                sky.stars, sky.bin_start, sky.frame, observed, candidates, start, settings, matched
-            )
+            place, count = next_candidate(sky.arrays, observed, candidates, start, settings, matched)
             if place < 0:
                 yield None, len(candidates) - start
                 return

@@ -55,7 +55,7 @@ def _features(centres: Array, kappa: float) -> Array:
     table = np.full((len(centres), 6), np.nan)
     sums, out = np.empty(8), np.empty(5)
     for i, (ra, dec) in enumerate(centres):
-        angle = cell_features(sky.stars, sky.bin_start, sky.frame, ra % 360.0, dec, sums, out)
+        angle = cell_features(sky.arrays, ra % 360.0, dec, sums, out)
         if out[0] >= 1.0:
             table[i, :5] = out
             table[i, 5] = np.degrees(angle)
