@@ -65,6 +65,6 @@ def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> NDArray[np.floa
     p, beta = np.asarray(directions, dtype=np.float64), checked_beta(velocity_m_s)
     inverse_gamma = math.sqrt(1.0 - float(beta @ beta))
     along = (p @ beta)[..., None]
-    seen = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
-    unit: NDArray[np.float64] = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
-    return unit
+    seen: NDArray[np.float64] = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
+    seen /= 1.0 + along
+    return seen
