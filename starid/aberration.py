@@ -66,6 +66,6 @@ def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> Array:
     p, beta = np.asarray(directions, dtype=np.float64), checked_beta(velocity_m_s)
     inverse_gamma = math.sqrt(1.0 - float(beta @ beta))
     along = (p @ beta)[..., None]
-    seen = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
-    unit: Array = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
-    return unit
+    seen: Array = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
+    seen /= 1.0 + along
+    return seen

@@ -158,21 +158,38 @@ _FRAME_COLUMNS: Final[tuple[Column, ...]] = (
 )
 
 
+_BODIES_COLUMNS: Final[tuple[Column, ...]] = (
+    ("in the field", lambda row: row.in_field),
+    *_FRAME_COLUMNS[:2],
+    ("without ms", _figure("without_ms", 2)),
+    ("with ms", _figure("with_ms", 2)),
+    ("ratio", _figure("ratio", 3)),
+)
+
+
 @group.command("frame")
 def frame(
     frames: Annotated[int, typer.Option(min=1, help="Number of measured frames.")] = 200,
     seed: Seed = 1,
     rate: Annotated[float, typer.Option(help="Body rate during the exposures, degrees/s.")] = 0.0,
+    bodies: Annotated[
+        bool,
+        typer.Option("--bodies", help="Frames with bodies and aberration against the same without, at rest."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure the processor time of each stage of a frame on one core: render, detect, identify."""
-    from starhil.emulator.benchmarks.frame import measure_frames
+    from starhil.emulator.benchmarks.frame import measure_bodies, measure_frames
 
-    rows = measure_frames(frames, seed, rate, progress=_progress())
+    rows: list[Any]
+    if bodies:
+        rows = measure_bodies(frames, seed, _progress())
+    else:
+        rows = measure_frames(frames, seed, rate, progress=_progress())
     if as_json:
         print(json.dumps({"seed": seed, "rows": _dicts(rows)}))
     else:
-        _print_table(_FRAME_COLUMNS, rows)
+        _print_table(_BODIES_COLUMNS if bodies else _FRAME_COLUMNS, rows)
 
 
 @group.command("bus")
