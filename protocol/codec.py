@@ -357,6 +357,8 @@ class Row:
     """Arguments of the action that no field gives."""
     answers: tuple[str, ...] = ("reply",)
     """Answers in their order: `echo`, `reply`, `row:NAME`."""
+    zeros: bool = False
+    """Whether fields that are bound to nothing are sent as zeros on purpose."""
 
     def __repr__(self) -> str:
         """Return kind, id and name."""

@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
-from starhil.protocol.icd_schema import BitModel, FieldModel, Scalar
+from starhil.protocol.field_text import fields_of
+from starhil.protocol.icd_schema import BitModel, FieldModel, RepeatModel, Scalar
 from starhil.protocol.link_schema import Order
 from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError
 
@@ -62,19 +63,39 @@ class Layout:
     def add(self, model: FieldModel) -> None:
         """Append a field, a series of numbered fields, a repeated group, or the bits of a bit field."""
         where = f"{self._where}: field {model.name or 'unused'}"
+        if model.text is not None:
+            for item in self._of_text(model):
+                self._place(item, f"{self._where}: field {item.name or 'unused'}", "", self._number)
+            return
         if model.repeat is not None:
-            if model.model_fields_set - {"repeat", "doc"}:
-                raise IcdError(f"{where}: `repeat` stands alone, with its own fields")
-            for number in range(1, model.repeat.count + 1):
-                for item in model.repeat.fields:
-                    if item.repeat is not None or item.count is not None:
-                        raise IcdError(f"{where}: a repeated group holds neither `repeat` nor `count`")
-                    self._place(item, where, f"_{number}", number)
+            self._add_repeat(model, model.repeat, where)
             return
         if model.count is None:
             self._place(model, where, "", self._number)
         for number in range(1, (model.count or 0) + 1):
             self._place(model, where, f"_{number}", number)
+
+    def _add_repeat(self, model: FieldModel, repeat: RepeatModel, where: str) -> None:
+        if model.model_fields_set - {"repeat", "doc"}:
+            raise IcdError(f"{where}: `repeat` stands alone, with its own fields")
+        group = [single for item in repeat.fields for single in self._of_text(item)]
+        if any(item.repeat is not None or item.count is not None for item in group):
+            raise IcdError(f"{where}: a repeated group holds neither `repeat` nor `count`")
+        for number in range(repeat.first, repeat.first + repeat.count):
+            for item in group:
+                self._place(item, where, f"_{number}", number)
+
+    def _of_text(self, model: FieldModel) -> list[FieldModel]:
+        """Return the fields that a text stands for, or the field itself."""
+        if model.text is None:
+            return [model]
+        where = f"{self._where}: field {model.text!r}"
+        if model.model_fields_set != {"text"}:
+            raise IcdError(f"{where}: `text` stands alone")
+        try:
+            return fields_of(model.text)
+        except IcdError as error:
+            raise IcdError(f"{where}: {error}") from None
 
     def _place(self, model: FieldModel, where: str, suffix: str, number: int | None) -> None:
         if model.type is None:

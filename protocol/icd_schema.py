@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from starhil.protocol.link_schema import LinkModel, Order
 
@@ -38,6 +38,8 @@ class UnitModel(_Model):
     """The public source of the confirmed rows that name none themselves."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Ids from this one up are telemetry, those below are telecommands; left out if classes or rows decide."""
+    provenance: Provenance | None = None
+    """That of the rows that name none."""
     plugin: str | None = None
     """Python file beside the definition, with quantities, actions, framings or checks of the unit's own."""
 
@@ -119,14 +121,18 @@ class RepeatModel(_Model):
     """A group of fields that follows `count` times; `[n]` in a quantity's name is the number of the repetition."""
 
     count: Annotated[int, Field(ge=1, le=256)]
-    """Number of repetitions; their names end in _1, _2 …"""
+    """Number of repetitions; their names end in _1, _2 …, unless `first` is given."""
     fields: list[FieldModel] = Field(min_length=1)
     """Fields of the group."""
+    first: Annotated[int, Field(ge=0, le=256)] = 1
+    """Number of the first repetition."""
 
 
 class FieldModel(_BoundModel):
-    """One field of a row; unused and sent as zeros if it has no name."""
+    """One field of a row; unused and sent as zeros if it has no name. A text in place of the table is its `text`."""
 
+    text: str | None = None
+    """Fields in short, as in `i16 mag{0,1}_{x,y,z} uT 0.01`, in place of all other keys."""
     count: Annotated[int, Field(ge=2, le=64)] | None = None
     """Expands to the fields name_1 … name_count."""
     repeat: RepeatModel | None = None
@@ -155,6 +161,11 @@ class FieldModel(_BoundModel):
     provenance: Provenance | None = None
     """That of the row unless given."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_text(cls, given: object) -> object:
+        return {"text": given} if isinstance(given, str) else given
+
 
 class RowModel(_Model):
     """A telecommand or telemetry row."""
@@ -169,16 +180,20 @@ class RowModel(_Model):
     """Class of the row; needed where there are several of its kind."""
     doc: str
     """What the row is."""
-    provenance: Provenance
-    """`confirmed` by a public source, `proxy` from a relative of the unit, or `ours`."""
+    provenance: Provenance | None = None
+    """`confirmed` by a public source, `proxy` from a relative of the unit, or `ours`; that of the unit unless given."""
     source: str = ""
     """The public source."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Bytes of data, to check the fields against."""
     fields: list[FieldModel] | None = None
-    """Fields in the order on the wire."""
+    """Fields in the order on the wire, after those of `include`; each is a table or a text."""
     include: list[str] | None = None
     """Names of rows whose fields this row concatenates, in order."""
+    unbound: Literal["zeros"] | None = None
+    """`zeros`: fields that are bound to nothing are sent as zeros on purpose; a mistake unless given."""
+    readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    """Identifier of the telemetry that reports what a telecommand named `set_…` was last accepted with; named without `set_`."""
     action: str | None = None
     """What a telecommand does."""
     arguments: dict[Name, Scalar] = {}

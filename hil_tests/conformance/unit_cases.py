@@ -377,7 +377,9 @@ def _read_back(command: Row, row: Row, used: bytes) -> Run:
 
 def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
     """Return a value within the limits: of bytes that the framing uses, if it may have them, or random."""
-    pattern = (used * 8)[turn : turn + field.size] if turn < 2 and used else rng.randbytes(field.size)
+    pattern = (
+        (used * (turn + field.size))[turn:][: field.size] if turn < 2 and used else rng.randbytes(field.size)
+    )
     match field.kind:
         case "bytes":
             return pattern
