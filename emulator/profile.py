@@ -24,7 +24,7 @@ from starhil.emulator.truth.config import (
     unix_time,
 )
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.unit_folders import DEFAULT_UNIT, shipped_units
+from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_EXTENDS_DEPTH: Final = 8
@@ -311,7 +311,7 @@ class Profile(Strict):
     @property
     def unit_source(self) -> str:
         """The unit for `load_unit`: a name that ships, else a folder relative to the profile's file."""
-        if self.unit in shipped_units():
+        if self.unit in bundled_units():
             return self.unit
         return str(self.folder / Path(self.unit).expanduser())
 

@@ -1,11 +1,12 @@
 """Locks on symlinks and other names, each held by one running emulator.
 
-The lock is an abstract Unix socket named after it. The kernel releases it when the process ends, and
-reports the process ID to another process that connects to it.
+A lock is an abstract Unix socket. The kernel releases it when the process ends, and reports the process ID to another process that
+connects to it. Abstract sockets belong to a network namespace: emulators in different containers do not see each other's locks.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import socket
@@ -25,7 +26,7 @@ def lock_symlink(path: Path) -> socket.socket:
     Raises
     ------
     EmulatorError
-        Another emulator uses it, or the existing symlink was not made by an emulator.
+        Another emulator uses it, it cannot be locked, or the existing symlink was not made by an emulator.
     """
     if path.is_symlink() and not str(path.readlink()).startswith("/dev/pts/"):
         raise EmulatorError(
@@ -33,36 +34,32 @@ def lock_symlink(path: Path) -> socket.socket:
         )
     try:
         return lock_name("symlink", os.fsencode(path.parent.resolve() / path.name))
-    except NameTakenError as error:
-        raise EmulatorError(
-            f"symlink {path}: in use by another emulator, process {error.owner}; end that one, or choose another name"
-        ) from None
+    except LockError as error:
+        raise EmulatorError(f"symlink {path}: {error}; choose another name") from None
 
 
-class NameTakenError(EmulatorError):
-    """Another emulator uses the name; `owner` is its process ID."""
-
-    def __init__(self, owner: str) -> None:
-        super().__init__(f"in use by another emulator, process {owner}")
-        self.owner = owner
+class LockError(EmulatorError):
+    """A name cannot be locked; the text is the reason, usually another emulator and its process ID."""
 
 
 def lock_name(kind: str, name: bytes) -> socket.socket:
-    """Lock a name of some kind on this machine until the socket is closed.
+    """Lock a name of some kind in this network namespace until the socket is closed.
 
     Raises
     ------
-    NameTakenError
-        Another emulator uses it.
+    LockError
+        Another emulator uses it, or the operating system does not make the lock.
     """
     address = f"\0starhil-{kind}-{hashlib.sha256(name).hexdigest()}".encode()
     lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         lock.bind(address)
         lock.listen()
-    except OSError:
+    except OSError as error:
         lock.close()
-        raise NameTakenError(_owner(address)) from None
+        if error.errno == errno.EADDRINUSE:
+            raise LockError(f"in use by another emulator, process {_owner(address)}") from None
+        raise LockError(f"cannot be locked ({error.strerror})") from None
     return lock
 
 

@@ -182,9 +182,7 @@ def _lock_and_empty(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise EmulatorError(
-            f"truth log {path}: in use by another emulator; end that one, or choose another file"
-        ) from None
+        raise EmulatorError(f"truth log {path}: in use by another emulator; choose another file") from None
     if os.fstat(file.fileno()).st_size and not overwrite:
         raise EmulatorError(
             f"truth log {path}: exists and is not empty; choose another file, or replace it with --overwrite"

@@ -13,6 +13,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog, WireLog
+from starhil.protocol.candump import bus_name
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -118,7 +119,9 @@ class Bench:
             return None
         if link not in self._log_of:
             path = self.log_folder / f"{link}.log"
-            self._log_of[link] = SerialLog(path) if link == "serial" else CandumpLog(path)
+            self._log_of[link] = (
+                SerialLog(path) if link == "serial" else CandumpLog(path, bus_name(self._spec(link)))
+            )
             self.logs.append(self._log_of[link])
         return self._log_of[link]
 

@@ -18,7 +18,7 @@ from starhil.hil_tests.errors import BenchError
 log = logging.getLogger("starhil.bench")
 
 TIMEOUT_S: Final = 5.0
-MOST_WAITING: Final = 5000
+MAX_WAITING: Final = 5000
 """Results that may wait for a slow console; more are not shown there."""
 
 ENDED_WITHIN_S: Final = 10.0
@@ -55,7 +55,7 @@ class RunFeed:
         self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=TIMEOUT_S)
         self._path = f"/runs?{parts.query}"
         self._run = uuid.uuid4().hex
-        self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue(MOST_WAITING)
+        self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue(MAX_WAITING)
         begin = {"event": "begin", "kind": kind, "title": title, "unit": unit, "planned": planned}
         try:
             self._post(begin)

@@ -86,12 +86,10 @@ class SerialLog(WireLog):
 class CandumpLog(WireLog):
     """A CAN log as `candump -L` writes it, so that can-utils, tshark and others read it."""
 
-    def __init__(self, path: Path, channel: str = "vcan0", *, now: Callable[[], float] = time.time) -> None:
+    def __init__(self, path: Path, bus: str, *, now: Callable[[], float] = time.time) -> None:
         super().__init__(path, now=now)
-        self._channel = channel
+        self._bus = bus
 
     def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:  # noqa: ARG002 -- not in the format
         frame = item if isinstance(item, CanFrame) else CanFrame(0, item)
-        return format_candump(
-            CanFrame(frame.id, frame.data, frame.extended, frame.remote, time_s), self._channel
-        )
+        return format_candump(CanFrame(frame.id, frame.data, frame.extended, frame.remote, time_s), self._bus)

@@ -23,6 +23,11 @@ def format_candump(frame: CanFrame, channel: str) -> str:
     return f"({frame.timestamp or 0.0:017.6f}) {channel} {can_id}#{data}"
 
 
+def bus_name(channel: str) -> str:
+    """Return the bus of a channel, for a candump log: `vcan0` of `socketcand:127.0.0.1:29536/vcan0`."""
+    return re.split("[/:]", channel)[-1]
+
+
 def parse_candump(line: str) -> tuple[str, CanFrame]:
     """Parse a line of a candump log; return the channel and the frame.
 

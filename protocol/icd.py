@@ -187,33 +187,33 @@ class InterfaceDefinition:
 
 
 def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
-    """Read the interface definition of a unit: a name that ships with the package, a folder of TOML files, or one file.
+    """Read the interface definition of a unit: a bundled unit by name, a folder of TOML files, or one file.
 
-    A unit that ships is read once. Raises IcdError, whose text names file, row and field.
+    Bundled units are read once. Raises IcdError, whose text names file, row and field.
     """
     path = find_unit(name_or_folder)
-    return _load_shipped(path) if path.parent == UNITS_FOLDER else _load(path)
+    return _load_bundled(path) if path.parent == UNITS_FOLDER else _load(path)
 
 
 def check_unit(name_or_folder: str | Path) -> list[str]:
-    """Return all mistakes of a definition, each with file, row and field; none if it can be emulated."""
+    """Return all errors in a definition, each with file, row and field; none if the unit can be emulated."""
     from starhil.protocol.icd_bindings import unbound
     from starhil.protocol.icd_builder import read_definition
 
-    definition, mistakes = read_definition(find_unit(name_or_folder))
-    return mistakes if definition is None else unbound(definition)
+    definition, errors = read_definition(find_unit(name_or_folder))
+    return errors if definition is None else unbound(definition)
 
 
 @cache
-def _load_shipped(path: Path) -> InterfaceDefinition:
+def _load_bundled(path: Path) -> InterfaceDefinition:
     return _load(path)
 
 
 def _load(path: Path) -> InterfaceDefinition:
     from starhil.protocol.icd_builder import read_definition
 
-    definition, mistakes = read_definition(path)
+    definition, errors = read_definition(path)
     if definition is None:
-        more = f" ({len(mistakes) - 1} more mistakes: starhil unit check {path})" if len(mistakes) > 1 else ""
-        raise IcdError(f"{mistakes[0]}{more}")
+        more = f" ({len(errors) - 1} more: starhil unit check {path})" if len(errors) > 1 else ""
+        raise IcdError(f"{errors[0]}{more}")
     return definition

@@ -1,4 +1,4 @@
-"""Reads the TOML files of a unit and builds its interface definition, or lists all their mistakes."""
+"""Reads the TOML files of a unit and builds its interface definition, or lists all errors in them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MODELS: Final[dict[str, type[BaseModel]]] = {
 
 
 def read_definition(path: Path) -> tuple[InterfaceDefinition | None, list[str]]:
-    """Read a folder of TOML files, or one file; return the definition, or None and its mistakes."""
+    """Read a folder of TOML files, or one file; return the definition, or None and its errors."""
     files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
     if not files:
         return None, [f"{path}: no .toml file of an interface definition in this folder"]
@@ -55,7 +55,7 @@ def read_definition(path: Path) -> tuple[InterfaceDefinition | None, list[str]]:
     for file in files:
         builder.read(file)
     definition = builder.build()
-    return (None, builder.mistakes) if builder.mistakes else (definition, [])
+    return (None, builder.errors) if builder.errors else (definition, [])
 
 
 def _key_path(document: object, location: tuple[int | str, ...]) -> str:
@@ -83,7 +83,7 @@ class _Builder:
     """Collects the files of a definition and validates them together."""
 
     def __init__(self, path: Path) -> None:
-        self.mistakes: list[str] = []
+        self.errors: list[str] = []
         self._path = path
         self._model: DeviceModel = device_model()
         self._enums: dict[str, EnumDefinition] = {}
@@ -103,10 +103,10 @@ class _Builder:
         try:
             document = tomllib.loads(read_user_text(file))
         except OSError as error:
-            self.mistakes.append(f"{file}: cannot read the interface definition: {error.strerror}")
+            self.errors.append(f"{file}: cannot read the interface definition: {error.strerror}")
             return
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            self.mistakes.append(f"{file}: not valid TOML: {error}")
+            self.errors.append(f"{file}: not valid TOML: {error}")
             return
         try:
             model = schema.FileModel.model_validate(document)
@@ -115,22 +115,24 @@ class _Builder:
                 where = f"{file}: {_key_path(document, item['loc'])}"
                 if item["type"] == "extra_forbidden":
                     hint = did_you_mean(str(item["loc"][-1]), _known_keys(item["loc"]))
-                    self.mistakes.append(f"{where}: unknown key{hint}")
+                    self.errors.append(f"{where}: unknown key{hint}")
                 else:
-                    self.mistakes.append(f"{where}: {item['msg']}")
+                    self.errors.append(f"{where}: {item['msg']}")
             return
         self._files.append((file, model))
 
     def _attempt(self, step: Callable[..., None], *arguments: object) -> None:
-        """Do one step of building; note its mistake."""
+        """Do one step of building; record its error."""
         try:
             step(*arguments)
         except IcdError as error:
-            self.mistakes.append(str(error))
+            self.errors.append(str(error))
 
     def build(self) -> InterfaceDefinition | None:
-        """Build the definition; None if a mistake leaves nothing to build on."""
-        if self.mistakes:  # rows refer to each other across files: more would be found that is none
+        """Build the definition; None if an error leaves nothing to build on."""
+        if (
+            self.errors
+        ):  # rows refer to each other across files: errors in one file would cause false ones in others
             return None
         for file, model in self._files:
             for name, table in (
@@ -149,14 +151,14 @@ class _Builder:
             for section in model.section:
                 self._attempt(self._add_section, file, section)
         if "unit" not in self._tables:
-            self.mistakes.append(f"{self._path}: no [unit] with name, version and doc")
+            self.errors.append(f"{self._path}: no [unit] with name, version and doc")
             return None
         conventions = Conventions()
         try:
             self._load_plugin()
             conventions = self._conventions()
         except IcdError as error:
-            self.mistakes.append(str(error))
+            self.errors.append(str(error))
         self.byte_order = conventions.byte_order
         self._add_parameters()
         rows: dict[str, Row] = {}
@@ -215,7 +217,7 @@ class _Builder:
             plugin=self._plugin,
         )
 
-    # --- tables that stand once ---
+    # --- tables that occur once ---
 
     def _add_table(self, name: str, file: Path, table: object) -> None:
         if name in self._tables:
@@ -260,7 +262,7 @@ class _Builder:
                     f"{file}: errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
                 )
 
-    # --- tables that stand many times ---
+    # --- tables that occur many times ---
 
     def _add_class(self, file: Path, model: schema.ClassModel) -> None:
         where = f"{file}: class {model.name}"

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from starhil.protocol.link_schema import LinkModel, Order
+from starhil.protocol.link_schema import HEX, LinkModel, Order
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Provenance = Literal["confirmed", "proxy", "ours"]
@@ -18,7 +18,7 @@ ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "b
 Kind = Literal["telecommand", "telemetry"]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Scalar = bool | int | float | str
-Code = Annotated[int, Field(ge=0, le=0xFFFF)]
+Code = Annotated[int, Field(ge=0, le=0xFFFF, json_schema_extra=HEX)]
 
 
 class _Model(BaseModel):
@@ -33,95 +33,95 @@ class UnitModel(_Model):
     version: str
     """Version of the definition."""
     doc: str
-    """What the unit is, in one sentence."""
+    """Description, one sentence."""
     source: str = ""
-    """The public source of the confirmed rows that name none themselves."""
+    """Public source of the confirmed rows that name no source."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Ids from this one up are telemetry, those below are telecommands; left out if classes or rows decide."""
+    """Lowest telemetry ID; lower IDs are telecommands. Omit it if the class or the row decides."""
     provenance: Provenance | None = None
-    """That of the rows that name none."""
+    """Provenance of the rows that name none."""
     plugin: str | None = None
-    """Python file beside the definition, with quantities, actions, framings or checks of the unit's own."""
+    """Python file beside the definition, with custom quantities, actions, framings or checks."""
 
 
 class ConventionsModel(_Model):
-    """How the unit reports attitude, vectors and time, in all rows alike."""
+    """How all rows report attitude, vectors and time."""
 
     quaternion: Literal["rotation", "attitude"] = "rotation"
-    """`rotation`: v_sensor = q v q*; `attitude`: its conjugate, as in a textbook's A(q)."""
+    """`rotation`: v_sensor = q v q*; `attitude`: the conjugate, the q of an attitude matrix A(q)."""
     scalar_sign: Literal["positive", "any"] = "positive"
-    """Whether the scalar part is never negative, or the sign stays with the last quaternion that was reported."""
+    """`positive`: the scalar part is never negative; `any`: the sign that is closer to the last reported quaternion."""
     axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] = ["+x", "+y", "+z"]
-    """Axes of the reported frame in terms of the sensor's."""
+    """Axes of the reported frame in terms of the sensor's (+x right in the image, +y down, +z boresight)."""
     epoch: str = "unix"
-    """Zero of times: `unix`, `gps`, `j2000`, `midnight` (of the day), or a date such as 2000-01-01."""
+    """Epoch of all times: `unix`, `gps`, `j2000`, `midnight` (of the current day), or a date such as `2000-01-01`."""
     byte_order: Order = "little"
-    """Order of the bytes of fields that do not say otherwise."""
+    """Default byte order of fields."""
 
 
 class ClassModel(_Model):
-    """A class of rows, by which a request says what it is."""
+    """A class of rows, with the codes that stand for it in a message."""
 
     name: Name
-    """Name by which rows refer to it."""
+    """Name that rows refer to."""
     kind: Kind
-    """What its rows are."""
+    """Kind of its rows."""
     code: Code | None = None
-    """Its code in a request."""
+    """Code in a request."""
     reply: Code | None = None
-    """Its code in a reply; that of the request unless given."""
+    """Code in a reply; default: the request's."""
     unsolicited: Code | None = None
-    """Its code in unsolicited telemetry; that of the reply unless given."""
+    """Code in unsolicited telemetry; default: the reply's."""
     answer: list[str] | None = None
-    """Answers of its rows: `echo`, `reply`, `row:NAME`; `["reply"]` unless given."""
+    """Answers of its rows, in order: `echo`, `reply`, `row:NAME`; default: `["reply"]`."""
 
 
 class EnumModel(_Model):
-    """Names for numbers."""
+    """An enumeration."""
 
     name: Name
-    """Name by which fields refer to it."""
+    """Name that fields refer to."""
     doc: str
-    """What is enumerated."""
+    """Description."""
     values: dict[Name, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(min_length=1)
     """Name → number on the wire."""
 
 
 class _BoundModel(_Model):
-    """What fields and bits have in common: where their value comes from, or goes to."""
+    """Keys that fields and bits share."""
 
     name: Name | None = None
-    """Name of the field; one without a name is sent as zeros."""
+    """Name of the field; a field without a name is sent as zeros."""
     enum: str | None = None
-    """Enumeration of the unit, or of the device model, that names the numbers."""
+    """Name of an enumeration, of the unit or of the device model."""
     default: Scalar | None = None
-    """Value where none is given: a telecommand without this field, a quantity without a value or without a number."""
+    """Value used if a client omits the field of a telecommand, or if a telemetry field has no value or no number for it."""
     parameter: str | None = None
-    """Name of the parameter that the field sets or reports."""
+    """Parameter that the field sets or reports."""
     value: str | None = None
-    """Quantity that the field of a telemetry row reports."""
+    """Quantity that a telemetry field reports."""
     argument: str | None = None
-    """Argument of the row's action that the field of a telecommand gives."""
+    """Argument of the row's action that a telecommand field sets."""
     const: int | float | None = None
     """Value that is always sent, and required in a telecommand."""
     map: dict[str, Scalar | list[Scalar]] | None = None
-    """Number on the wire → value of the quantity or argument, or several values for one number."""
+    """Number on the wire → value of the quantity or argument, or a list of values that share the number."""
     doc: str = ""
-    """What the field is."""
+    """Description."""
 
 
 class BitModel(_BoundModel):
-    """One bit or a group of bits, the lowest first; unused if it has no name."""
+    """One bit or a group of bits; unused and sent as zeros if it has no name."""
 
     width: Annotated[int, Field(ge=1, le=31)] = 1
-    """Bits."""
+    """Width in bits."""
 
 
 class RepeatModel(_Model):
-    """A group of fields that follows `count` times; `[n]` in a quantity's name is the number of the repetition."""
+    """A group of fields, sent `count` times; `[n]` in the name of a quantity or argument is the number of the repetition."""
 
     count: Annotated[int, Field(ge=1, le=256)]
-    """Number of repetitions; their names end in _1, _2 …, unless `first` is given."""
+    """Number of repetitions; the names of their fields end in _1, _2 …, unless `first` is given."""
     fields: list[FieldModel] = Field(min_length=1)
     """Fields of the group."""
     first: Annotated[int, Field(ge=0, le=256)] = 1
@@ -134,32 +134,32 @@ class FieldModel(_BoundModel):
     text: str | None = None
     """Fields in short, as in `i16 mag{0,1}_{x,y,z} uT 0.01`, in place of all other keys."""
     count: Annotated[int, Field(ge=2, le=64)] | None = None
-    """Expands to the fields name_1 … name_count."""
+    """Expands to the fields name_1 … name_count; `[n]` in a quantity's or argument's name is the number."""
     repeat: RepeatModel | None = None
-    """A repeated group in place of one field."""
+    """A repeated group instead of a single field."""
     type: FieldType | None = None
     """Type on the wire."""
     size: Annotated[int, Field(ge=1, le=4096)] | None = None
-    """Bytes of a `bytes` or `text` field."""
+    """Size of a `bytes` or `text` field in bytes."""
     order: Order | None = None
-    """Order of the bytes; that of the unit unless given."""
+    """Byte order; default: the unit's."""
     unit: str = ""
-    """Unit of the physical value; values are converted from that of the quantity (s, ms, us, ns; rad, deg, arcmin, arcsec; rad/s, deg/s …)."""
+    """Unit of the physical value, converted from or to the unit of the quantity or argument
+    (s, ms, us, ns; rad, deg, arcmin, arcsec; rad/s, deg/s …)."""
     scale: float = 1.0
-    """Physical = raw * scale + offset."""
+    """Physical = raw × scale + offset."""
     offset: float = 0.0
-    """Added after the scale."""
+    """Physical = raw × scale + offset."""
     min: float | None = None
     """Lowest physical value."""
     max: float | None = None
     """Highest physical value."""
     bits: list[BitModel] = []
-    """Bits of a bit field, the lowest first."""
+    """Bits of a bit field, lowest first."""
     wrap: bool = False
-    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
-    nearest limit."""
+    """Whether an out-of-range value is sent modulo the range (a counter) instead of as the nearest limit."""
     provenance: Provenance | None = None
-    """That of the row unless given."""
+    """Provenance; default: the row's."""
 
     @model_validator(mode="before")
     @classmethod
@@ -171,58 +171,58 @@ class RowModel(_Model):
     """A telecommand or telemetry row."""
 
     id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
-    """Identifier on the wire."""
+    """ID on the wire."""
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Expands to the rows name_1 … for the ids id … last_id, all with the same layout; `[n]` is their number."""
+    """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the row's number."""
     name: Name
     """Name for clients, sessions and exports."""
     class_: str | None = Field(default=None, alias="class")
-    """Class of the row; needed where there are several of its kind."""
+    """Class of the row; required if the unit has several classes of its kind."""
     doc: str
-    """What the row is."""
+    """Description."""
     provenance: Provenance | None = None
-    """`confirmed` by a public source, `proxy` from a relative of the unit, or `ours`; that of the unit unless given."""
+    """`confirmed`: from a public source; `proxy`: public for another unit of the family; `ours`: chosen here; default: the unit's."""
     source: str = ""
-    """The public source."""
+    """Public source of the row."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
-    """Bytes of data, to check the fields against."""
+    """Expected size of the data in bytes; the fields are checked against it."""
     fields: list[FieldModel] | None = None
-    """Fields in the order on the wire, after those of `include`; each is a table or a text."""
+    """Fields, in their order on the wire, after those of `include`; each is a table or a text."""
     include: list[str] | None = None
-    """Names of rows whose fields this row concatenates, in order."""
+    """Rows whose fields this row concatenates, in order."""
     unbound: Literal["zeros"] | None = None
-    """`zeros`: fields that are bound to nothing are sent as zeros on purpose; a mistake unless given."""
+    """`zeros`: fields that are bound to nothing are sent as zeros on purpose; without it they are an error."""
     readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Identifier of the telemetry that reports what a telecommand named `set_…` was last accepted with; named without `set_`."""
+    """ID of the telemetry that reports the arguments that a telecommand named `set_…` was last accepted with; it has the name without `set_`."""
     action: str | None = None
-    """What a telecommand does."""
+    """Action that a telecommand performs."""
     arguments: dict[Name, Scalar] = {}
-    """Arguments of the action that no field gives; the text `[n]` is the number of an expanded row."""
+    """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     answer: list[str] | None = None
-    """Answers in their order: `echo`, `reply`, `row:NAME`; those of the class unless given."""
+    """Answers, in order: `echo`, `reply`, `row:NAME`; default: the class's."""
 
 
 class ParameterModel(_Model):
-    """A parameter of the device that the unit exposes; what is left out is as in the device model."""
+    """A device parameter that the unit exposes; omitted keys keep the device model's values."""
 
     id: Annotated[int, Field(ge=1, le=254)]
-    """Identifier in set_parameter and select_parameter."""
+    """ID in set_parameter and select_parameter."""
     name: Name
     """Name of the parameter in the device model."""
     type: ParameterType | None = None
     """Type on the wire."""
     unit: str | None = None
-    """Unit; that of the device model."""
+    """Unit; must be the device model's."""
     min: float | None = None
     """Lowest value."""
     max: float | None = None
     """Highest value."""
     default: Scalar | None = None
-    """Default of this unit."""
+    """Default value."""
     enum: str | None = None
-    """Enumeration that names the numbers."""
+    """Name of an enumeration."""
     doc: str | None = None
-    """What the parameter does."""
+    """Description."""
 
 
 class SectionModel(_Model):
@@ -241,7 +241,7 @@ class FileModel(_Model):
     conventions: ConventionsModel | None = None
     class_: list[ClassModel] = Field(default=[], alias="class")
     errors: dict[str, Annotated[int, Field(ge=0, le=0xFFFF)]] | None = None
-    """Number on the wire of each error: ok, invalid_id, invalid_length …, and `other` for the rest."""
+    """Error name → number on the wire."""
     enum: list[EnumModel] = []
     telecommand: list[RowModel] = []
     telemetry: list[RowModel] = []
@@ -249,7 +249,7 @@ class FileModel(_Model):
     section: list[SectionModel] = []
     link: LinkModel | None = None
     canopen: dict[str, object] | None = None
-    """The CANopen mapping, read by `starhil.protocol.canopen.layout`."""
+    """Mapping to the object dictionary, read by `starhil.protocol.canopen.layout`."""
 
 
 class QuantityModel(_Model):

@@ -1,18 +1,20 @@
-"""Schema of `[link.serial]` in a unit's definition: framing, check and header of a serial link, as data.
+"""Schema of `[link.serial]` and `[link.can]` in a unit's definition.
 
-A message on the line is `header data check`, put between bytes by the framing. The header is a list of fields by role;
-the check covers the header and the data unless `covers` says otherwise.
+A serial message consists of header, data and checksum; the framing marks where it begins and ends. The header is a list of
+fields by role; the checksum covers header and data unless `covers` lists other parts.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from starhil.protocol.messages import DEFAULT_TIMEOUT_S
 
-Byte = Annotated[int, Field(ge=0, le=0xFF)]
+HEX: Final = {"format": "hex"}
+"""Schema of numbers that the reference shows in hexadecimal."""
+Byte = Annotated[int, Field(ge=0, le=0xFF, json_schema_extra=HEX)]
 Order = Literal["little", "big"]
 CheckType = Literal["u8", "u16", "u32", "u64"]
 HeaderType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "bits8", "bits16", "bits32"]
@@ -22,11 +24,7 @@ Role = Literal[
     "address", "source", "destination", "class", "id", "sequence", "length",
     "status", "ack", "final", "flags", "ticks", "time",
 ]  # fmt: skip
-"""Meaning of a header field.
-
-`address` is that of the device, in both directions; `source` (of a request) and `destination` (of a reply) are that of
-the OBC. `ack` is 1 unless the request is refused, `final` is 1 in the last reply to a request.
-"""
+"""Meaning of a header field; described in `HeaderFieldModel`."""
 
 
 class _Model(BaseModel):
@@ -34,42 +32,42 @@ class _Model(BaseModel):
 
 
 class CubeSpaceFraming(_Model):
-    """Framing of the CubeSpace family with its three reply dialects; it has no header and no check."""
+    """The CubeSpace family's framing with its three reply dialects, without header and checksum."""
 
     kind: Literal["cubespace"]
     """Selects this framing."""
     dialect: Literal["a", "b", "c"] | None = None
-    """The only dialect of the unit; that of the parameter `serial_dialect` unless given."""
+    """Dialect of the unit; default: selected by the parameter `serial_dialect`."""
 
 
 class EscapedFraming(_Model):
-    """`escape start … escape end`, with every escape byte within doubled (DLE framing)."""
+    """`escape start … escape end`, with escape bytes in between doubled (DLE framing)."""
 
     kind: Literal["escaped"]
     """Selects this framing."""
     escape: Byte = 0x10
-    """Byte that marks start and end; doubled where it occurs within."""
+    """Byte before `start` and `end`, doubled inside a message."""
     start: Byte = 0x02
-    """Byte after the escape byte that begins a message."""
+    """Byte that begins a message, after `escape`."""
     end: Byte = 0x03
-    """Byte after the escape byte that ends a message."""
+    """Byte that ends a message, after `escape`."""
 
 
 class SlipFraming(_Model):
-    """Frames between `end` bytes, in which `end` and `escape` are substituted (RFC 1055)."""
+    """Messages between `end` bytes; `end` and `escape` inside a message are escaped (RFC 1055)."""
 
     kind: Literal["slip"]
     """Selects this framing."""
     end: Byte = 0xC0
-    """Byte before and after a frame."""
+    """Byte after a message, and before it with `leading_end`."""
     escape: Byte = 0xDB
-    """Byte before a substituted one."""
+    """Byte before an escaped byte."""
     substitutes: tuple[Byte, Byte] | None = None
-    """Bytes that stand for `end` and `escape` after an escape byte; DC and DD unless `xor` is given."""
+    """Escaped forms of `end` and `escape`; default without `xor`: `[0xDC, 0xDD]`."""
     xor: Byte | None = None
-    """After an escape byte follows the substituted byte XOR this (asynchronous HDLC: end 7E, escape 7D, xor 20)."""
+    """XOR mask applied to an escaped byte, instead of `substitutes` (HDLC: end 0x7E, escape 0x7D, xor 0x20)."""
     leading_end: bool = True
-    """Whether an `end` byte is sent before each frame too."""
+    """Whether an `end` byte also precedes each message."""
 
     @property
     def escaped(self) -> tuple[int, int]:
@@ -80,44 +78,44 @@ class SlipFraming(_Model):
 
 
 class LengthFraming(_Model):
-    """`start`, then as many bytes as the header's `length` field says, then `end`."""
+    """`start`, a message whose size the header's `length` field gives, `end`."""
 
     kind: Literal["length"]
     """Selects this framing."""
     start: list[Byte] = []
     """Bytes before the header."""
     end: list[Byte] = []
-    """Bytes after the check."""
+    """Bytes after the checksum."""
 
 
 class FixedFraming(_Model):
-    """`start`, then a message whose size follows from its row, then `end`."""
+    """`start`, a message whose size its row gives, `end`."""
 
     kind: Literal["fixed"]
     """Selects this framing."""
     start: list[Byte] = []
     """Bytes before the header."""
     end: list[Byte] = []
-    """Bytes after the check."""
+    """Bytes after the checksum."""
     request_size: Annotated[int, Field(ge=1, le=4096)] | None = None
-    """Bytes of every request between `start` and `end`, where they are all alike."""
+    """Bytes between `start` and `end` if all requests have the same size."""
 
 
 class DelimitedFraming(_Model):
-    """`start`, then the message up to `end`, which cannot occur in it; in `hex` each byte is two digits."""
+    """`start`, a message that does not contain `end`, `end`."""
 
     kind: Literal["delimited"]
     """Selects this framing."""
     start: list[Byte] = []
     """Bytes before the header."""
     end: Annotated[list[Byte], Field(min_length=1)]
-    """Bytes after the check."""
+    """Bytes after the checksum."""
     encoding: Literal["binary", "hex"] = "binary"
-    """Bytes as they are, or two hexadecimal digits for each."""
+    """`binary`: raw bytes; `hex`: two hexadecimal digits per byte."""
 
 
 class CustomFraming(_Model):
-    """A framing from the unit's plugin."""
+    """A framing of the unit's plugin."""
 
     kind: Literal["custom"]
     """Selects this framing."""
@@ -139,27 +137,27 @@ FramingModel = Annotated[
 
 class _CheckModel(_Model):
     order: Order | None = None
-    """Byte order of the check; that of the unit unless given."""
+    """Byte order of the checksum; default: the unit's."""
     covers: Annotated[list[CoveredPart], Field(min_length=1)] = ["header", "data"]
-    """Parts over which the check is computed: `start`, `header`, `data`."""
+    """Parts of the message that the checksum covers."""
 
 
 class NoCheck(_Model):
-    """No check."""
+    """No checksum."""
 
     kind: Literal["none"]
     """Selects this check."""
 
 
 class SumCheck(_CheckModel):
-    """Sum of the bytes, or its ones' or two's complement."""
+    """Sum of the bytes."""
 
     kind: Literal["sum"]
     """Selects this check."""
     type: CheckType = "u8"
     """Width of the sum."""
     complement: Literal["none", "ones", "twos"] = "none"
-    """What is sent instead of the sum itself."""
+    """Whether the ones' or two's complement of the sum is sent."""
 
 
 class XorCheck(_CheckModel):
@@ -168,37 +166,37 @@ class XorCheck(_CheckModel):
     kind: Literal["xor"]
     """Selects this check."""
     init: Byte = 0
-    """Value before the first byte."""
+    """Initial value."""
 
 
 class CrcCheck(_CheckModel):
-    """Cyclic redundancy check in the parameters of the CRC catalogue (`poly` in normal notation)."""
+    """CRC with the parameters of the Rocksoft model, as CRC catalogues list them."""
 
     kind: Literal["crc"]
     """Selects this check."""
     type: CheckType
-    """Width of the register."""
-    poly: Annotated[int, Field(ge=1)]
-    """Polynomial, without its highest term."""
-    init: Annotated[int, Field(ge=0)] = 0
-    """Register before the first byte."""
+    """Width of the CRC."""
+    poly: Annotated[int, Field(ge=1, json_schema_extra=HEX)]
+    """Polynomial in normal (not reversed) notation, without the highest term."""
+    init: Annotated[int, Field(ge=0, json_schema_extra=HEX)] = 0
+    """Initial value."""
     reflect: bool = False
-    """Whether bytes enter and the register leaves lowest bit first."""
-    xor: Annotated[int, Field(ge=0)] = 0
-    """What the register is combined with at the end."""
+    """Reflect input and output (refin = refout)."""
+    xor: Annotated[int, Field(ge=0, json_schema_extra=HEX)] = 0
+    """Final XOR value (xorout)."""
 
 
 class XxHashCheck(_CheckModel):
-    """XXH32 with a seed."""
+    """XXH32 hash."""
 
     kind: Literal["xxh32"]
     """Selects this check."""
-    seed: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] = 0
-    """Seed of the hash."""
+    seed: Annotated[int, Field(ge=0, le=0xFFFFFFFF, json_schema_extra=HEX)] = 0
+    """Seed."""
 
 
 class CustomCheck(_CheckModel):
-    """A check from the unit's plugin."""
+    """A checksum of the unit's plugin."""
 
     kind: Literal["custom"]
     """Selects this check."""
@@ -212,72 +210,73 @@ CheckModel = Annotated[
 
 
 class HeaderBitModel(_Model):
-    """One bit or a group of bits of a header field, lowest first."""
+    """One bit or group of bits of a header field."""
 
     role: Role | None = None
-    """Meaning, as of a field."""
+    """Meaning; none: a constant."""
     width: Annotated[int, Field(ge=1, le=32)] = 1
-    """Bits."""
+    """Width in bits."""
     const: Annotated[int, Field(ge=0)] | None = None
-    """Value that is sent and required."""
+    """Value that is sent, and required on reception."""
     default: Annotated[int, Field(ge=0)] | None = None
-    """Value that is sent where the message has none, and not required."""
+    """Value that is sent if the message has none; not checked on reception, except an address."""
 
 
 class HeaderFieldModel(_Model):
     """One field of a header.
 
-    `address` is that of the device, in both directions; `source` (of a request) and `destination` (of a reply) are that of the
-    OBC. `ack` is 1 unless the request is refused, `final` is 1 in the last reply to a request; `flags` and `sequence` are
-    repeated in the reply.
+    Roles: `address` is the device's address in both directions; `source` (in a request) and `destination` (in a reply) are
+    the OBC's. `class`, `id` and `status` are the codes of class, row and error. `length` is described by `includes`. `ack` is
+    0 in a refusal, else 1; `final` is 1 in the last reply to a request. A reply repeats the `sequence` and `flags` of its
+    request. `ticks` is the time since start, `time` the unit's time.
     """
 
     role: Role | None = None
-    """Meaning; none for a constant."""
+    """Meaning; none: a constant."""
     type: HeaderType
-    """Type; `bits8` … have `bits`."""
+    """Type on the wire; `bits8`, `bits16` and `bits32` need `bits`."""
     const: int | None = None
-    """Value that is sent and required."""
+    """Value that is sent, and required on reception."""
     default: int | None = None
-    """Value that is sent where the message has none (an address, a flag), and not required."""
+    """Value that is sent if the message has none; not checked on reception, except an address."""
     order: Order | None = None
-    """Byte order; that of the unit unless given."""
+    """Byte order; default: the unit's."""
     scale: Annotated[float, Field(gt=0)] = 1.0
-    """Seconds a count, of `ticks` and `time`."""
+    """Seconds per count of `ticks` or `time`."""
     includes: list[SizedPart] = ["data"]
-    """What a `length` counts: `start`, `header`, `data`, `check`, `end`."""
+    """Parts of the message that a `length` counts; `header` includes the length field itself."""
     classes: list[str] | None = None
-    """Classes whose messages have the field; all unless given."""
+    """Classes whose messages have the field; default: all."""
     bits: list[HeaderBitModel] = []
-    """Bits, the lowest first."""
+    """Bits, lowest first."""
 
 
 class SerialLinkModel(_Model):
-    """The serial line: a message is `header data check`, put between bytes by the framing."""
+    """The serial line."""
 
     baud: Annotated[int, Field(ge=300)] = 115200
     """Bit rate."""
     framing: FramingModel
-    """Where a message begins and ends."""
+    """Marks where a message begins and ends."""
     check: CheckModel = NoCheck(kind="none")
-    """What protects a message."""
+    """Checksum."""
     request_header: list[HeaderFieldModel] = []
     """Fields before the data of a request."""
     reply_header: list[HeaderFieldModel] = []
     """Fields before the data of a reply."""
     max_size: Annotated[int, Field(ge=1, le=65536)] | None = None
-    """Longest message in bytes that a receiver accepts; 512, or the longest row, unless given."""
+    """Longest message that a receiver accepts, in bytes; default: 512, or more if a row is longer."""
     timeout: Annotated[float, Field(gt=0)] = DEFAULT_TIMEOUT_S
-    """Silence within a message after which it is abandoned, seconds."""
+    """Silence after which an incomplete message is discarded, in seconds."""
 
 
 class CubeSpaceCanModel(_Model):
-    """CAN with the CAN IDs and segments of the CubeSpace family."""
+    """CAN with the CubeSpace family's CAN ID layout and segmentation."""
 
     kind: Literal["cubespace"]
-    """Layout of CAN IDs and segments."""
+    """CAN ID layout and segmentation."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
-    """Bit rate of the bus."""
+    """Bit rate."""
 
 
 class LinkModel(_Model):

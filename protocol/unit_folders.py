@@ -1,4 +1,4 @@
-"""Folders of units: those that ship with the package in `configs/units`, and a user's own."""
+"""Folders of units: bundled ones in `configs/units`, and the user's."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ DEFAULT_UNIT: Final = "cubestar"
 """Name of the unit that is emulated unless another is chosen."""
 
 UNITS_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "units"
-"""Folder of the units that ship with the package."""
+"""Folder of the bundled units."""
 
 SKELETON: Final = UNITS_FOLDER.parent / "new_unit.toml"
 """Definition from which a user's own begins."""
 
 
-def shipped_units() -> list[str]:
-    """Return the names of the units that ship with the package."""
+def bundled_units() -> list[str]:
+    """Return the names of the bundled units."""
     return sorted(folder.name for folder in UNITS_FOLDER.iterdir() if any(folder.glob("*.toml")))
 
 
 def find_unit(name_or_folder: str | Path) -> Path:
-    """Return the folder of a unit: an existing folder (or file), else that of a unit that ships.
+    """Return the folder of a unit: an existing folder or file, else a bundled unit's.
 
     Raises IcdError that offers similar names.
     """
     path = Path(name_or_folder).expanduser()
-    shipped = shipped_units()
+    shipped = bundled_units()
     if path.name == str(name_or_folder) in shipped:
         return UNITS_FOLDER / path.name
     if path.exists():
         return path
     near = difflib.get_close_matches(path.name, shipped, n=3)
-    hint = f"did you mean {', '.join(near)}?" if near else f"units that ship: {', '.join(shipped)}"
+    hint = f"did you mean {', '.join(near)}?" if near else f"bundled units: {', '.join(shipped)}"
     raise IcdError(
-        f"unit {name_or_folder}: neither a folder nor a unit that ships with the package; {hint}; `starhil unit new FOLDER` writes one"
+        f"unit {name_or_folder}: neither a folder nor a bundled unit; {hint}; `starhil unit new FOLDER` creates one"
     )

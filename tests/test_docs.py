@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import can
+import cv2
 import pytest
 
 from starhil.emulator.device.parameters import Parameters
@@ -23,6 +24,7 @@ from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sky.view import Sky
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import private_can_bus
@@ -31,7 +33,9 @@ from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen import build_dictionary
 from starhil.protocol.export import export
 from starhil.protocol.icd import load_unit
+from starid.attitude import Attitude
 from starid.camera import Camera
+from starid.catalog import load_catalog
 
 DOCS = Path(__file__).parents[1] / "docs"
 PATIENCE_S = 20.0
@@ -50,11 +54,12 @@ class Block:
     heading: str
 
 
-def blocks(name: str) -> list[Block]:
+def blocks(name: str, language: str = "") -> list[Block]:
     text = (DOCS / name).read_text(encoding="utf-8")
     return [
         Block(match[1], match[2], re.findall(r"^##+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
         for match in _FENCE.finditer(text)
+        if language in ("", match[1])
     ]
 
 
@@ -93,6 +98,16 @@ def test_the_examples_of_the_sky_are_valid_and_run(tmp_path):
             assert sky.by_date
     (program,) = (block for block in found if block.language == "python")
     run(program, {})
+
+
+def test_the_library_example_of_the_readme_prints_the_attitude_of_its_image(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    truth = Attitude.from_radec_roll(83.8, -1.2, 30.0)
+    cv2.imwrite(
+        "sky.png", render(Camera.from_fov(20.0, width=640, height=480), load_catalog(), truth, seed=1).image
+    )
+    _, program = blocks("../README.md", language="python")
+    assert run(program, {}) == "True RA 83.80, Dec -1.20\n"
 
 
 def test_icd_is_the_present_export():

@@ -86,9 +86,7 @@ def literal(value: object) -> str:
     """Return a value as a TOML file has it."""
     if isinstance(value, BaseModel):
         items = value.model_dump(exclude_none=True).items()
-        return ", ".join(
-            f"{key} {item if isinstance(item, str) else format(item, 'g')}" for key, item in items
-        )
+        return "`{ " + ", ".join(f"{key} = {json.dumps(item)}" for key, item in items) + " }`"
     if value is None or value in ({}, ""):
         return ""
     if isinstance(value, float) and value >= LARGE and float(f"{value:g}") == value:
@@ -166,6 +164,8 @@ def limits(schema: Mapping[str, Any]) -> str:
         return "" if schema.get("type") != "boolean" else "`true`, `false`"
     if high is None:
         return f"{low:g} or more"
+    if schema.get("format") == "hex":
+        return f"{low:#x} to 0x{high:X}" if low else f"0 to 0x{high:X}"
     return f"{number(low)} to {number(high)}"
 
 
@@ -183,10 +183,12 @@ def model_rows(model: type[BaseModel]) -> list[Row]:
     ]
 
 
-def default(field: FieldInfo) -> str:
-    """Return the default of a field."""
+def default(field: FieldInfo, schema: Mapping[str, Any] | None = None) -> str:
+    """Return the default of a field, in hexadecimal if its schema says so."""
     if field.is_required():
         return "required"
+    if field.default and (schema or {}).get("format") == "hex":
+        return f"`0x{field.default:02X}`"
     return "" if field.default is PydanticUndefined else literal(field.default)
 
 
@@ -376,6 +378,8 @@ def scenario() -> str:
 def unit_definition() -> str:
     """Tables and keys of the files of a unit."""
     from starhil.protocol import icd_schema, link_schema
+    from starhil.protocol.canopen import layout
+    from starhil.protocol.messages import ErrorCode
 
     headings: dict[str, type[BaseModel]] = {
         "[unit]": icd_schema.UnitModel,
@@ -395,6 +399,7 @@ def unit_definition() -> str:
         'framing = { kind = "delimited" }': link_schema.DelimitedFraming,
         'framing = { kind = "cubespace" }': link_schema.CubeSpaceFraming,
         'framing = { kind = "custom" }': link_schema.CustomFraming,
+        'check = { kind = "none" }': link_schema.NoCheck,
         'check = { kind = "sum" }': link_schema.SumCheck,
         'check = { kind = "xor" }': link_schema.XorCheck,
         'check = { kind = "crc" }': link_schema.CrcCheck,
@@ -403,6 +408,11 @@ def unit_definition() -> str:
         "request_header, reply_header": link_schema.HeaderFieldModel,
         "bits of a header": link_schema.HeaderBitModel,
         "[link.can]": link_schema.CubeSpaceCanModel,
+        "[canopen]": layout.CanopenModel,
+        "[[canopen.object]]": layout.PlacedObject,
+        "packed": layout.PackedField,
+        "members": layout.PlacedMember,
+        "[[canopen.tpdo]], [[canopen.rpdo]]": layout.PdoModel,
     }
     parts = []
     for heading, model in headings.items():
@@ -412,12 +422,19 @@ def unit_definition() -> str:
         schema = model.model_json_schema()
         properties = schema.get("properties") or schema["$defs"][model.__name__]["properties"]
         rows: list[Row] = [
-            (f"`{key}`", "", limits(properties[key]), default(field), texts[name])
+            (f"`{key}`", "", limits(properties[key]), default(field, properties[key]), texts[name])
             for name, field in model.model_fields.items()
             for key in (field.alias or name,)
             if f'{key} = "' not in heading
         ]
-        parts.append(f"### `{heading}`\n\n{plain_text(model.__doc__ or '')}\n\n{table(rows)}")
+        parts.append(
+            f"### `{heading}`\n\n{plain_text(model.__doc__ or '')}" + (f"\n\n{table(rows)}" if rows else "")
+        )
+    numbers = "\n".join(f"| `{code.name.lower()}` | `{int(code)}` |" for code in ErrorCode)
+    parts.append(
+        "### `[errors]`\n\nThe number of each error on the wire, 0 to 0xFFFF. If the table is there, an error that it lacks is sent "
+        f"as `other`, if given; `ok` keeps its default.\n\n| key | default |\n|---|---|\n{numbers}\n| `other` | |"
+    )
     return "\n\n".join(parts)
 
 

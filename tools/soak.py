@@ -44,7 +44,7 @@ from starhil.hil_tests.session_run import SessionRequest, run_session
 WARM_UP_SHARE = 0.25
 MEMORY_GROWTH_MB = 8.0
 LATENCY_FACTOR, LATENCY_GROWTH_MS = 1.5, 10.0
-LEAST_ROUNDS = 8
+MIN_ROUNDS = 8
 """Minimum number of rounds, so that each third has two."""
 
 BAUD = 921_600
@@ -102,7 +102,7 @@ def compare(samples: Sequence[Sample]) -> list[Figure]:
     end_s = samples[-1].time_s if samples else 0.0
     warm = [sample for sample in samples if sample.time_s >= WARM_UP_SHARE * end_s]
     third = len(warm) // 3
-    if len(samples) < LEAST_ROUNDS or third < 2:
+    if len(samples) < MIN_ROUNDS or third < 2:
         raise ValueError(f"{len(samples)} rounds are too few to compare: give more minutes")
     first, last = warm[:third], warm[-third:]
 

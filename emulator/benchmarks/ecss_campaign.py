@@ -1,7 +1,7 @@
-"""The frames of a performance campaign after ECSS-E-ST-60-20C: a profile's device under one influence at a time.
+"""Frames of a performance campaign per ECSS-E-ST-60-20C: a profile's device under one influence at a time.
 
 Every frame is rendered, detected and identified, lost in space, by the image pipeline of the device with the parameters
-of its profile. It depends on the plan, the name of its condition and its number only, so that a campaign can be
+of its profile. A frame depends only on the plan, the name of its condition and its number, so a campaign can be
 interrupted and resumed, and run in any number of processes.
 """
 
@@ -39,7 +39,7 @@ EARTH_DEG: Final = (-20.0, -10.0, 0.0, 10.0, 20.0, 25.0, 30.0)
 FALSE_STARS: Final = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 PARTICLES_S: Final = (0.0, 100.0, 300.0, 1000.0, 3000.0)
 EARTH_RADIUS_DEG: Final = 64.0
-"""Angular radius of the Earth's disc, as from 700 km."""
+"""Angular radius of the Earth's disc from an altitude of 700 km."""
 _RATE_DIGITS: Final = 9
 
 REST: Final = "rest"
@@ -55,7 +55,7 @@ INFLUENCES: Final = {
     "false_stars": ("false stars in each frame", "", FALSE_STARS),
     "particles": ("particles on the detector", "/s", PARTICLES_S),
 }
-"""Name of an influence → what is varied, its unit, and the values."""
+"""Name of an influence → description, unit and values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class EcssPlan:
     profile
         Name or path of the device profile.
     overrides
-        Settings that replace those of the profile, `section.key=value`.
+        Overrides of the profile, `section.key=value`.
     seed
         Seed of attitudes and noise.
     fields, positions, repeats
@@ -81,7 +81,7 @@ class EcssPlan:
     frames
         Frames at each value of an influence.
     chunk
-        Frames of a part, the unit of work and resumption.
+        Frames per part; a resumed campaign repeats only unfinished parts.
     """
 
     profile: str
@@ -115,7 +115,7 @@ class EcssPlan:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One condition of a campaign: its name, the influence with its value, and the number of frames."""
+    """A condition of a campaign: name, influence and its value, number of frames."""
 
     name: str
     influence: str
@@ -124,7 +124,7 @@ class Condition:
 
     @property
     def stream(self) -> int:
-        """Number that sets its random numbers apart from those of other conditions."""
+        """Seed component that makes its random numbers independent of other conditions'."""
         return int.from_bytes(hashlib.sha256(self.name.encode()).digest()[:4], "little")
 
 
@@ -144,7 +144,7 @@ class _Shot:
 
 
 class EcssDevice:
-    """The image pipeline of a profile's device with the parameters and temperatures that the device has in flight."""
+    """The image pipeline of a profile's device, with the device's parameters and temperatures in flight."""
 
     def __init__(self, plan: EcssPlan) -> None:
         self.plan = plan
@@ -175,7 +175,7 @@ class EcssDevice:
         self.swing_c = thermal.swing_c
 
     def solve(self, condition: Condition, number: int) -> tuple[_Shot, FrameResult]:
-        """Make a frame of a condition, and return what it was made of and its result."""
+        """Make and solve a frame of a condition; return its conditions and the result."""
         rng = np.random.default_rng((self.plan.seed, condition.stream, number))
         shot = _SHOTS[condition.influence](self, condition, number, rng)
         temperature_c = self.mean_c
@@ -200,7 +200,7 @@ class EcssDevice:
         return shot, result
 
     def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
-        """Return the request of a frame at a date, with the orbit and the device's own velocity."""
+        """Return a frame's request at a date, with the orbit and the velocity parameters of the device."""
         state = None if self.orbit is None else self.orbit.state(unix_s)
         own = observer_velocity(self.parameters, unix_s)
         return replace(
@@ -212,7 +212,7 @@ class EcssDevice:
         )
 
     def field_attitude(self, condition: Condition, number: int) -> Attitude:
-        """Return the attitude of a numbered field, the same for all frames of it."""
+        """Return the attitude of a field, the same for all its frames."""
         return random_attitude(np.random.default_rng((self.plan.seed, condition.stream, number, 1)))
 
 
@@ -297,11 +297,11 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
     "false_stars": _false_stars,
     "particles": _particles,
 }
-"""Influence → what makes a frame's conditions."""
+"""Influence → function that makes a frame's conditions."""
 
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
-    """Return the frames of a part: outcome, error about x, y and z in arcseconds, and numbers of field and condition."""
+    """Solve the frames of a part; return outcomes, errors about x, y and z in arcseconds, and numbers of field and condition."""
     device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)
@@ -327,7 +327,7 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
 def run_ecss(
     plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1
 ) -> Iterator[tuple[str, int, Results]]:
-    """Run a campaign, and yield name of condition, number of chunk and results of each part as it finishes.
+    """Run a campaign; yield condition name, chunk number and results of each part as it finishes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Errors of attitude split into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
+"""Attitude errors split into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
 
 An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y lie across the boresight,
 z about it. In the main series each field (direction of the sky) is seen at several sub-pixel positions, and each
@@ -6,10 +6,10 @@ position in several frames, so that the error is
 
     e = bias + field + position + noise
 
-with a random part for each level. A nested analysis of variance gives their variances without bias (Henderson's method
-1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests whether they are there at all: what
-does not stand out from the level below is given as zero with the smallest value that would have been seen. Thermo-elastic
-error and aberration residual come from separate series, in which fields are repeated at other temperatures and dates.
+with a random term for each level. A nested analysis of variance gives unbiased estimates of their variances (Henderson's
+method 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests their significance: a term that is not
+significant is reported as zero, with the smallest value that would have been significant. Thermo-elastic error and aberration
+residual come from separate series, in which fields are repeated at other temperatures and dates.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy.typing as npt
 from starhil.emulator.errors import EmulatorError
 
 SIGNIFICANCE: Final = 1e-3
-"""Probability with which an influence is reported that is not there."""
+"""Probability of reporting an influence that does not exist."""
 
 BIAS: Final = "bias"
 THERMO_ELASTIC: Final = "thermo-elastic error"
@@ -62,7 +62,7 @@ class ErrorLine:
     name : str
         As the standard calls it.
     arcsec : ndarray (3,) or None
-        Size about x, y and z at the level of confidence, arcseconds; 0 where it is not significant. None: not evaluated.
+        Size about x, y and z at the confidence level, arcseconds; 0 if not significant. None: not evaluated.
     resolution_arcsec : ndarray (3,)
         Smallest size that would have been significant.
     """
@@ -73,7 +73,7 @@ class ErrorLine:
 
     @property
     def across_arcsec(self) -> float:
-        """Size about an axis across the boresight: the quadratic mean of x and y."""
+        """Size about an axis across the boresight: RMS of x and y."""
         return math.nan if self.arcsec is None else math.sqrt(0.5 * float(np.sum(self.arcsec[:2] ** 2)))
 
     @property
@@ -83,7 +83,7 @@ class ErrorLine:
 
 
 def coverage_factor(confidence: float) -> float:
-    """Standard deviations within which a normal error lies with a probability, such as 2.97 for 0.997."""
+    """Number of standard deviations that a normal error stays within at a confidence level: 2.97 for 0.997."""
     from scipy.stats import norm
 
     if not 0.5 <= confidence < 1.0:

@@ -1,4 +1,4 @@
-"""The report of a performance campaign after ECSS-E-ST-60-20C: Markdown that reads like a data sheet, CSV and plots."""
+"""Report of a performance campaign per ECSS-E-ST-60-20C: a data sheet in Markdown, CSV files and plots."""
 
 from __future__ import annotations
 
@@ -29,12 +29,16 @@ from starid.result_store import Results
 INTERVAL: Final = 0.95
 """Confidence of the intervals of probabilities."""
 
-_ARCSEC_PER_DEG: Final = 3600.0
+PLOTS: Final = {
+    "ecss-errors.png": "Attitude errors by kind, across and about the boresight",
+    "ecss-availability.png": "Correct and wrong attitudes against body rate, bodies near the field, false stars and particles",
+}
+"""File of a plot → its description."""
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """How many frames of a condition gave a correct, a wrong and no attitude.
+    """Numbers of frames of a condition with a correct, a wrong and no attitude.
 
     Attributes
     ----------
@@ -68,11 +72,11 @@ class EcssReport:
     plan
         The campaign.
     confidence
-        Level of confidence of the errors.
+        Confidence level of the errors.
     lines
-        The kinds of error.
+        Errors by kind.
     measured_arcsec
-        Quantile of the errors at rest about x, y and z, at that level, over sky and orbit.
+        Quantile of the errors at rest about x, y and z at the confidence level, over sky and orbit.
     outcomes
         Correct, wrong and invalid attitudes by condition, at rest first.
     stars
@@ -88,7 +92,7 @@ class EcssReport:
 
     @property
     def total(self) -> ErrorLine:
-        """Bias and thermo-elastic error, plus the root of the sum of the squares of the others but aberration."""
+        """Bias plus thermo-elastic error plus the root sum of squares of the others, without aberration."""
         arcsec = {line.name: line.arcsec for line in self.lines if line.arcsec is not None}
         steady = [arcsec.pop(name) for name in (BIAS, THERMO_ELASTIC)]
         random = [size for name, size in arcsec.items() if name != ABERRATION]
@@ -124,7 +128,7 @@ class EcssReport:
 
 
 def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confidence: float) -> EcssReport:
-    """Make the report from the parts of a finished campaign, in any order."""
+    """Make the report of a finished campaign from its parts, in any order."""
     by_name: dict[str, list[tuple[int, Results]]] = {}
     for name, chunk, results in parts:
         by_name.setdefault(name, []).append((chunk, results))
@@ -188,8 +192,8 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
         f"# Performance of `{plan.profile}`",
         "",
         (
-            f"Errors of attitude after ECSS-E-ST-60-20C at a level of confidence of {percent:g} %; single frames, lost in space, "
-            f"at rest; seed {plan.seed}. x and y lie across the boresight, z about it; *across* is the quadratic mean of x and y."
+            f"Attitude errors per ECSS-E-ST-60-20C, at {percent:g} % confidence; single images, lost in space, at rest; seed "
+            f"{plan.seed}. x and y are across the boresight, z is about it; *across* is the RMS of x and y."
         ),
         "",
         "## Accuracy",
@@ -199,20 +203,25 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
         *(_error_row(line) for line in (*report.lines, report.total, report.measured)),
         "",
         (
-            f"From {plan.fields} fields of the sky at {plan.positions} sub-pixel positions with {plan.repeats} frames each, and "
-            f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit and {plan.dated_fields} on {plan.dates} dates of a year. An error that does not stand out from the noise "
-            "is given as below the smallest that would have. The total is the sum of bias and thermo-elastic error and the root of the "
-            f"sum of the squares of the others but aberration; the last line is the quantile of {plan.rest_frames} frames at random attitudes."
+            f"From {plan.fields} fields at {plan.positions} sub-pixel positions with {plan.repeats} images each, "
+            f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit, and {plan.dated_fields} fields on {plan.dates} "
+            "dates of a year. `<` marks an error that is not significant: it is below the smallest significant one. The total is bias plus "
+            "thermo-elastic error plus the root sum of squares of the others, without aberration; the last line is the quantile of "
+            f"{plan.rest_frames} images at random attitudes."
         ),
         "",
         "## Availability at rest",
         "",
-        "| frames | stars detected, median | correct | wrong | invalid |",
+        "| images | stars detected, median | correct | wrong | invalid |",
         "|---|---|---|---|---|",
     ]
     rest = report.outcomes[0]
     text.append(f"| {rest.frames} | {report.stars:g} | {_shares(rest)} |")
-    text += ["", f"Correct: within 0.1° on every axis. Intervals hold at {100 * INTERVAL:g} %.", ""]
+    text += [
+        "",
+        f"Correct: within 0.1° on every axis. Ranges in parentheses are {100 * INTERVAL:g} % confidence intervals.",
+        "",
+    ]
     for name, (what, unit, _) in INFLUENCES.items():
         text += [
             f"## {what[0].upper()}{what[1:]}",
@@ -225,7 +234,7 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
                 reasons = ", ".join(f"{reason} {count}" for reason, count in outcome.reasons.items()) or "—"
                 text.append(f"| {outcome.value:g}{unit} | {_shares(outcome)} | {reasons} |")
         text.append("")
-    text += [f"![{Path(plot).stem.replace('-', ' ')}]({plot})\n" for plot in plots]
+    text += [f"![{PLOTS[plot]}]({plot})\n" for plot in plots]
     return "\n".join(text).rstrip() + "\n"
 
 
@@ -237,14 +246,12 @@ def _error_row(line: ErrorLine) -> str:
         for size, least in zip(line.arcsec, line.resolution_arcsec, strict=True)
     ]
     across, about = line.across_arcsec, line.about_arcsec
-    both = [
-        f"{value:.3g}″ ({value / _ARCSEC_PER_DEG:.3g}°)" if value > 0.0 else "—" for value in (across, about)
-    ]
+    both = [f"{value:.3g}″" if value > 0.0 else "—" for value in (across, about)]
     return f"| {line.name} | {' | '.join(cells)} | {' | '.join(both)} |"
 
 
 def _shares(outcome: Outcomes) -> str:
-    """Return the cells of correct, wrong and invalid, in per cent with their intervals."""
+    """Return the cells of correct, wrong and invalid: percentages with confidence intervals."""
     cells = []
     invalid = outcome.frames - outcome.correct - outcome.wrong
     for count in (outcome.correct, outcome.wrong, invalid):
@@ -301,7 +308,7 @@ def _plot_errors(report: EcssReport, folder: Path) -> Path:
     axes.set_yticks(places, [line.name for line in shown])
     axes.invert_yaxis()
     axes.set_xlabel(f"arcseconds at {100 * report.confidence:g} %")
-    axes.set_title(f"Errors of {report.plan.profile}")
+    axes.set_title(f"Attitude errors of {report.plan.profile}")
     axes.legend()
     return folder / save(fig, folder / "ecss-errors.png")
 

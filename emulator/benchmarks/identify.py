@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.benchmarks.peers import (
+    NotInstalledError,
     Reply,
     Solver,
     UnsuitedError,
@@ -200,7 +201,7 @@ def run(
     seed : int
         Seed of the scenes; each row restarts with it.
     peers, own : sequence of str
-        Solvers; a peer that is not installed is reported as skipped.
+        Solvers; one that is not installed is reported as skipped.
     rows : sequence of str
         Keys of `ROWS`.
     camera : Camera
@@ -285,8 +286,8 @@ class _Field:
             before, begin = resident_bytes(), time.perf_counter()
             try:
                 solver = make_solver(name, camera, self.known, raw=raw)
-            except ImportError:
-                skipped[name] = f"not installed: pip install {name}"
+            except NotInstalledError as error:
+                skipped[name] = str(error)
                 continue
             except (UnsuitedError, StaridError) as error:
                 skipped[f"{name}, {camera.fov_deg:.0f}°"] = str(error)

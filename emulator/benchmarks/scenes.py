@@ -19,7 +19,7 @@ from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 
-MOST_DRAWS: Final = 1000
+MAX_DRAWS: Final = 1000
 """Attitudes drawn at most for one scene."""
 
 
@@ -48,7 +48,7 @@ class SceneSettings:
     kept : int or None
         Only so many of the brightest stars are seen.
     least_stars : int
-        Stars that the field has at least; another one is drawn until it has (at most `MOST_DRAWS`).
+        Stars that the field has at least; another one is drawn until it has (at most `MAX_DRAWS`).
     mirrored : bool
         The image is mirrored: as dense and clustered as the sky, and nowhere like it.
     """
@@ -116,7 +116,7 @@ class SceneMaker:
     def scene(self, settings: SceneSettings, rng: np.random.Generator) -> Scene:
         """Make one scene; the generator is the only source of randomness."""
         visible = np.flatnonzero(self.stars.v <= settings.limiting_magnitude)
-        for _ in range(MOST_DRAWS):
+        for _ in range(MAX_DRAWS):
             attitude = random_attitude(rng)
             rows, xy = self._field(visible, attitude)
             if len(rows) >= settings.least_stars:

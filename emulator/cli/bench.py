@@ -275,9 +275,8 @@ def identify(
     solvers: Annotated[
         str,
         typer.Option(
-            help="Solvers: geometric,lsi,rsi, published ones such as pyramid,grid (pyramid-even: with evenly spread guide stars), "
-            "or a custom MODULE:FUNCTION; "
-            "'all' adds the third-party ones."
+            help="Solvers: geometric,lsi,rsi, lsi-matlab,lsi-sklearn, published ones such as pyramid,grid "
+            "(pyramid-even: with evenly spread guide stars), or MODULE:FUNCTION; 'all' stands for geometric, lsi, rsi, the published and the third-party ones."
         ),
     ] = "geometric",
     frames: Annotated[int, typer.Option(min=1, help="Scenes per row.")] = 300,

@@ -10,7 +10,7 @@ import typer
 from starhil.emulator.cli.output import output_help
 from starhil.emulator.errors import EmulatorError
 
-AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 SerialPort: TypeAlias = Annotated[
     str | None,
@@ -38,14 +38,14 @@ Unit: TypeAlias = Annotated[
     str,
     typer.Option(
         "--unit",
-        help="Interface definition: the name of a unit that ships with starhil, or a folder of TOML files.",
+        help="Interface of the device: name of a bundled unit, or a folder of TOML files.",
     ),
 ]
 UnitChoice: TypeAlias = Annotated[
     str | None,
     typer.Option(
         "--unit",
-        help="Interface definition: the name of a unit that ships with starhil, or a folder. Default: that of the profile, or cubestar.",
+        help="Interface of the device: name of a bundled unit, or a folder of TOML files. Default: the profile's (cubestar).",
     ),
 ]
 JunitFile: TypeAlias = Annotated[

@@ -208,9 +208,9 @@ def command(
 
 def _absolute_folder(unit: str) -> str:
     """Return a folder given on the command line as an absolute path: in a profile it is relative to the profile."""
-    from starhil.protocol.unit_folders import find_unit, shipped_units
+    from starhil.protocol.unit_folders import bundled_units, find_unit
 
-    return unit if unit in shipped_units() else str(find_unit(unit).absolute())
+    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
 
 
 def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:

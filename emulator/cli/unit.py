@@ -1,4 +1,4 @@
-"""`starhil unit`: list, write, check and describe the interface definitions of units."""
+"""`starhil unit`: list, create, check and describe units."""
 
 from __future__ import annotations
 
@@ -12,44 +12,59 @@ from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import print_text
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
-group = typer.Typer(help="List, write, check and describe units.", no_args_is_help=True)
+group = typer.Typer(
+    help="List, create, check and describe units. A unit is a star sensor's interface: a folder of TOML files that define "
+    "its telecommands, telemetry and links.",
+    no_args_is_help=True,
+)
 
 _ROW_KEYS = ("kind", "klass", "id", "name", "size", "action", "provenance")
 _FIELD_KEYS = ("name", "offset", "type", "unit", "value", "argument", "parameter", "const")
 
 UnitArgument = Annotated[
     str,
-    typer.Argument(metavar="UNIT", help="Name of a unit that ships with starhil, or a folder of TOML files."),
+    typer.Argument(metavar="UNIT", help="Name of a bundled unit, or a folder of TOML files."),
 ]
 
 
 @group.command("list")
 def list_units(as_json: AsJson = False) -> None:
-    """List the units that ship with starhil."""
+    """List the bundled units."""
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.unit_folders import shipped_units
+    from starhil.protocol.unit_folders import bundled_units
 
-    units = {name: load_unit(name) for name in shipped_units()}
+    units = {name: load_unit(name) for name in bundled_units()}
     if as_json:
         print(json.dumps([{"unit": name, **_summary(icd)} for name, icd in units.items()]))
         return
-    for name, icd in units.items():
-        mark = " (default)" if name == DEFAULT_UNIT else ""
-        rows = f"{len(icd.telecommands)} telecommands, {len(icd.telemetry)} telemetry"
-        print(f"{name + mark:22s} {', '.join(_links(icd)):22s} {rows:36s} {icd.doc}")
+    lines = [
+        (
+            f"{name} (default)" if name == DEFAULT_UNIT else name,
+            ", ".join(_links(icd)),
+            _count(len(icd.telecommands), "telecommand"),
+            _count(len(icd.telemetry), "telemetry row"),
+            icd.doc,
+        )
+        for name, icd in units.items()
+    ]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        print("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
 
 
 @group.command("new")
 def new(
-    folder: Annotated[Path, typer.Argument(help="Folder to write; it must hold no TOML file yet.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder to create; it must not contain TOML files.")
+    ],
 ) -> None:
-    """Write a commented definition that already runs, as a starting point."""
+    """Create a unit: a commented definition that already runs, as a starting point."""
     from starhil.emulator.errors import EmulatorError
     from starhil.protocol.unit_folders import SKELETON
     from starid.files import write_atomically
 
     if folder.exists() and (not folder.is_dir() or any(folder.glob("*.toml"))):
-        raise EmulatorError(f"{folder}: is a file, or holds TOML files already; choose another folder")
+        raise EmulatorError(f"{folder}: is a file, or contains TOML files; choose another folder")
     name = folder.resolve().name
     text = SKELETON.read_text(encoding="utf-8").replace("MY_UNIT", name.replace('"', "").replace("\\", ""))
     file = folder / "unit.toml"
@@ -63,43 +78,45 @@ def new(
 
 @group.command("check")
 def check(unit: UnitArgument, as_json: AsJson = False) -> None:
-    """Check a definition: print its mistakes, or an example exchange of each row in hexadecimal bytes.
+    """Check a unit: list all errors, or show an example exchange of each row in hexadecimal.
 
-    Exit status 0: the unit can be emulated, 1: it has mistakes.
+    Exit status 0: no errors, 1: errors.
     """
     from starhil.protocol.errors import ProtocolError
     from starhil.protocol.icd import check_unit, load_unit
     from starhil.protocol.unit_examples import Exchange, exchanges
 
-    mistakes = check_unit(unit)
+    errors = check_unit(unit)
     examples: list[Exchange] = []
-    if not mistakes:
+    if not errors:
         try:
             examples = list(exchanges(load_unit(unit)))
         except ProtocolError as error:
-            mistakes = [f"unit {unit}: {error}"]
+            errors = [f"unit {unit}: {error}"]
     if as_json:
         shown = [
             {"row": item.row.name, "link": item.link, "request": item.request, "answers": item.answers}
             for item in examples
         ]
-        print(json.dumps({"unit": unit, "mistakes": mistakes, "examples": shown}))
+        print(json.dumps({"unit": unit, "errors": errors, "examples": shown}))
     else:
-        for text in mistakes:
+        for text in errors:
             print_text(text + "\n")
         for item in examples:
-            print(f"{item.row.kind} {item.row.name}, id {item.row.id}, {item.row.size} B, on {item.link}")
+            print(
+                f"{item.row.kind} {item.row.name}, ID 0x{item.row.id:02X}, {item.row.size} B, on {item.link}"
+            )
             for frame in item.request:
                 print(f"  > {frame}")
             for frame in item.answers:
                 print(f"  < {frame}")
-        print(f"{len(mistakes)} mistakes" if mistakes else f"unit {unit}: good")
-    raise typer.Exit(1 if mistakes else 0)
+        print(f"{unit}: {_count(len(errors), 'error')}" if errors else f"{unit}: no errors")
+    raise typer.Exit(1 if errors else 0)
 
 
 @group.command("describe")
 def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None:
-    """Describe a unit: links, conventions, and what each row is bound to."""
+    """Describe a unit: links, conventions, and what each field is bound to."""
     from starhil.protocol.icd import load_unit
 
     icd = load_unit(unit)
@@ -123,6 +140,10 @@ def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None
         for field in row.named_fields.values():
             unit_text = f" {field.unit}" if field.unit else ""
             print(f"    {field.offset:4d} {field.name}: {field.type}{unit_text}{_binding(field)}")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _binding(field: Any) -> str:

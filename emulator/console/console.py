@@ -30,7 +30,7 @@ from starid.errors import StaridError
 log = logging.getLogger("starhil.console")
 
 TURN_S: Final = 0.1
-"""Time between two deliveries of the wire's trace, seconds."""
+"""Time between two deliveries of the trace, seconds."""
 
 STATUS_S: Final = 0.5
 """Time between two reports of the run's status, seconds."""
@@ -96,7 +96,7 @@ class Console:
         }
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening."""
         device = self._emulation.device
         device.on_frame.append(self._frame_published)
         device.on_mode.append(self._mode_changed)
@@ -107,7 +107,7 @@ class Console:
         self._tasks = [asyncio.create_task(self._guarded(loop)) for loop in loops]
 
     async def close(self) -> None:
-        """Cease to listen."""
+        """Stop listening."""
         self.trace.listen(wanted=False)
         tasks = [*self._tasks, *([self._stars] if self._stars is not None else [])]
         for task in tasks:
@@ -202,7 +202,7 @@ class Console:
         if not any(viewer.wire for viewer in self.viewers):
             self.trace.discard()
             return
-        lines, left_out = self.trace.take()
+        lines, left_out = self.trace.drain()
         if lines:
             self._broadcast(
                 {"type": "wire", "lines": lines, "left_out": left_out}, lambda viewer: viewer.wire

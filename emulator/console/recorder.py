@@ -1,4 +1,4 @@
-"""A recording of a run as an MCAP file: images, truth, measurements, telemetry and events."""
+"""Records a run in an MCAP file: images, truth, measurements, telemetry and events."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from starhil.emulator.guard import log_internal_error
 
 log = logging.getLogger("starhil.record")
 
-MOST_PENDING: Final = 64
-"""Messages that may wait for the disk; more are dropped."""
+MAX_PENDING: Final = 64
+"""Write-queue limit; further messages are dropped."""
 
 POLL_S: Final = 1.0
-"""Time in which every telemetry row is read once, seconds."""
+"""Period in which every telemetry row is read once, seconds."""
 
 _TIME: Final = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 _TEXT: Final = {"type": "string"}
@@ -65,21 +65,21 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     | {"mode": _TEXT, "reason": _TEXT, "valid": {"type": "boolean"}},
     "starhil.Telemetry": {},
 }
-"""Name of a schema → its properties. Foxglove knows the first three and draws them."""
+"""Schema → properties. The first three are Foxglove's own, which it displays."""
 
 INFO: Final = 2
 """Level of foxglove.Log."""
 
 
 class McapRecorder:
-    """Records a run; on a full disk the recording ends and the run goes on.
+    """Records a run; if the disk is full, the recording stops and the run continues.
 
     Parameters
     ----------
     emulation
-        The run, open.
+        The run, started.
     client
-        OBC that reads the telemetry.
+        OBC client that reads the telemetry.
     path
         File to write.
     overwrite
@@ -98,9 +98,9 @@ class McapRecorder:
         self._client = client
         self._path = path
         self._history = History(1)
-        self._room = threading.Semaphore(MOST_PENDING)
+        self._room = threading.Semaphore(MAX_PENDING)
         self._ended = False
-        """Whether nothing more can be written."""
+        """Whether the recording has stopped."""
         self.dropped = 0
         """Messages that were dropped because the disk was too slow."""
         self._task: asyncio.Task[None] | None = None
@@ -128,7 +128,7 @@ class McapRecorder:
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
 
     def start(self) -> None:
-        """Begin to record."""
+        """Start recording."""
         emulation = self._emulation
         emulation.imager.watchers.add(self)
         emulation.device.on_frame.append(self._record_frame)
@@ -136,7 +136,7 @@ class McapRecorder:
         self._task = asyncio.create_task(self._record_telemetry())
 
     async def close(self) -> None:
-        """Write what is left, and the index of the file."""
+        """Write pending messages and the index, and close the file."""
         self._emulation.imager.watchers.discard(self)
         if self._task is not None:
             self._task.cancel()
@@ -147,10 +147,10 @@ class McapRecorder:
         self._file.close()
         if self.dropped:
             log.warning(
-                "recording %s: %d messages were dropped; the disk was too slow", self._path, self.dropped
+                "recording %s: %d messages dropped, as the disk was too slow", self._path, self.dropped
             )
 
-    # --- what is recorded ---
+    # --- sources ---
 
     def _record_frame(self, measurement: Measurement) -> None:
         at_ns = measurement.mid_unix_ns
@@ -183,13 +183,13 @@ class McapRecorder:
         self._write("/events", "foxglove.Log", at_ns, content)
 
     async def _record_telemetry(self) -> None:
-        """Read one telemetry row after the other."""
+        """Read the telemetry rows in turn."""
         rows = list(self._emulation.device.icd.telemetry.values())
         while True:
             for row in rows:
                 try:
                     exchange = await self._client.exchange(row, b"")
-                except Exception as error:  # noqa: BLE001 (the recording goes on without this row)
+                except Exception as error:  # noqa: BLE001 (the recording continues without this row)
                     log_internal_error(f"recording: {row.name}", error)
                 else:
                     if values := decode(row, exchange):
@@ -200,7 +200,7 @@ class McapRecorder:
     # --- the file ---
 
     def _write(self, topic: str, schema: str, at_ns: int, content: dict[str, Any]) -> None:
-        """Hand a message to the disk's thread, unless too many wait there."""
+        """Queue a message for the disk thread, unless the queue is full."""
         if self._ended:
             return
         if not self._room.acquire(blocking=False):
@@ -225,16 +225,16 @@ class McapRecorder:
         )
 
     def _on_disk(self, action: Callable[[], object]) -> None:
-        """Write; the recording ends if that fails."""
+        """Run a write; if it fails, the recording stops."""
         if self._ended:
             return
         try:
             action()
         except OSError as error:
-            log.warning("recording %s: ends here (%s); the run goes on", self._path, error.strerror)
+            log.warning("recording %s stopped: %s; the run continues", self._path, error.strerror)
             self._ended = True
 
 
 def _stamp(at_ns: int) -> dict[str, int]:
-    """Return a time as Foxglove has it."""
+    """Return a time as a Foxglove timestamp."""
     return {"sec": at_ns // NANOSECONDS, "nsec": at_ns % NANOSECONDS}

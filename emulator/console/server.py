@@ -30,13 +30,13 @@ LARGEST_MESSAGE: Final = 1 << 16
 LARGEST_REPORT: Final = 1 << 20
 """Longest report of a run, bytes."""
 
-MOST_REQUESTS: Final = 16
+MAX_REQUESTS: Final = 16
 """Requests of a page that may be under way at a time."""
 
 HEARTBEAT_S: Final = 20.0
 """Time after which a page that does not answer is disconnected, seconds."""
 
-MOST_VIEWERS: Final = 32
+MAX_VIEWERS: Final = 32
 
 HEADERS: Final = {
     "Cache-Control": "no-cache",
@@ -152,8 +152,8 @@ class ConsoleServer:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         """Connect a page: what it asks for is answered, and what it has subscribed to is sent."""
         console = self._console(request)
-        if sum(len(each.viewers) for each in self._consoles) >= MOST_VIEWERS:
-            return web.Response(status=503, text=f"503: {MOST_VIEWERS} pages are open already\n")
+        if sum(len(each.viewers) for each in self._consoles) >= MAX_VIEWERS:
+            return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are open already\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
         await socket.prepare(request)
         viewer = Viewer(socket)
@@ -189,8 +189,8 @@ async def _receive(
         if not isinstance(request, dict):
             viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": "not a JSON object"}))
             continue
-        if len(tasks) > MOST_REQUESTS:
-            error = f"more than {MOST_REQUESTS} requests at a time"
+        if len(tasks) > MAX_REQUESTS:
+            error = f"more than {MAX_REQUESTS} requests at a time"
             viewer.send(json.dumps({"type": "answer", "id": request.get("id"), "ok": False, "error": error}))
             continue
         task = asyncio.create_task(_answer(console, viewer, request))

@@ -1,4 +1,4 @@
-"""The trace of the wires: what goes over serial line and CAN bus, decoded."""
+"""Decoded trace of the traffic on the serial line and the CAN bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from starhil.protocol.can_framing import (
     MessageType,
     encode_request_frames,
 )
-from starhil.protocol.candump import format_candump
+from starhil.protocol.candump import bus_name, format_candump
 from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
@@ -33,16 +33,16 @@ from starhil.protocol.serial_interface import HostEnd
 from starhil.protocol.serial_stack import build_serial_stack
 
 KEPT_ITEMS: Final = 20_000
-"""Newest items of the trace, for export."""
+"""Number of items kept for export."""
 
 DECODED_PER_TURN: Final = 200
-"""Most items decoded at a time; the others of a burst are only kept for export."""
+"""Maximum number of items decoded at a time; the rest of a burst is only kept for export."""
 
 SHOWN_VALUES: Final = 8
-"""Most values of a row in one line."""
+"""Maximum number of values in a line."""
 
-MOST_ADDRESSES: Final = 64
-"""Addresses whose segments are joined; random identifiers of a wire fault would make ever new ones."""
+MAX_ADDRESSES: Final = 64
+"""Limit of the addresses whose segments are joined: a wire fault can make any number of random CAN IDs."""
 
 _REQUEST_TYPES: Final = (
     MessageType.TELECOMMAND,
@@ -60,7 +60,7 @@ _CANOPEN: Final = (
 
 @dataclass(frozen=True, slots=True)
 class WireItem:
-    """One piece on a wire.
+    """Bytes or a CAN frame on a link.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class WireItem:
 
 
 class WireTrace:
-    """Listens to the device's links while somebody looks.
+    """Records the traffic on the device's links while a console page is open.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class WireTrace:
     links
         Links of the device.
     dialect
-        Returns the present dialect of serial replies; None for a unit that has no dialects.
+        Returns the current dialect of serial replies; None for a unit without dialects.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class WireTrace:
         self.listening = False
 
     def listen(self, wanted: bool) -> None:
-        """Begin or cease to listen."""
+        """Start or stop recording."""
         if wanted == self.listening:
             return
         self.listening = wanted
@@ -128,8 +128,8 @@ class WireTrace:
         self._kept.append(entry)
         self._new.append(entry)
 
-    def take(self) -> tuple[list[dict[str, Any]], int]:
-        """Return the lines of what is new, and how many items were left out."""
+    def drain(self) -> tuple[list[dict[str, Any]], int]:
+        """Return the new items, decoded, and the number of items left out."""
         left_out = max(0, len(self._new) - DECODED_PER_TURN)
         for _ in range(left_out):
             self._new.popleft()
@@ -138,33 +138,35 @@ class WireTrace:
         return lines, left_out
 
     def recent(self) -> list[dict[str, Any]]:
-        """Return the newest lines, for somebody who begins to look."""
+        """Return the newest items, decoded, for a page that subscribes."""
         decoder = Decoder(self._icd, self._dialect)
         first = max(0, len(self._kept) - DECODED_PER_TURN)
         return [decoder.line(item) for item in itertools.islice(self._kept, first, None)]
 
     def discard(self) -> None:
-        """Forget what is new: nobody looks at the trace."""
+        """Drop undecoded items; no page shows the trace."""
         self._new.clear()
 
     def candump(self) -> str:
-        """Return the kept CAN frames as a candump log."""
+        """Return the recorded CAN frames as a candump log with the name of their bus."""
+        channels = (link.transport.description for link in self._links if link.bus == "can")
+        name = bus_name(next(channels, ""))
         return "".join(
-            format_candump(replace(entry.item, timestamp=entry.at_s), "can0") + "\n"
+            format_candump(replace(entry.item, timestamp=entry.at_s), name) + "\n"
             for entry in self._kept
             if isinstance(entry.item, CanFrame)
         )
 
 
 class Decoder:
-    """Decodes the items of a trace in their order.
+    """Decodes the items of a trace, in order.
 
     Parameters
     ----------
     icd
         Interface definition.
     dialect
-        Returns the present dialect of serial replies; None for a unit that has no dialects.
+        Returns the current dialect of serial replies; None for a unit without dialects.
     """
 
     def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect | None]) -> None:
@@ -176,7 +178,7 @@ class Decoder:
         self._can: dict[tuple[bool, int], CanDeviceReceiver | CanHostReceiver] = {}
 
     def line(self, entry: WireItem) -> dict[str, Any]:
-        """Return one item as a line of the trace, JSON data."""
+        """Decode one item to a line of the trace, as JSON data."""
         if isinstance(entry.item, CanFrame):
             frame = entry.item
             kind, text = self._can_text(frame, entry.at_s)
@@ -220,7 +222,7 @@ class Decoder:
         request = can_id.type in _REQUEST_TYPES
         key = (request, can_id.destination)
         if key not in self._can:
-            if len(self._can) >= MOST_ADDRESSES:
+            if len(self._can) >= MAX_ADDRESSES:
                 self._can.clear()
             self._can[key] = (CanDeviceReceiver if request else CanHostReceiver)(can_id.destination)
         row = self._icd.row_by_id(can_id.id)
@@ -228,14 +230,14 @@ class Decoder:
         kind, text = self._texts(self._can[key].feed(frame, now), f"segment of {name}")
         return kind, f"{can_id.source}→{can_id.destination} {text}"
 
-    def _texts(self, events: Sequence[Request | Reply | LinkFault], nothing: str) -> tuple[str, str]:
+    def _texts(self, events: Sequence[Request | Reply | LinkFault], if_none: str) -> tuple[str, str]:
         found = [self._text(event) for event in events]
         if not found:
-            return "part", nothing
+            return "part", if_none
         return found[-1][0], "; ".join(text for _, text in found)
 
     def _row(self, message: Request | Reply) -> Row | None:
-        """Return the row of a message, by class and id, else by its id alone."""
+        """Return the row of a message, by class and ID, else by ID alone."""
         if message.id is None:
             return None
         return self._icd.rows_by_key.get((message.klass, message.id)) or self._icd.row_by_id(message.id)
@@ -257,7 +259,7 @@ class Decoder:
 
 
 def _values(row: Row | None, data: bytes) -> str:
-    """Return the first values of a row in one line."""
+    """Format the first values of a row."""
     if row is None or not data:
         return ""
     try:
@@ -269,12 +271,12 @@ def _values(row: Row | None, data: bytes) -> str:
 
 
 def short(value: Any) -> str:
-    """Return a value for one line."""
+    """Format a value."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def canopen_text(frame: CanFrame) -> str:
-    """Return what an 11-bit frame means in CANopen."""
+    """Return the meaning of an 11-bit frame in CANopen."""
     if frame.id == 0:
         return "NMT command"
     if frame.id in (0x7E4, 0x7E5):
@@ -289,7 +291,7 @@ def canopen_text(frame: CanFrame) -> str:
 
 
 class RequestEncoder:
-    """Encodes telecommands as they go over the links of a unit.
+    """Encodes telecommands for the links of a unit.
 
     Parameters
     ----------
@@ -303,7 +305,7 @@ class RequestEncoder:
         self._objects = build_dictionary(icd) if icd.canopen_only else None
 
     def encode(self, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
-        """Return data and serial bytes in hexadecimal, and arguments of cansend, from one CAN address to another.
+        """Return data and serial bytes in hexadecimal, and arguments of cansend, for CAN addresses of OBC and device.
 
         Raises
         ------

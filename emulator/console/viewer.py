@@ -1,4 +1,4 @@
-"""One open page: what it wants, and what waits to be sent to it."""
+"""A connected console page: its subscriptions and its send queue."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections import deque
 from typing import Final, Protocol
 
 QUEUE_LIMIT: Final = 256
-"""Most messages that wait for a page; the oldest are dropped."""
+"""Send-queue limit; the oldest messages are dropped."""
 
 
 class Socket(Protocol):
-    """What a viewer needs of a WebSocket."""
+    """The methods of a WebSocket that a viewer uses."""
 
     async def send_str(self, data: str, /) -> None:
         """Send a text message."""
@@ -21,7 +21,7 @@ class Socket(Protocol):
 
 
 class Viewer:
-    """The server's end of a page; a page that does not read loses messages and delays nothing.
+    """The server side of a page; a page that does not read loses messages and delays nothing.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class Viewer:
     Attributes
     ----------
     frames, wire
-        Whether the page shows images, and the trace of the wire.
+        Whether the page shows images, and the trace.
     rows
         Telemetry rows that the page shows.
     dropped
@@ -50,7 +50,7 @@ class Viewer:
 
     @property
     def waiting(self) -> int:
-        """Number of messages that wait, the image included."""
+        """Number of queued messages, image included."""
         return len(self._texts) + (self._frame is not None)
 
     def send(self, text: str) -> None:
@@ -62,30 +62,30 @@ class Viewer:
         self._wake.set()
 
     def send_frame(self, data: bytes) -> None:
-        """Queue an image in place of one that still waits."""
+        """Queue an image, replacing one that is still queued."""
         self.dropped += self._frame is not None
         self._frame = data
         self._wake.set()
 
     async def pump(self) -> None:
-        """Send what is queued, for ever.
+        """Send queued messages until cancelled.
 
         Raises
         ------
         ConnectionError
-            The page has gone.
+            The page has closed.
         """
         while True:
             await self._wake.wait()
             await self.flush()
 
     async def flush(self) -> None:
-        """Send what is queued now.
+        """Send all queued messages.
 
         Raises
         ------
         ConnectionError
-            The page has gone.
+            The page has closed.
         """
         self._wake.clear()
         while self._texts:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.symlink_lock import NameTakenError, lock_name
+from starhil.emulator.symlink_lock import LockError, lock_name
 from starhil.protocol.errors import reason
 
 PRIVATE_FOLDER: Final = 0o700
@@ -33,7 +33,7 @@ class ControlSocket:
         self.path = path
         try:
             self._lock = lock_name("control", os.fsencode(path.parent.resolve() / path.name))
-        except NameTakenError as error:
+        except LockError as error:
             raise EmulatorError(f"control channel unix:{path}: {error}; choose another path") from None
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._file: os.stat_result | None = None

@@ -81,11 +81,11 @@ class FileStore:
             ) from None
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except OSError as error:
             os.close(self._lock)
-            raise EmulatorError(
-                f"state folder {folder}: in use by another emulator; choose another with --state-dir"
-            ) from None
+            taken = isinstance(error, BlockingIOError)
+            why = "in use by another emulator" if taken else f"cannot be used ({error.strerror})"
+            raise EmulatorError(f"state folder {folder}: {why}; choose another with --state-dir") from None
 
     def load(self) -> dict[str, Any]:
         """Return the last saved state; a corrupt file is set aside as `device.json.corrupt`."""

@@ -6,7 +6,7 @@ import logging
 import socket
 from typing import Final
 
-from starhil.emulator.symlink_lock import NameTakenError, lock_name
+from starhil.emulator.symlink_lock import LockError, lock_name
 
 log = logging.getLogger("starhil.link")
 
@@ -46,14 +46,14 @@ class BusAddress:
             return
         try:
             self._lock = lock_name(self._what, f"{bus} {number}".encode())
-        except NameTakenError as error:
-            self._warn(f"is in use by another emulator, process {error.owner}")
+        except LockError as error:
+            self._warn(str(error))
 
     def report_elsewhere(self) -> None:
         """Warn, once per address, that a CAN frame came from another node with this address."""
         if not self.seen_elsewhere:
             self.seen_elsewhere = True
-            self._warn("is also that of another node, whose frames arrive here")
+            self._warn("also used by another node, whose frames arrive here")
 
     def release(self) -> None:
         """Release the address."""
@@ -64,6 +64,6 @@ class BusAddress:
     def _warn(self, why: str) -> None:
         other = self.number % HIGHEST + 1
         log.warning(
-            "CAN %s: %s %d %s; give one of them another: --set %s=%d",
+            "CAN %s: %s %d: %s; give one of them another: --set %s=%d",
             *(self._bus, self._what, self.number, why, self._setting, other),
         )

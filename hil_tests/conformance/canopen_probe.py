@@ -35,7 +35,7 @@ NOBODY: Final = -1
 SETTLING_S: Final = 0.05
 """Time in which a node obeys an NMT command, and what was under way has come."""
 
-MOST_WAITING: Final = 20_000
+MAX_WAITING: Final = 20_000
 """Frames that may wait to be read before a node counts as one that floods the bus."""
 
 PDO_OFF: Final = 1 << 31
@@ -186,10 +186,10 @@ class CanopenProbe:
 
     def drain(self) -> None:
         """Discard everything received; fail if the node floods the bus."""
-        for _ in range(MOST_WAITING):
+        for _ in range(MAX_WAITING):
             if self.receive(0.0) is None:
                 return
-        raise CaseFailed("a node that comes to rest", f"more than {MOST_WAITING} frames")
+        raise CaseFailed("a node that comes to rest", f"more than {MAX_WAITING} frames")
 
     def wait_for(
         self,

@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.link_schema import HEX
 from starhil.protocol.values import IcdError
 
-Index = Annotated[int, Field(ge=0x2000, le=0xFFFF)]
+Index = Annotated[int, Field(ge=0x2000, le=0xFFFF, json_schema_extra=HEX)]
+Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF, json_schema_extra=HEX)]
 PackedType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u48"]
 
 
@@ -18,28 +20,33 @@ class _Model(BaseModel):
 
 
 class PackedField(_Model):
-    """A field of a telemetry row as a narrower integer."""
+    """A telemetry field as a narrower integer."""
 
     source: str = Field(alias="from")
-    """ROW.FIELD; a bit selects the whole byte that contains it."""
+    """`ROW.FIELD`; a bit selects the whole bit field that contains it."""
     name: str | None = None
-    """Name in the record; the field's name by default."""
+    """Name in the record; default: the field's."""
     type: PackedType
+    """Type of the entry."""
     scale: Annotated[float, Field(gt=0)] = 1.0
-    """Physical = raw * scale."""
+    """Physical = raw × scale."""
     wrap: bool = False
-    """Keep the lowest bits of a counter instead of clipping it."""
+    """Whether an out-of-range value is sent modulo the range (a counter) instead of as the nearest limit."""
 
 
 class PlacedMember(_Model):
-    """One entry of a record: a field to read, a telecommand to write, or both; or a parameter."""
+    """An entry of a record, with `value`, `telecommand` or both, or with `parameter`."""
 
     subindex: Annotated[int, Field(ge=1, le=254)] | None = None
-    """One more than that of the entry before unless given."""
+    """Sub-index; default: the next one."""
     name: str
+    """Name of the entry."""
     value: str | None = None
+    """`ROW.FIELD` of the telemetry field that is read."""
     telecommand: str | None = None
+    """Telecommand that a write executes."""
     parameter: str | None = None
+    """Parameter that is read and set."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> PlacedMember:
@@ -49,21 +56,34 @@ class PlacedMember(_Model):
 
 
 class PlacedObject(_Model):
-    """One object of the application and its content."""
+    """An application object.
+
+    The keys from `requests` on give its content: one of them, or `telecommand` with `value` or `telemetry`.
+    """
 
     index: Index
+    """Index in the object dictionary."""
     name: str
+    """Name of the object."""
     requests: bool = False
+    """A record of all rows, by ID as sub-index: telemetry to read, telecommands to write."""
     telemetry: str | None = None
-    """Record of the row's fields; with a telecommand that it includes, each of them sets this one and keeps the others."""
+    """A record of the fields of a telemetry row; with `telecommand`, which the row must include, a write to one field
+    executes the telecommand with the other fields unchanged."""
     value: str | None = None
+    """A telemetry field to read, as `ROW.FIELD`."""
     telecommand: str | None = None
+    """A telecommand, which a write executes."""
     type: Literal["u8", "u16", "u32", "u64"] | None = None
-    """Number that holds all bytes of the telecommand, so that a PDO can carry it."""
+    """Integer type that holds all data of the telecommand, so that a PDO can carry it."""
     parameters: bool = False
+    """A record of all parameters, by ID as sub-index."""
     image: Literal["frame", "stored"] | None = None
+    """A record of the last frame or the stored image: pixels (DOMAIN), width, height, frame counter."""
     packed: list[PackedField] = []
+    """A record of telemetry fields in narrower types."""
     members: list[PlacedMember] = []
+    """A record of the listed entries."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> PlacedObject:
@@ -92,30 +112,46 @@ class PdoModel(_Model):
     """Default configuration of a PDO."""
 
     name: str
+    """Name of the PDO."""
     enabled: bool = False
-    can_id: Annotated[int, Field(ge=0x181, le=0x57F)] | None = None
-    """CAN ID, to which the node-ID is added; the predefined one of the first four PDOs unless given."""
+    """Whether the PDO is enabled."""
+    can_id: Annotated[int, Field(ge=0x181, le=0x57F, json_schema_extra=HEX)] | None = None
+    """CAN ID; the first four PDOs have a predefined default."""
     relative: bool = True
-    """Whether the node-ID is added to `can_id`."""
+    """Whether the node ID is added to `can_id`."""
     transmission_type: Annotated[int, Field(ge=0, le=255)] = 255
+    """Transmission type (CiA 301)."""
     inhibit_ms: Annotated[float, Field(ge=0, le=6553.5)] = 0
+    """Inhibit time in milliseconds."""
     event_ms: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
+    """Event timer in milliseconds; 0: off."""
     objects: list[str] = []
+    """Mapped entries, as `INDEX.NAME` or `INDEX` in hexadecimal digits."""
 
 
 class CanopenModel(_Model):
-    """Content of the table `canopen`."""
+    """The CANopen node: its identity and what its object dictionary holds."""
 
-    device_type: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    device_type: Unsigned32
+    """Object 1000h."""
     device_name: str
+    """Object 1008h."""
     vendor_name: str
-    vendor_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
-    product_code: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
-    revision: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    """Vendor in the EDS."""
+    vendor_id: Unsigned32
+    """Object 1018h, sub-index 1."""
+    product_code: Unsigned32
+    """Object 1018h, sub-index 2."""
+    revision: Unsigned32
+    """Object 1018h, sub-index 3."""
     bit_rates: list[int] = Field(min_length=1)
+    """Supported bit rates, in bit/s."""
     object: list[PlacedObject] = Field(min_length=1)
+    """Application objects: `[[canopen.object]]`."""
     tpdo: list[PdoModel] = []
+    """Transmit PDOs: `[[canopen.tpdo]]`."""
     rpdo: list[PdoModel] = []
+    """Receive PDOs: `[[canopen.rpdo]]`."""
 
 
 def read_layout(icd: InterfaceDefinition) -> CanopenModel:

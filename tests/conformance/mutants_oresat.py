@@ -1,4 +1,4 @@
-"""Mutants of a unit on CANopen: its definition with one mistake, served to a tester that has the right one."""
+"""Mutants of a unit on CANopen: its definition with one error, served to a tester with the correct definition."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ UNIT = "oresat"
 
 
 @dataclasses.dataclass(frozen=True)
-class Mistake:
-    """A text of the definition that is another one, wherever it stands, and the case that has to fail because of it."""
+class DefinitionMutant:
+    """A text of the definition that is replaced everywhere, and the case that must then fail."""
 
     name: str
     caught_by: str
@@ -23,12 +23,12 @@ class Mistake:
     new: str
 
     def write(self, folder: Path) -> Path:
-        """Write the definition with the mistake.
+        """Write the definition with the error.
 
         Raises
         ------
         ValueError
-            The text does not stand in it.
+            The definition does not contain the text.
         """
         text = (find_unit(UNIT) / f"{UNIT}.toml").read_text(encoding="utf-8")
         if self.old not in text:
@@ -37,30 +37,30 @@ class Mistake:
         return folder
 
 
-MISTAKES = (
-    Mistake("the orientation has another index", "rows.orientation", "4002", "4012"),
-    Mistake("a sub-index is left out", "rows.system", 'name = "unix_time", value', 'name = "unix_time", subindex = 5, value'),
-    Mistake("fields are shifted by one", "rows.orientation", '    { name = "attitude_i"', '    { name = "count", type = "u8", default = 0 },\n    { name = "attitude_i"'),
-    Mistake("a number has another size", "rows.system", 'name = "power_cycles", type = "u16"', 'name = "power_cycles", type = "u32"'),
-    Mistake("a number has another scale", "attitude.orientation", 'value = "attitude.z"', 'value = "attitude.z", scale = 0.5'),
-    Mistake("the scalar part is missing", "attitude.orientation", 'value = "attitude.w"', "default = 0"),
-    Mistake("the attitude is known when it is not", "attitude.orientation", 'value = "attitude.valid"', "const = 1"),
-    Mistake("another number stands for a mode", "commands.set_status", '4 = ["lost_in_space"', '5 = ["lost_in_space"'),
-    Mistake("a mode is refused", "commands.set_status", '2 = "standby", 4 = "lost_in_space" }', '2 = "standby" }'),
-    Mistake("another mode is accepted", "limits.set_status.status.unknown", '4 = "lost_in_space" }', '4 = "lost_in_space", 255 = "tracking" }'),
-    Mistake("the status cannot be written", "commands.set_status", 'telecommand = "set_status"', ""),
-    Mistake("limits are wider", "limits.set_capture_filter.upper_percentage.high", "max = 100", "max = 255"),
-    Mistake("limits are tighter", "records.set_capture_filter", "max = 255", "max = 254"),
-    Mistake("settings cannot be written", "records.set_capture_filter", '\ntelecommand = "set_capture_filter"', ""),
-    Mistake("a reset is accepted without one", "commands.reset", 'action = "reset"', 'action = "nothing"'),
-    Mistake("seconds and fractions are exchanged", "rpdos.1.clock", 'name = "coarse", type = "u32", unit = "s", argument = "seconds" }', 'name = "coarse", type = "u32", default = 0 }'),
-    Mistake("an RPDO has another CAN ID", "rpdos.1.default", "relative = false", ""),
-    Mistake("a TPDO has another CAN ID", "tpdos.5.default", "can_id = 0x181                      # 1ADh", "can_id = 0x182  #"),
-    Mistake("a TPDO is off", "tpdos.4.default", '"attitude real, i"\nenabled = true', '"attitude real, i"'),
-    Mistake("a TPDO is synchronous", "tpdos.3.default", "transmission_type = 254", "transmission_type = 1"),
-    Mistake("a TPDO has another period", "tpdos.2.default", "event_ms = 5000", "event_ms = 500"),
-    Mistake("a TPDO has its objects in another order", "tpdos.4.default", '"4002.attitude_real", "4002.attitude_i"', '"4002.attitude_i", "4002.attitude_real"'),
-    Mistake("a TPDO lacks an object", "tpdos.3.default", '"4002.attitude_known", ', ""),
+DEFINITION_MUTANTS = (
+    DefinitionMutant("the orientation has another index", "rows.orientation", "4002", "4012"),
+    DefinitionMutant("a sub-index is left out", "rows.system", 'name = "unix_time", value', 'name = "unix_time", subindex = 5, value'),
+    DefinitionMutant("fields are shifted by one", "rows.orientation", '    { name = "attitude_i"', '    { name = "count", type = "u8", default = 0 },\n    { name = "attitude_i"'),
+    DefinitionMutant("a number has another size", "rows.system", 'name = "power_cycles", type = "u16"', 'name = "power_cycles", type = "u32"'),
+    DefinitionMutant("a number has another scale", "attitude.orientation", 'value = "attitude.z"', 'value = "attitude.z", scale = 0.5'),
+    DefinitionMutant("the scalar part is missing", "attitude.orientation", 'value = "attitude.w"', "default = 0"),
+    DefinitionMutant("the attitude is known when it is not", "attitude.orientation", 'value = "attitude.valid"', "const = 1"),
+    DefinitionMutant("another number stands for a mode", "commands.set_status", '4 = ["lost_in_space"', '5 = ["lost_in_space"'),
+    DefinitionMutant("a mode is refused", "commands.set_status", '2 = "standby", 4 = "lost_in_space" }', '2 = "standby" }'),
+    DefinitionMutant("another mode is accepted", "limits.set_status.status.unknown", '4 = "lost_in_space" }', '4 = "lost_in_space", 255 = "tracking" }'),
+    DefinitionMutant("the status cannot be written", "commands.set_status", 'telecommand = "set_status"', ""),
+    DefinitionMutant("limits are wider", "limits.set_capture_filter.upper_percentage.high", "max = 100", "max = 255"),
+    DefinitionMutant("limits are tighter", "records.set_capture_filter", "max = 255", "max = 254"),
+    DefinitionMutant("settings cannot be written", "records.set_capture_filter", '\ntelecommand = "set_capture_filter"', ""),
+    DefinitionMutant("a reset is accepted without one", "commands.reset", 'action = "reset"', 'action = "nothing"'),
+    DefinitionMutant("seconds and fractions are exchanged", "rpdos.1.clock", 'name = "coarse", type = "u32", unit = "s", argument = "seconds" }', 'name = "coarse", type = "u32", default = 0 }'),
+    DefinitionMutant("an RPDO has another CAN ID", "rpdos.1.default", "relative = false", ""),
+    DefinitionMutant("a TPDO has another CAN ID", "tpdos.5.default", "can_id = 0x181                      # 1ADh", "can_id = 0x182  #"),
+    DefinitionMutant("a TPDO is off", "tpdos.4.default", '"attitude real, i"\nenabled = true', '"attitude real, i"'),
+    DefinitionMutant("a TPDO is synchronous", "tpdos.3.default", "transmission_type = 254", "transmission_type = 1"),
+    DefinitionMutant("a TPDO has another period", "tpdos.2.default", "event_ms = 5000", "event_ms = 500"),
+    DefinitionMutant("a TPDO has its objects in another order", "tpdos.4.default", '"4002.attitude_real", "4002.attitude_i"', '"4002.attitude_i", "4002.attitude_real"'),
+    DefinitionMutant("a TPDO lacks an object", "tpdos.3.default", '"4002.attitude_known", ', ""),
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The units that ship pass the cases that their definitions yield."""
+"""Bundled units pass the cases that their definitions yield."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.icd import load_unit
 from tests.conformance.mutant_seams import Damage
-from tests.conformance.mutants_oresat import DAMAGES, MISTAKES, Mistake
+from tests.conformance.mutants_oresat import DAMAGES, DEFINITION_MUTANTS, DefinitionMutant
 from tests.conformance.mutants_units import UnitMutant, gen2, mutants
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_mutants import MUTANTS
@@ -31,7 +31,7 @@ MUTANTS_ON_CAN = [
 
 
 @pytest.mark.parametrize(("unit", "link"), [*((unit, "serial") for unit in UNITS), (GEN2, "can")])
-def test_a_unit_that_ships_passes_every_case_of_its_definition(unit: str, link: str) -> None:
+def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str) -> None:
     cases = SUITES[link](load_unit(unit))
     with SimulatedUnit(link, unit=unit) as simulated:
         outcomes = run_cases(simulated.probe, cases)
@@ -80,10 +80,10 @@ def caught_on_canopen(simulated: SimulatedUnit, case: str) -> None:
     assert outcome.seen
 
 
-@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
-def test_a_mistake_in_a_definition_on_canopen_is_caught_by_its_case(mistake: Mistake, tmp_path) -> None:
-    served = mistake.write(tmp_path)
-    caught_on_canopen(SimulatedUnit("canopen", unit="oresat", served=served), mistake.caught_by)
+@pytest.mark.parametrize("mutant", DEFINITION_MUTANTS, ids=lambda mutant: mutant.name)
+def test_a_mutant_of_a_canopen_definition_is_caught_by_its_case(mutant: DefinitionMutant, tmp_path) -> None:
+    served = mutant.write(tmp_path)
+    caught_on_canopen(SimulatedUnit("canopen", unit="oresat", served=served), mutant.caught_by)
 
 
 @pytest.mark.parametrize("name", DAMAGES)

@@ -1,7 +1,9 @@
 """A symlink belongs to one emulator at a time."""
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 
@@ -11,7 +13,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.symlink_lock import lock_symlink
 
 
-def test_a_claimed_path_is_rejected_by_every_spelling_and_free_again_after(tmp_path):
+def test_a_locked_path_is_rejected_in_every_spelling_and_free_again_afterwards(tmp_path):
     path = tmp_path / "tty"
     (tmp_path / "folder").mkdir()
     with lock_symlink(path):
@@ -22,7 +24,7 @@ def test_a_claimed_path_is_rejected_by_every_spelling_and_free_again_after(tmp_p
     lock_symlink(path).close()
 
 
-def test_a_stale_symlink_may_be_claimed_and_one_of_somebody_else_not(tmp_path):
+def test_a_stale_symlink_can_be_locked_and_a_foreign_one_cannot(tmp_path):
     stale, foreign = tmp_path / "stale", tmp_path / "foreign"
     stale.symlink_to("/dev/pts/99999")
     lock_symlink(stale).close()
@@ -31,7 +33,7 @@ def test_a_stale_symlink_may_be_claimed_and_one_of_somebody_else_not(tmp_path):
         lock_symlink(foreign)
 
 
-def test_a_lock_ends_with_its_process_however_that_ends(tmp_path):
+def test_a_lock_ends_with_its_process_even_when_killed(tmp_path):
     path = tmp_path / "tty"
     program = (
         "import sys, time; from pathlib import Path; from starhil.emulator.symlink_lock import lock_symlink;"
@@ -45,3 +47,17 @@ def test_a_lock_ends_with_its_process_however_that_ends(tmp_path):
             lock_symlink(path)
         holder.send_signal(signal.SIGKILL)
     lock_symlink(path).close()
+
+
+def test_a_lock_that_cannot_be_made_is_not_reported_as_in_use(tmp_path, monkeypatch):
+    class NoBuffers(socket.socket):
+        def bind(self, _address):
+            raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
+
+    monkeypatch.setattr(socket, "socket", NoBuffers)
+    with pytest.raises(EmulatorError) as error:
+        lock_symlink(tmp_path / "tty")
+    assert (
+        str(error.value)
+        == f"symlink {tmp_path / 'tty'}: cannot be locked (No buffer space available); choose another name"
+    )

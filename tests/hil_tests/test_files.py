@@ -18,7 +18,7 @@ from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percent
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.candump import read_candump
+from starhil.protocol.candump import bus_name, read_candump
 
 
 def random_image(height: int, width: int) -> np.ndarray:
@@ -70,13 +70,15 @@ def test_the_can_log_is_read_back_as_candump_lines(tmp_path):
         CanFrame(0x05850401, b"\x01\x02"),
         CanFrame(0x123, b"\xff", extended=False),
     ]
-    with CandumpLog(tmp_path / "can.log", now=lambda: 12.25) as log:
+    with CandumpLog(
+        tmp_path / "can.log", bus_name("socketcand:127.0.0.1:29536/can7"), now=lambda: 12.25
+    ) as log:
         log.note("not in this format")
         for frame in frames:
             log.sent(frame)
     lines = list(read_candump(tmp_path / "can.log"))
     assert [(channel, frame.id, frame.data, frame.extended) for channel, frame in lines] == [
-        ("vcan0", frame.id, frame.data, frame.extended) for frame in frames
+        ("can7", frame.id, frame.data, frame.extended) for frame in frames
     ]
     assert {frame.timestamp for _, frame in lines} == {12.25}
 

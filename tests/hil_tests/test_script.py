@@ -1,4 +1,4 @@
-"""Session scripts: what is read, and the one line that each mistake is answered with."""
+"""Session scripts: what is read, and the one-line message for each error."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_a_full_script_is_read_as_it_stands(load):
         ),
     ],
 )
-def test_a_mistake_is_answered_with_file_step_name_and_near_matches(load, text, words):
+def test_an_error_is_reported_with_file_step_name_and_near_matches(load, text, words):
     message = refusal(load, text)
     for word in words:
         assert word in message

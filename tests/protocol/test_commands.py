@@ -49,7 +49,7 @@ def test_list_tells_every_row_and_parameter() -> None:
         ),
         (
             ("icd", "export", "html", "--unit", "/does/not/exist"),
-            "starhil: unit /does/not/exist: neither a folder nor a unit that ships",
+            "starhil: unit /does/not/exist: neither a folder nor a bundled unit",
         ),
         (("hub", "--host", "203.0.113.1", "--port", "1"), "starhil: CAN hub: cannot listen at 203.0.113.1:1"),
     ],

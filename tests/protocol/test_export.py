@@ -28,7 +28,7 @@ from starhil.protocol.export.describe import anchor
 from starhil.protocol.export.row_key import key_bits, key_of
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.unit_folders import DEFAULT_UNIT, shipped_units
+from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starhil.protocol.values import Value, to_f32
 
 ICD = load_unit()
@@ -409,7 +409,7 @@ def test_a_changed_row_changes_every_export(tmp_path: Path) -> None:
 
 # -- other units -------------------------------------------------------------------------------------------------------
 
-UNITS = [name for name in shipped_units() if name != DEFAULT_UNIT]
+UNITS = [name for name in bundled_units() if name != DEFAULT_UNIT]
 WITHOUT = {
     "dbc": ("has no CAN link", lambda icd: icd.link.can is None),
     "eds": ("has no CANopen", lambda icd: icd.canopen is None),

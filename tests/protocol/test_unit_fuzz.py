@@ -1,4 +1,4 @@
-"""Every unit that ships: its decoders stand mutated input (STARHIL_FUZZ_INPUTS sets the number), another unit's bytes included."""
+"""Every bundled unit: its decoders withstand mutated input (STARHIL_FUZZ_INPUTS sets the number), another unit's bytes included."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack
-from starhil.protocol.unit_folders import shipped_units
+from starhil.protocol.unit_folders import bundled_units
 from starhil.protocol.values import MessageError
 from tests.protocol.mutations import mutated
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "1500"))
 SEED = 20261122
-UNITS = [name for name in shipped_units() if load_unit(name).link.serial is not None]
+UNITS = [name for name in bundled_units() if load_unit(name).link.serial is not None]
 FOREIGN = [
     (unit, other)
     for unit in UNITS

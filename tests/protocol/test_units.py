@@ -1,4 +1,4 @@
-"""Definitions of other units: byte order, groups, maps, classes, bindings, and the mistakes in them."""
+"""Definitions of other units: byte order, groups, maps, classes, bindings, and errors in definitions."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from starhil.protocol.device_model import device_model
 from starhil.protocol.icd import check_unit, load_unit
 from starhil.protocol.plugin import quantity
 from starhil.protocol.unit_examples import exchanges
-from starhil.protocol.unit_folders import SKELETON, shipped_units
+from starhil.protocol.unit_folders import SKELETON, bundled_units
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import FieldError, IcdError
 
@@ -125,7 +125,7 @@ def test_a_parameter_is_that_of_the_device_unless_the_unit_says_otherwise(unit):
     assert set(icd.device_parameters) == set(device_model().parameters)
 
 
-MISTAKES = [
+INVALID = [
     ("unknown quantity", telemetry('{ name = "a", type = "f32", value = "atitude.w" }'), "row: field a: no quantity named 'atitude.w'; did you mean attitude.w"),
     ("number beyond the last", telemetry('{ name = "a", type = "f32", unit = "px", value = "stars[99].x" }'), r"no quantity named 'stars\[99\].x'"),
     ("no number", telemetry('{ name = "a", type = "f32", unit = "px", value = "stars[n].x" }'), r"\[n\] has no number"),
@@ -173,9 +173,9 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [case[1:] for case in MISTAKES], ids=[case[0] for case in MISTAKES]
+    ("text", "message"), [case[1:] for case in INVALID], ids=[case[0] for case in INVALID]
 )
-def test_a_mistake_is_named_with_file_row_field_and_remedy(tmp_path, text, message):
+def test_an_error_is_named_with_file_row_field_and_remedy(tmp_path, text, message):
     file = tmp_path / "unit.toml"
     file.write_text(HEAD + text, encoding="utf-8")
     with pytest.raises(IcdError, match=message) as caught:
@@ -184,7 +184,7 @@ def test_a_mistake_is_named_with_file_row_field_and_remedy(tmp_path, text, messa
     assert "\n" not in str(caught.value)
 
 
-def test_all_mistakes_are_listed(tmp_path):
+def test_all_errors_are_listed(tmp_path):
     wrong = '{ name = "a", type = "f32", value = "atitude.w" }'
     (tmp_path / "a.toml").write_text(
         HEAD + telemetry(wrong, "one") + telecommand("", "reboot"), encoding="utf-8"
@@ -193,7 +193,7 @@ def test_all_mistakes_are_listed(tmp_path):
     found = check_unit(tmp_path)
     assert len(found) == 3
     assert [text for text in found if "b.toml: telemetry two: field a" in text]
-    with pytest.raises(IcdError, match="2 more mistakes: starhil unit check"):
+    with pytest.raises(IcdError, match="2 more: starhil unit check"):
         load_unit(tmp_path)
 
 
@@ -301,7 +301,7 @@ def test_the_skeleton_can_be_emulated(tmp_path):
     assert examples[0].request[0].startswith("C0 10 01 01")
 
 
-@pytest.mark.parametrize("name", [name for name in shipped_units() if name != "cubestar"])
+@pytest.mark.parametrize("name", [name for name in bundled_units() if name != "cubestar"])
 def test_every_row_of_a_foreign_unit_names_its_public_source(name):
     rows = list(load_unit(name).rows)
     assert {row.provenance for row in rows} <= {"confirmed", "ours"}
@@ -309,7 +309,7 @@ def test_every_row_of_a_foreign_unit_names_its_public_source(name):
     assert not any(row.source for row in rows if row.provenance == "ours")
 
 
-@pytest.mark.parametrize("name", shipped_units())
+@pytest.mark.parametrize("name", bundled_units())
 def test_every_shipped_unit_can_be_emulated(name):
     assert check_unit(name) == []
     assert all(item.request for item in exchanges(load_unit(name)))

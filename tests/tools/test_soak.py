@@ -73,7 +73,7 @@ def test_a_latency_that_was_not_measured_fails():
     ]
 
 
-@pytest.mark.parametrize("count", [0, 1, soak.LEAST_ROUNDS - 1])
+@pytest.mark.parametrize("count", [0, 1, soak.MIN_ROUNDS - 1])
 def test_too_few_rounds_are_no_verdict(count):
     with pytest.raises(ValueError, match=f"{count} rounds are too few"):
         soak.compare(series()[:count])

@@ -1,4 +1,4 @@
-"""`starhil unit`: a definition that is written, checked and described, and one that does not start."""
+"""`starhil unit`: list, create, check and describe units; a unit with errors does not start."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import shipped_units
+from starhil.protocol.unit_folders import bundled_units
 
 
 def unit(*words: str):
@@ -26,14 +26,14 @@ def unit(*words: str):
     return CliRunner().invoke(group, words)
 
 
-def test_a_new_definition_is_good_and_shows_its_exchanges(tmp_path):
+def test_a_new_unit_has_no_errors_and_shows_its_exchanges(tmp_path):
     folder = tmp_path / "mine"
     assert unit("new", str(folder)).exit_code == 0
     assert 'name = "mine"' in (folder / "unit.toml").read_text(encoding="utf-8")
     checked = unit("check", str(folder))
     assert checked.exit_code == 0
-    assert "telecommand set_mode, id 2, 1 B, on serial\n  > C0 10 01 02 00 CE 35 C0\n" in checked.stdout
-    assert checked.stdout.endswith(f"unit {folder}: good\n")
+    assert "telecommand set_mode, ID 0x02, 1 B, on serial\n  > C0 10 01 02 00 CE 35 C0\n" in checked.stdout
+    assert checked.stdout.endswith(f"{folder}: no errors\n")
 
 
 def test_a_definition_is_not_overwritten(tmp_path):
@@ -41,7 +41,7 @@ def test_a_definition_is_not_overwritten(tmp_path):
     assert isinstance(unit("new", str(tmp_path)).exception, EmulatorError)
 
 
-def test_all_mistakes_are_printed_and_the_status_is_1(tmp_path):
+def test_all_errors_are_printed_and_the_status_is_1(tmp_path):
     unit("new", str(tmp_path))
     file = tmp_path / "unit.toml"
     text = (
@@ -50,7 +50,7 @@ def test_all_mistakes_are_printed_and_the_status_is_1(tmp_path):
     file.write_text(text, encoding="utf-8")
     checked = unit("check", str(tmp_path), "--json")
     assert checked.exit_code == 1
-    clock, attitude = json.loads(checked.stdout)["mistakes"]
+    clock, attitude = json.loads(checked.stdout)["errors"]
     assert (
         clock
         == f"{file}: telecommand set_time: no action named 'set_clok'; did you mean set_clock, set_mode?"
@@ -74,10 +74,16 @@ def test_a_profile_with_a_wrong_unit_starts_nothing(tmp_path, monkeypatch):
         Emulation(load_profile(str(profile)))
 
 
-def test_units_that_ship_are_listed_and_described():
+def test_bundled_units_are_listed_and_described():
     listed = json.loads(unit("list", "--json").stdout)
-    assert [item["unit"] for item in listed] == shipped_units()
-    assert "cubestar (default)" in unit("list").stdout
+    assert [item["unit"] for item in listed] == bundled_units()
+    table = unit("list").stdout
+    assert re.search(
+        r"^cubestar \(default\)  serial \(cubespace\), CAN \(cubespace\), CANopen  \d+ telecommands  ",
+        table,
+        re.MULTILINE,
+    )
+    assert re.search(r"^nos3 .*  \d+ telecommands?  +\d+ telemetry rows?  ", table, re.MULTILINE)
     text = unit("describe", "cubestar").stdout
     assert re.search(
         r"160 telemetry precise_attitude: 56 B, ours\n +0 time_of_exposure: f64 s <- frame\.time\n", text

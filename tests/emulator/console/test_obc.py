@@ -111,7 +111,7 @@ def test_a_pause_between_two_telecommands_is_a_step_and_a_slow_reply_is_none():
     ]
 
 
-def test_the_wire_is_decoded_for_those_who_look_and_saved_as_a_candump_log(run):
+def test_a_page_that_subscribes_to_the_wire_gets_it_decoded(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:
@@ -131,15 +131,15 @@ def test_the_wire_is_decoded_for_those_who_look_and_saved_as_a_candump_log(run):
     run(scenario, options=OPTIONS)
 
 
-def test_the_candump_log_has_the_frames_of_the_bus(run):
+def test_the_candump_log_has_the_frames_and_the_name_of_the_bus(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:
             await page.ask(do="subscribe", wire=True)
             await page.ask(do="send", row="clear_counters", values={})
             text = await page.get("/wire.log")
-            ids = [parse_candump(line)[1].id for line in text.splitlines()]
-            assert ids == [0x0167FD04, 0x026704FD]
+            seen = [(channel, frame.id) for channel, frame in map(parse_candump, text.splitlines())]
+            assert seen == [("console-test", 0x0167FD04), ("console-test", 0x026704FD)]
 
     run(
         scenario,

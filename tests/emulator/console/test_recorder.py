@@ -115,7 +115,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
         recorder_module.Writer = original
     said = [record.getMessage() for record in caplog.records if record.name == "starhil.record"]
     assert len(said) == 1
-    assert said[0].endswith("ends here (No space left on device); the run goes on")
+    assert said[0].endswith("stopped: No space left on device; the run continues")
 
 
 def test_each_head_has_a_file_of_its_own(run, tmp_path):

@@ -1,4 +1,4 @@
-"""The trace of the wires: what each piece means."""
+"""Decoding of the traffic trace."""
 
 import pytest
 

@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import resource
@@ -34,7 +35,16 @@ def test_a_folder_serves_one_emulator_at_a_time(tmp_path):
     FileStore(tmp_path).close()
 
 
-def test_a_folder_that_cannot_be_is_refused(tmp_path):
+def test_a_lock_that_fails_for_another_reason_is_not_reported_as_in_use(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with pytest.raises(EmulatorError, match=r"cannot be used \(No locks available\)"):
+        FileStore(tmp_path)
+
+
+def test_a_folder_that_cannot_be_created_is_rejected(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(EmulatorError, match="--state-dir"):
         FileStore(tmp_path / "file")

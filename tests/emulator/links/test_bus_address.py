@@ -30,7 +30,7 @@ def test_an_address_is_reported_while_another_has_it_and_free_after(caplog):
     assert clashes(caplog) == []
     second.take(BUS, 4)
     [text] = clashes(caplog)
-    assert text.startswith(f"CAN {BUS}: address 4 is in use by another emulator, process ")
+    assert text.startswith(f"CAN {BUS}: address 4: in use by another emulator, process ")
     assert text.endswith("give one of them another: --set links.can.address=5")
     second.release()
     first.release()
@@ -82,7 +82,7 @@ def test_a_frame_from_a_node_of_the_same_address_is_reported_once(bench, caplog)
         for _ in range(3):
             bus.arrive(REPLY)
         [text] = clashes(caplog)
-        assert "address 4 is also that of another node" in text
+        assert "address 4: also used by another node" in text
         assert "--set links.can.address=5" in text
         await link.close()
 

@@ -1,4 +1,4 @@
-"""The noise of a frame has the statistics of electrons, and never repeats."""
+"""Noise has the statistics of electrons, differs between images and seeds, and is the same for the same seed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def normals(seed: int) -> np.ndarray:
     return out.ravel().astype(np.float64)
 
 
-def test_deviates_are_normal() -> None:
+def test_normal_deviates_have_a_normal_distribution() -> None:
     sample = normals(1)
     assert stats.kstest(sample, "norm").pvalue > 1e-3
     assert abs(sample.mean()) < 5.0 / np.sqrt(sample.size)
@@ -38,7 +38,7 @@ def test_deviates_are_normal() -> None:
     assert abs(beyond - expected) < 5.0 * np.sqrt(expected)
 
 
-def test_deviates_are_independent() -> None:
+def test_normal_deviates_are_uncorrelated() -> None:
     sample = normals(2)
     for lag in (1, 2, 511, 512, 513, 1024, 2048):
         correlation = np.corrcoef(sample[:-lag], sample[lag:])[0, 1]
@@ -49,7 +49,7 @@ def test_deviates_are_independent() -> None:
 
 @pytest.mark.parametrize("mean_e", [0.0, 3.0, 17.0, 100.0, 1000.0, 5000.0])
 @pytest.mark.parametrize("digitizer", [FINE, QUIET], ids=["fine", "quiet"])
-def test_photon_transfer(digitizer: Digitizer, mean_e: float) -> None:
+def test_the_variance_follows_the_photon_transfer_curve(digitizer: Digitizer, mean_e: float) -> None:
     """Mean and variance follow the electrons: variance = mean + read noise² + rounding²."""
     sample = electrons(mean_e, digitizer)
     variance = mean_e + digitizer.read_noise_e**2 + digitizer.gain_e_per_dn**2 / 12.0
@@ -75,25 +75,25 @@ def test_few_electrons_are_whole_numbers() -> None:
     assert chi2 < stats.chi2.isf(1e-4, np.count_nonzero(chosen))
 
 
-def test_bytes_have_the_mean_of_the_electrons() -> None:
+def test_images_of_8_bits_have_the_mean_of_the_electrons() -> None:
     sample = electrons(17.0, BYTES)
     assert sample.mean() == pytest.approx(17.0, abs=0.3)
 
 
-def test_full_well_and_converter_cut() -> None:
+def test_full_well_and_converter_limit_the_counts() -> None:
     assert electrons(40000.0, QUIET).max() < QUIET.full_well_e + 6.0
     full = digitize(np.full(SHAPE, 40000.0, dtype=np.float32), BYTES, 1, 0)
     assert np.all(full == BYTES.max_dn)
 
 
-def test_frames_do_not_repeat_each_other() -> None:
+def test_noise_differs_between_images_and_seeds() -> None:
     first, second = electrons(1000.0, FINE, 0), electrons(1000.0, FINE, 1)
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 5.0 / 512.0
     other_seed = electrons(1000.0, FINE, 0, seed=4)
     assert abs(np.corrcoef(first.ravel(), other_seed.ravel())[0, 1]) < 5.0 / 512.0
 
 
-def test_noise_has_no_pattern() -> None:
+def test_noise_has_no_spatial_pattern() -> None:
     """The power spectrum of many frames' mean is white: no row, column or block stands out."""
     mean = np.mean([electrons(1000.0, FINE, frame) for frame in range(16)], axis=0)
     mean -= mean.mean()
@@ -105,7 +105,7 @@ def test_noise_has_no_pattern() -> None:
         assert profile.std() == pytest.approx(mean.std() / np.sqrt(512), rel=0.2)
 
 
-def test_same_seed_same_bytes() -> None:
+def test_the_same_seed_and_image_number_give_the_same_noise() -> None:
     mean = np.linspace(0.0, 8000.0, 937 * 31, dtype=np.float32).reshape(31, 937)
     for digitizer in (FINE, BYTES, QUIET):
         first = digitize(mean, digitizer, 7, 5)

@@ -153,14 +153,14 @@ class SimulatedBus:
     A slave that never comes to rest fails the case instead of hanging it.
     """
 
-    MOST_FRAMES = 100_000
-    MOST_TICKS = 5_000
+    MAX_FRAMES = 100_000
+    MAX_TICKS = 5_000
 
     def __init__(self, slave) -> None:
         self._slave = slave
         self._now = 0.0
         self._frames = deque(slave.start(0.0))
-        self.budget = self.MOST_FRAMES
+        self.budget = self.MAX_FRAMES
 
     def now(self) -> float:
         return self._now
@@ -170,7 +170,7 @@ class SimulatedBus:
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         end = self._now + timeout_s
-        for _ in range(self.MOST_TICKS):
+        for _ in range(self.MAX_TICKS):
             if self._frames:
                 self.budget -= 1
                 if self.budget < 0:

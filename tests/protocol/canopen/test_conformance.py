@@ -64,7 +64,7 @@ def test_mutant_is_caught(simulated_probe, mutants, name):
     probe = simulated_probe(mutants.load(mutant))
     likely_first = sorted(CANOPEN_CASES, key=lambda case: case.area != f"canopen.{mutant.area}")
     for case in likely_first:
-        probe.port.budget = probe.port.MOST_FRAMES
+        probe.port.budget = probe.port.MAX_FRAMES
         if run_case(probe, case).status == "failed":
             return
     pytest.fail("no case fails")

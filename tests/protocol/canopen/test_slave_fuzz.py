@@ -34,7 +34,7 @@ LSS_COMMANDS = (
     0x5E,
 )
 NMT_COMMANDS = (1, 2, 128, 129, 130)
-MOST_ANSWERS = 200
+MAX_ANSWERS = 200
 """Frames that one frame may be answered by: a block of 127 segments and what goes with it."""
 LONGEST_SILENCE_S = 2 * 65.535
 """LSS activate bit timing keeps a slave silent for two switch delays of 16 bits of milliseconds (CiA 305)."""
@@ -79,7 +79,7 @@ def test_the_slave_answers_in_order_and_goes_on_whatever_comes():
         deadline = bench.slave.next_deadline()
         if deadline is not None and deadline <= bench.now:
             answers = [*answers, *bench.slave.tick(bench.now)]
-        assert len(answers) <= MOST_ANSWERS
+        assert len(answers) <= MAX_ANSWERS
         for answer in answers:
             assert not answer.extended
             assert len(answer.data) <= 8

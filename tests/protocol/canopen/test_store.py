@@ -1,4 +1,4 @@
-"""Store and restore (1010h, 1011h) and the file that they are kept in."""
+"""Store and restore (1010h, 1011h), and the file of stored parameters."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def values(bench):
 
 
 @pytest.mark.parametrize("subindex", [1, 2])
-def test_what_was_saved_survives_the_power_cycle(stored, new_bench, storage, subindex):
+def test_saved_parameters_survive_a_power_cycle(stored, new_bench, storage, subindex):
     changed(stored)
     assert stored.write(0x1010, subindex, SAVE) == 0
     stored.write(0x1017, 0, 333, 2)
@@ -47,7 +47,7 @@ def test_what_was_saved_survives_the_power_cycle(stored, new_bench, storage, sub
 
 
 @pytest.mark.parametrize("command", [129, 130])
-def test_what_was_saved_is_back_after_a_reset(stored, command):
+def test_saved_parameters_return_after_a_reset(stored, command):
     changed(stored)
     stored.write(0x1010, 1, SAVE)
     stored.write(0x1017, 0, 333, 2)
@@ -55,14 +55,14 @@ def test_what_was_saved_is_back_after_a_reset(stored, command):
     assert values(stored) == (250, 5)
 
 
-def test_what_was_not_saved_does_not_survive(stored, new_bench, storage):
+def test_unsaved_parameters_are_lost_at_power_off(stored, new_bench, storage):
     changed(stored)
-    stored.write(0x1010, 3, SAVE)  # the application's only
+    stored.write(0x1010, 3, SAVE)  # application parameters only
     assert values(new_bench(storage=storage).power_on()) == (1000, 254)
 
 
 @pytest.mark.parametrize("subindex", [1, 2])
-def test_restore_counts_from_the_next_reset_on(stored, new_bench, storage, subindex):
+def test_a_restore_takes_effect_at_the_next_reset(stored, new_bench, storage, subindex):
     changed(stored)
     stored.write(0x1010, 1, SAVE)
     assert stored.write(0x1011, subindex, LOAD) == 0
@@ -72,7 +72,7 @@ def test_restore_counts_from_the_next_reset_on(stored, new_bench, storage, subin
     assert values(new_bench(storage=storage).power_on()) == (1000, 254)
 
 
-def test_restore_of_the_application_leaves_communication(stored):
+def test_restoring_application_parameters_keeps_communication_parameters(stored):
     changed(stored)
     stored.write(0x1010, 1, SAVE)
     stored.write(0x1011, 3, LOAD)
@@ -80,7 +80,7 @@ def test_restore_of_the_application_leaves_communication(stored):
     assert values(stored) == (250, 5)
 
 
-def test_default_that_follows_the_node_id_goes_on_doing_so(stored, new_bench, storage):
+def test_a_saved_default_cob_id_still_follows_the_node_id(stored, new_bench, storage):
     stored.write(0x1010, 1, SAVE)
     other = new_bench(0x30, storage=storage).power_on()
     assert other.number(0x1014) == 0xB0
@@ -89,21 +89,21 @@ def test_default_that_follows_the_node_id_goes_on_doing_so(stored, new_bench, st
 
 @pytest.mark.parametrize("index", [0x1010, 0x1011])
 @pytest.mark.parametrize("signature", [b"SAVE", b"LOAD", b"evas", b"daol", b"\0\0\0\0", b"\1\0\0\0"])
-def test_wrong_signature(stored, index, signature):
+def test_a_wrong_signature_is_refused(stored, index, signature):
     assert stored.write(index, 1, signature) == AbortCode.NOT_STORED
 
 
-def test_signatures_are_not_exchangeable(stored):
+def test_the_signature_of_the_other_object_is_refused(stored):
     assert stored.write(0x1010, 1, LOAD) == AbortCode.NOT_STORED
     assert stored.write(0x1011, 1, SAVE) == AbortCode.NOT_STORED
 
 
 @pytest.mark.parametrize("index", [0x1010, 0x1011])
-def test_what_it_can_do(stored, index):
+def test_each_group_is_stored_on_command_only(stored, index):
     assert [stored.number(index, subindex) for subindex in range(4)] == [3, 1, 1, 1]
 
 
-def test_application_is_asked_for_its_own_parameters(stored):
+def test_application_parameters_are_stored_by_the_application(stored):
     stored.slave.store.on_save = save = Mock(return_value=None)
     stored.slave.store.on_restore = restore = Mock(return_value=None)
     stored.write(0x1010, 2, SAVE)
@@ -117,7 +117,7 @@ def test_application_is_asked_for_its_own_parameters(stored):
     assert stored.write(0x1010, 3, SAVE) == AbortCode.DEVICE_STATE
 
 
-def test_storage_that_fails(new_bench):
+def test_a_failing_storage_gives_defaults_an_event_and_hardware_aborts(new_bench):
     storage = MemoryStorage()
     storage.save = Mock(side_effect=StorageError("disk full"))
     storage.clear = Mock(side_effect=StorageError("disk full"))
@@ -129,7 +129,7 @@ def test_storage_that_fails(new_bench):
     assert bench.write(0x1011, 1, LOAD) == AbortCode.HARDWARE
 
 
-def test_stored_mapping_that_no_longer_fits_gives_way_to_the_defaults(new_bench):
+def test_defaults_replace_a_stored_mapping_that_no_longer_fits(new_bench):
     storage = MemoryStorage()
     storage.save("communication", {"1017:00": b"\x05\x00", "1A00:01": (0x5FFF_0008).to_bytes(4, "little")})
     bench = new_bench(storage=storage).power_on()
@@ -138,7 +138,7 @@ def test_stored_mapping_that_no_longer_fits_gives_way_to_the_defaults(new_bench)
 
 
 @pytest.mark.parametrize("name", ["1017:00", "1000:00", "5FFF:01", "1001:00"])
-def test_stored_values_of_wrong_size_or_unknown_objects_are_left_out(new_bench, name):
+def test_stored_values_of_wrong_size_or_of_unknown_objects_are_ignored(new_bench, name):
     storage = MemoryStorage()
     storage.save("communication", {name: b"\x01\x02\x03"})
     assert values(new_bench(storage=storage).power_on()) == (1000, 254)
@@ -147,7 +147,7 @@ def test_stored_values_of_wrong_size_or_unknown_objects_are_left_out(new_bench, 
 # The file
 
 
-def test_file_keeps_groups_apart(tmp_path):
+def test_the_file_keeps_groups_separate(tmp_path):
     storage = FileStorage(tmp_path / "node.json")
     assert storage.load("a") == {}
     storage.save("a", {"x": b"\x01"})
@@ -173,7 +173,7 @@ def test_file_keeps_groups_apart(tmp_path):
         '{"crc32": 0}',
     ],
 )
-def test_damaged_file_is_an_error_that_a_save_ends(tmp_path, text):
+def test_a_damaged_file_is_an_error_until_the_next_save(tmp_path, text):
     path = tmp_path / "node.json"
     path.write_text(text, encoding="latin-1")
     storage = FileStorage(path)
@@ -183,7 +183,7 @@ def test_damaged_file_is_an_error_that_a_save_ends(tmp_path, text):
     assert storage.load("a") == {"x": b"\x01"}
 
 
-def test_damaged_file_ends_with_a_restore_too(tmp_path):
+def test_a_restore_replaces_a_damaged_file(tmp_path):
     path = tmp_path / "node.json"
     path.write_text("{", encoding="ascii")
     storage = FileStorage(path)
@@ -191,7 +191,7 @@ def test_damaged_file_ends_with_a_restore_too(tmp_path):
     assert storage.load("a") == {}
 
 
-def test_one_flipped_bit_is_found(tmp_path):
+def test_a_changed_value_fails_the_checksum(tmp_path):
     path = tmp_path / "node.json"
     storage = FileStorage(path)
     storage.save("a", {"x": b"\x10"})
@@ -200,14 +200,14 @@ def test_one_flipped_bit_is_found(tmp_path):
         storage.load("a")
 
 
-def test_folder_that_cannot_be_written(tmp_path):
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path):
     blocker = tmp_path / "file"
     blocker.write_text("", encoding="ascii")
     with pytest.raises(StorageError, match="cannot be written"):
         FileStorage(blocker / "node.json").save("a", {})
 
 
-def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+def test_a_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
     storage = FileStorage(tmp_path / "node.json")
     storage.save("a", {"x": b"\x01"})
     monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(28, "No space left on device")))
@@ -231,7 +231,7 @@ while True:
 
 
 @pytest.mark.process
-def test_killed_in_the_midst_of_saving_the_file_is_whole(tmp_path):
+def test_the_file_is_whole_after_a_kill_during_a_save(tmp_path):
     path = tmp_path / "node.json"
     for delay in (0.0, 0.003, 0.01, 0.02, 0.05):
         writer = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE)
@@ -250,12 +250,13 @@ def test_killed_in_the_midst_of_saving_the_file_is_whole(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["node.json"]
 
 
-def test_what_a_killed_save_left_is_used_up_by_the_next_one(tmp_path, monkeypatch):
+def test_interrupted_saves_leave_one_temporary_file_which_the_next_save_replaces(tmp_path, monkeypatch):
     storage = FileStorage(tmp_path / "node.json")
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", Mock(side_effect=KeyboardInterrupt))  # no OSError: nothing is cleared away
-        for process in (1001, 1002):
-            patch.setattr(os, "getpid", Mock(return_value=process))
+        patch.setattr(
+            os, "fsync", Mock(side_effect=KeyboardInterrupt)
+        )  # not an OSError: the temporary file stays
+        for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 storage.save("a", {"x": b"\x01"})
     assert [item.name for item in tmp_path.iterdir()] == ["node.json.new"]

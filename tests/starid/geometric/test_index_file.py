@@ -16,7 +16,7 @@ from starid.geometric.identifier import Identifier
 from tests.starid.geometric.sky_points import sky
 
 CAMERA = Camera.from_fov(60.0, 512, 512)
-MOST_BYTES = 10_000_000
+MAX_BYTES = 10_000_000
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_index_is_written_once_and_is_small(stored: Path) -> None:
     before = stored.stat().st_mtime_ns
     Identifier(CAMERA, limiting_magnitude=4.0, cache=stored.parent)
     assert stored.stat().st_mtime_ns == before
-    assert stored.stat().st_size < MOST_BYTES
+    assert stored.stat().st_size < MAX_BYTES
 
 
 def test_arrays_come_back_as_they_were_and_cannot_be_written(stored: Path) -> None:
