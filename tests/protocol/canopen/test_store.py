@@ -253,7 +253,9 @@ def test_the_file_is_whole_after_a_kill_during_a_save(tmp_path):
 def test_interrupted_saves_leave_one_temporary_file_which_the_next_save_replaces(tmp_path, monkeypatch):
     storage = FileStorage(tmp_path / "node.json")
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", Mock(side_effect=KeyboardInterrupt))  # not an OSError: the temporary file stays
+        patch.setattr(
+            os, "fsync", Mock(side_effect=KeyboardInterrupt)
+        )  # not an OSError: the temporary file stays
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 storage.save("a", {"x": b"\x01"})
