@@ -261,7 +261,7 @@ class Emulation:
             head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
 
     def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
-        """Return the truth of this head: at the mount of a configuration, or else that of its profile."""
+        """Return the truth of this head, at the mount of a configuration, else of its profile."""
         mount = config.mount or self.profile.truth.mount
         return mounted(truth, None if mount is None else mount.build())
 

@@ -1,4 +1,4 @@
-"""Reports the results of a run to the console of a running emulator, while the run goes on."""
+"""Reports the results of a run to the console of a running emulator, as they arrive."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class RunFeed:
                 self._post(event)
             except (OSError, http.client.HTTPException, BenchError) as error:
                 log.warning(
-                    "%s: the console takes no more reports (%s); the run goes on", self._address, error
+                    "%s: the console accepts no more reports (%s); the run continues", self._address, error
                 )
                 while self._waiting.get() is not None:
                     pass
@@ -131,7 +131,7 @@ class RunFeed:
 
 
 def console_address(view: str, emulator: EmulatorProcess | None) -> str:
-    """Return the address of the console; for `auto` print and return that of the started emulator.
+    """Return the address of the console; for `auto`, print and return the started emulator's.
 
     Raises
     ------

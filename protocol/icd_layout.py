@@ -69,7 +69,7 @@ class Layout:
         self.size = 0
 
     def include(self, row: Row) -> None:
-        """Append the fields of another row; telemetry reports those of a telecommand as they were last accepted."""
+        """Append the fields of another row; telemetry reports a telecommand's fields as last accepted."""
         moved = {slot.index: self._slot(slot.type, slot.size, slot.order) for slot in row.slots}
         for item in row.fields:
             field = replace(item, slot=moved[item.slot.index])

@@ -48,7 +48,7 @@ class RowShape:
     request_size: int = 0
     """Data bytes of the request: parameters of a telecommand."""
     reply_size: int = 0
-    """Data bytes of the reply: those of the telemetry."""
+    """Number of data bytes in the reply."""
     answers: tuple[str, ...] = ("reply",)
     """`echo` and `reply`, in the order in which the device sends them."""
 

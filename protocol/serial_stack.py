@@ -23,7 +23,7 @@ from starhil.protocol.values import IcdError
 
 
 class CubeSpaceStack(SerialStack):
-    """The serial link of the CubeSpace family; its style is the reply dialect, b unless given.
+    """The serial link of the CubeSpace family; its style is the reply dialect, by default b.
 
     Attributes
     ----------

@@ -2,7 +2,7 @@
 
     python tools/measure_links.py [--frames N] [--trips N] [--json]
 
-Hub and both ends are separate processes, as in normal use. The peer only echoes, so that the figures are those of
+Hub and both ends are separate processes, as in normal use. The peer only echoes, so that the figures measure
 the links alone.
 """
 

@@ -139,7 +139,7 @@ def measure_centroids(
     seed : int
         Seed of attitudes, directions and noise.
     sensor, camera : optional
-        The defaults of the product unless given.
+        Default: the product's.
     progress : callable, optional
         Receives a line about each step.
 

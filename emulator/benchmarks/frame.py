@@ -62,7 +62,7 @@ def measure_frames(
     rate_deg_s : float
         Body rate during the exposures, about an axis across the boresight.
     sensor, camera : optional
-        Defaults: those of starhil.
+        Default: starhil's.
     progress : callable, optional
         Receives one line per step.
     """

@@ -79,7 +79,7 @@ FIELDS: Final[dict[str, tuple[float, int | None]]] = {
     PAPERS[7]: (8.0, 512),
     PAPERS[8]: (12.0, 2048),
 }
-"""Width in degrees, and side in pixels where that differs too, of fields that are not that of the camera given."""
+"""Row → width in degrees, and side in pixels if it differs, for fields other than the given camera's."""
 
 TRACKED: Final = {
     "tracking, 3 stars": 3.0,
@@ -106,7 +106,7 @@ WRONG_ROLL_ARCSEC: Final = 3600.0
 attitude of the true matches is within these of it: two or three stars close together determine no attitude better."""
 
 PEER_LIMIT_V: Final = 5.5
-"""Least faint limit of the databases of peers and published algorithms: otherwise that of the scenes."""
+"""Lowest magnitude limit of the databases of third-party solvers and published algorithms; otherwise the scenes'."""
 
 _BLEND_PX: Final = 2.0
 _DEEPER_V: Final = 0.5
@@ -261,7 +261,7 @@ def _by_field(rows: Sequence[str], camera: Camera) -> dict[tuple[Camera, float],
 
 
 class _Field:
-    """A camera with the sky that its scenes are made of, and the solvers for it.
+    """A camera, the sky of its scenes, and the solvers for it.
 
     Parameters
     ----------

@@ -242,7 +242,7 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
 
 
 def _folder_of_head(folder: Path, number: int) -> Path:
-    """Return the state folder of a head: of the second head, `head-2` in that of the first."""
+    """Return the state folder of a head; the second head's is `head-2` in the first head's."""
     return folder if number == 1 else folder / f"head-{number}"
 
 

@@ -63,7 +63,7 @@ class ScenarioEvent(Strict):
         return self
 
     def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path, at_s: float) -> Action:
-        """Return the action of the event at a simulation time; what it needs is read and checked now."""
+        """Return the action of the event at a simulation time; its files and values are read and checked now."""
         if self.fault is not None:
             faults.check(self.fault)
         config = self.truth

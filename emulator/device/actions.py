@@ -23,7 +23,7 @@ from starhil.protocol.messages import ErrorCode, Reply
 from starhil.protocol.values import MessageError, Value
 
 Arguments: TypeAlias = Mapping[str, Any]
-"""Values by argument; `parameters` has those of fields that name a parameter."""
+"""Values by argument; `parameters` holds the values of fields that name a parameter."""
 Action: TypeAlias = Callable[[Device, Arguments, Acknowledge], list[Reply] | None]
 
 PARAMETERS: Final = "parameters"
@@ -167,7 +167,7 @@ def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowle
 
 
 def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
-    """Send a list of telemetry rows unasked, in place of the last list."""
+    """Send a list of telemetry rows unsolicited, instead of the previous list."""
     rate_hz = float(arguments["rate"])
     wanted = []
     for name, row_id in arguments.items():

@@ -376,7 +376,7 @@ def orbit_of(profile: Profile) -> Orbit | None:
     Raises
     ------
     EmulatorError
-        Its values are not those of an orbit.
+        The values do not describe an orbit.
     """
     if profile.orbit is None:
         return None

@@ -58,7 +58,7 @@ class WideEarth:
 
 @compiled_ieee
 def _glow(height: npt.NDArray[np.float32], line: npt.NDArray[np.float32]) -> None:
-    """Brightness of the atmosphere over that of the disc, from its height at every `GLARE_STEP`-th column."""
+    """Brightness of the atmosphere relative to the disc's, from its height at every `GLARE_STEP`-th column."""
     line[:] = 1.0
     for i in range(height.size - 1):
         first, last = height[i], height[i + 1]

@@ -91,7 +91,7 @@ class AttitudeConfig(Strict):
     roll_deg: Turn | None = None
     """Angle by which celestial north is turned counter-clockwise in the image; 0 if left out."""
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
-    """Quaternion ICRS to sensor, scalar last, of length 1; in place of the angles."""
+    """Unit quaternion, ICRS to sensor, scalar last; instead of the angles."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -131,7 +131,7 @@ class MountConfig(Strict):
     matrix: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
     """The sensor's x, y and z axis in the body frame, as three rows."""
     euler_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
-    """Angles by which the body axes are turned, one after the other, to become those of the sensor, as 42 has them."""
+    """Angles of the successive rotations from the body axes to the sensor's, in 42's convention."""
     sequence: Annotated[str, Field(pattern="^[123]{3}$")] = "321"
     """Axes of `euler_deg`: 1 is x, 2 is y, 3 is z."""
 
@@ -173,7 +173,7 @@ class FixedConfig(Strict):
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """The attitude."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
@@ -190,7 +190,7 @@ class RateConfig(Strict):
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the rotation begins now."""
@@ -264,7 +264,7 @@ class SlewConfig(Strict):
     repeat: bool = False
     """Begin again after the last segment."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -284,7 +284,7 @@ class FileConfig(Strict):
     repeat: bool = False
     """Begin again after the last row."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
@@ -316,7 +316,7 @@ class LiveConfig(Strict):
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude before the first message."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the messages are then those of the body."""
+    """Mount of the sensor on the body; the messages then describe the body."""
 
     @model_validator(mode="after")
     def _answers_have_a_way_back(self) -> Self:

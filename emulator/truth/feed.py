@@ -66,7 +66,7 @@ class LiveFeed:
         self._writers: set[asyncio.StreamWriter] = set()
 
     async def start(self, socket: Socket, host: str, port: int) -> str:
-        """Listen, or begin to connect; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
+        """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
 
         Raises
         ------

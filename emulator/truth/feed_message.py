@@ -18,7 +18,7 @@
     Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, both
     or none.
 ``unix_s``
-    Date, as Unix time. Optional; default: that of the run.
+    Date, as Unix time. Optional; default: the run's.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def unit_cases(icd: InterfaceDefinition) -> list[Case[Any]]:
 def unit_row_cases(
     icd: InterfaceDefinition, stack: object = None, *, lengths: bool = True, clause: str
 ) -> list[Case[UnitProbe]]:
-    """Make the cases of the rows of a unit, whatever its link; `stack` is that of a serial line."""
+    """Make the cases of a unit's rows, for any link; `stack` is the serial line's, if it has one."""
     return [
         *_identifiers(icd, stack, clause),
         *_rows(icd),

@@ -182,7 +182,7 @@ class TransmitPdo:
             self._send()
 
     def tick(self) -> None:
-        """Send what is due by event or timer."""
+        """Send the PDOs that are due by event or timer."""
         deadline = self.next_deadline
         if deadline is None or self._context.now < deadline:
             return

@@ -114,7 +114,7 @@ def test_a_run_goes_on_without_an_orbit_that_ends(make_bench, caplog):
     bench.step(3.5)
     assert [frame.position_m for frame in bench.pipeline.frames] == [None] * len(bench.pipeline.frames)
     assert len(bench.pipeline.frames) >= 2
-    assert caplog.text.count("has decayed; the run goes on without an orbit") == 1
+    assert caplog.text.count("has decayed; the run continues without an orbit") == 1
 
 
 def test_an_orbit_of_a_profile_that_is_none_names_the_profile(make_bench):
