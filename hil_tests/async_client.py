@@ -99,6 +99,7 @@ class AsyncObcClient:
 
     async def command(
         self,
+        /,
         name: str,
         values: Mapping[str, Value] | None = None,
         *,

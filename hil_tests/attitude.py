@@ -137,7 +137,7 @@ def interpolate(first: Quaternion, second: Quaternion, fraction: float) -> Quate
     return unit([a * p + b * q for p, q in zip(first, target, strict=True)])
 
 
-def wrapped_difference(value: float, expected: float, turn: float = 360.0) -> float:
-    """Return the absolute difference of two angles, at most half a turn."""
-    difference = math.fmod(abs(value - expected), turn)
-    return min(difference, turn - difference)
+def wrapped_difference(value: float, expected: float) -> float:
+    """Return the absolute difference of two angles in degrees, at most half a turn."""
+    difference = math.fmod(abs(value - expected), 360.0)
+    return min(difference, 360.0 - difference)

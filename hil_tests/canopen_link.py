@@ -41,10 +41,7 @@ class CanopenHostLink(HostLink[CanFrame]):
         self._dictionary = build_dictionary(icd)
         self._node = int(icd.device_parameters["canopen_node"].default) if node is None else node
         self._under_way: tuple[Request, SdoTransfer] | None = None
-
-    @property
-    def _receiver(self) -> CanopenHostLink:
-        return self
+        self._receiver = self
 
     def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- an upload has its own length
         """Begin the transfers of a request.
@@ -63,6 +60,11 @@ class CanopenHostLink(HostLink[CanFrame]):
             raise BenchError(str(error)) from None
         self._under_way = request, transfer
         self._send(next(transfer))
+
+    @property
+    def busy(self) -> bool:
+        """Whether a transfer is under way."""
+        return self._under_way is not None
 
     def feed(self, frame: CanFrame, _now: float) -> list[Reply | LinkFault]:
         """Continue the transfers with a response of the node; return the reply at their end."""

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
+import functools
 from collections import deque
-from collections.abc import Callable, Coroutine, Mapping
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.images import Image
 from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
@@ -20,14 +18,26 @@ from starhil.hil_tests.links import (
     SerialHostLink,
 )
 from starhil.hil_tests.loop_thread import LoopThread
-from starhil.hil_tests.transactions import Ack, Reading, Transaction
+from starhil.hil_tests.transactions import Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import LinkFault, Reply, RequestKind
 from starhil.protocol.unit_folders import DEFAULT_UNIT
-from starhil.protocol.values import Value
 
+Parameters = ParamSpec("Parameters")
 T = TypeVar("T")
+
+
+def _synchronous(
+    method: Callable[Concatenate[AsyncObcClient, Parameters], Coroutine[Any, Any, T]],
+) -> Callable[Concatenate[ObcClient, Parameters], T]:
+    """Return the method of `ObcClient` that runs one of `AsyncObcClient` in the client's loop."""
+
+    @functools.wraps(method)
+    def run(client: ObcClient, /, *args: Parameters.args, **fields: Parameters.kwargs) -> T:
+        return client.run(method(client.core, *args, **fields))
+
+    return run
 
 
 class ObcClient:
@@ -59,10 +69,7 @@ class ObcClient:
 
     @staticmethod
     async def _open(
-        make_link: Callable[[], HostLink[Any]],
-        icd: InterfaceDefinition,
-        timeout_s: float,
-        retries: int,
+        make_link: Callable[[], HostLink[Any]], icd: InterfaceDefinition, timeout_s: float, retries: int
     ) -> AsyncObcClient:
         core = AsyncObcClient(make_link(), icd, timeout_s=timeout_s, retries=retries)
         await core.start()
@@ -117,9 +124,7 @@ class ObcClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     @property
@@ -142,33 +147,16 @@ class ObcClient:
         """The newest replies that answered no request."""
         return self.core.stray_replies
 
-    def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
-        """Read a telemetry row."""
-        return self.run(self.core.read(name, timeout_s=timeout_s, retries=retries))
-
-    def telemetry(
-        self, name: str, *, timeout_s: float | None = None, retries: int | None = None
-    ) -> dict[str, Value]:
-        """Ask for a telemetry row and return its physical values by field."""
-        return self.run(self.core.telemetry(name, timeout_s=timeout_s, retries=retries))
-
-    def command(
-        self,
-        name: str,
-        values: Mapping[str, Value] | None = None,
-        *,
-        timeout_s: float | None = None,
-        retries: int | None = None,
-        checked: bool = True,
-        **fields: Value,
-    ) -> Ack:
-        """Send a telecommand and wait for its acknowledge.
-
-        `checked=False` sends values outside their limits too.
-        """
-        return self.run(
-            self.core.command(name, values, timeout_s=timeout_s, retries=retries, checked=checked, **fields)
-        )
+    read = _synchronous(AsyncObcClient.read)
+    telemetry = _synchronous(AsyncObcClient.telemetry)
+    command = _synchronous(AsyncObcClient.command)
+    command_raw = _synchronous(AsyncObcClient.command_raw)
+    set_parameter = _synchronous(AsyncObcClient.set_parameter)
+    get_parameter = _synchronous(AsyncObcClient.get_parameter)
+    read_parameter = _synchronous(AsyncObcClient.read_parameter)
+    wait_for = _synchronous(AsyncObcClient.wait_for)
+    wait_unsolicited = _synchronous(AsyncObcClient.wait_unsolicited)
+    download_image = _synchronous(AsyncObcClient.download_image)
 
     def request(
         self, identifier: int, data: bytes = b"", *, klass: str | None = None, timeout_s: float | None = None
@@ -178,32 +166,3 @@ class ObcClient:
         row = self.icd.rows_by_key.get((request.klass, identifier))
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
         return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
-
-    def set_parameter(self, name: str, value: Value, *, checked: bool = True) -> Ack:
-        """Set a parameter by name, in its own unit.
-
-        `checked=False` sends a value outside its limits too.
-        """
-        return self.run(self.core.set_parameter(name, value, checked=checked))
-
-    def get_parameter(self, name: str) -> Value:
-        """Return the value of a parameter in its own type."""
-        return self.run(self.core.get_parameter(name))
-
-    def wait_for(
-        self, name: str, condition: Callable[[Reading], bool], *, within_s: float, every_s: float = 0.1
-    ) -> Reading:
-        """Read a row until the condition holds."""
-        return self.run(self.core.wait_for(name, condition, within_s=within_s, every_s=every_s))
-
-    def wait_unsolicited(
-        self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
-    ) -> Reading:
-        """Return the next unsolicited telemetry of a row; see `AsyncObcClient`."""
-        return self.run(self.core.wait_unsolicited(name, timeout_s=timeout_s, since_s=since_s))
-
-    def download_image(
-        self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
-    ) -> Image:
-        """Capture and store an image, and download it."""
-        return self.run(self.core.download_image(size, method=method, within_s=within_s))

@@ -11,9 +11,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Final, Self
 from urllib.parse import unquote
 
@@ -41,28 +41,24 @@ def emulator_command(
     extra: Sequence[str] = (),
 ) -> list[str]:
     """Return the command line of an emulator that ends with this process."""
-    command = [*_starhil_command(), "run"]
-    if profile is not None:
-        command.append(profile)
-    if unit is not None:
-        command += ["--unit", unit]
-    command += ["--serial", serial, "--can", can]
-    if dialect is not None:
-        command += ["--dialect", dialect]
-    if seed is not None:
-        command += ["--seed", str(seed)]
-    for setting in settings:
-        command += ["--set", setting]
-    if state_dir is not None:
-        command += ["--state-dir", str(state_dir)]
-    if truth_log is not None:
-        command += ["--truth-log", str(truth_log), "--overwrite"]
-    return [*command, *extra]
+    options = {
+        "--unit": unit,
+        "--serial": serial,
+        "--can": can,
+        "--dialect": dialect,
+        "--seed": seed,
+        "--state-dir": state_dir,
+        "--truth-log": truth_log,
+    }
+    given = [(name, str(value)) for name, value in options.items() if value is not None]
+    given += [("--set", setting) for setting in settings]
+    command = [*_starhil_command(), "run", *([] if profile is None else [profile]), *chain(*given)]
+    return [*command, *([] if truth_log is None else ["--overwrite"]), *extra]
 
 
-def hub_command(*, port: int = 0, log: Path | None = None) -> list[str]:
-    """Return the command line of a CAN hub that ends with this process; port 0 is a free one."""
-    command = [*_starhil_command(), "hub", "--port", str(port)]
+def hub_command(*, log: Path | None = None) -> list[str]:
+    """Return the command line of a CAN hub at a free port that ends with this process."""
+    command = [*_starhil_command(), "hub", "--port", "0"]
     return command if log is None else [*command, "--log", str(log)]
 
 
@@ -113,8 +109,6 @@ class EmulatorProcess:
         Command line, from `emulator_command`.
     ready_within_s : float
         Time-out of the ready line, s.
-    environment : mapping, optional
-        Additions to the environment.
 
     Attributes
     ----------
@@ -122,18 +116,11 @@ class EmulatorProcess:
         The ready line by key: serial, can, control, seed …
     """
 
-    def __init__(
-        self,
-        command: Sequence[str],
-        *,
-        ready_within_s: float = READY_WITHIN_S,
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, command: Sequence[str], *, ready_within_s: float = READY_WITHIN_S) -> None:
         self.command = list(command)
         self.ready: dict[str, str] = {}
         self.errors: list[str] = []
         self._ready_within_s = ready_within_s
-        self._environment = {**os.environ, **(environment or {})}
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._readers: list[threading.Thread] = []
@@ -172,7 +159,6 @@ class EmulatorProcess:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,
-                env=self._environment,
                 start_new_session=True,
             )
         except OSError as error:
@@ -285,18 +271,12 @@ class EmulatorProcess:
     def memory_bytes(self) -> int:
         """Return the resident memory of the process and its workers, bytes."""
         group = self.process.pid
-        total = 0
-        for folder in Path("/proc").iterdir():
-            if folder.name.isdigit():
-                total += _resident(folder, group)
-        return total
+        return sum(_resident(folder, group) for folder in Path("/proc").iterdir() if folder.name.isdigit())
 
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
         if kind is None:
             self.stop()
         else:

@@ -85,19 +85,10 @@ async def unsolicited_jitter(
     await transport.start(take)
     command = icd.telecommands["set_unsolicited"]
     try:
-        await _command(
-            transport,
-            answers,
-            Request.of(command.id, command.encode({"telemetry": row.id, "rate": rate_hz})),
-            device,
-        )
-        await asyncio.sleep(seconds)
-        await _command(
-            transport,
-            answers,
-            Request.of(command.id, command.encode({"telemetry": row.id, "rate": 0.0})),
-            device,
-        )
+        for rate, pause_s in ((rate_hz, seconds), (0.0, 0.0)):
+            data = command.encode({"telemetry": row.id, "rate": rate})
+            await _command(transport, answers, Request.of(command.id, data), device)
+            await asyncio.sleep(pause_s)
     finally:
         await transport.close()
     return arrivals.jitter(f"unsolicited telemetry at {rate_hz:g} Hz")

@@ -22,10 +22,11 @@ from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.can_framing import CanFrame, CanId, encode_request_frames
+from starhil.protocol.can_framing import CanId, encode_request_frames
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import Reply
 from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.socketcand import format_send
 
 ROWS: Final = ("identification", "quaternion", "precise_attitude", "star_tracker", "unix_time")
 """Telemetry rows of the CubeStar, requested in turn; of another unit all rows."""
@@ -133,7 +134,7 @@ class HubRequester:
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
         for frame in encode_request_frames(self._icd.request(row), HOST, DEVICE):
-            self._socket.sendall(_socketcand(frame))
+            self._socket.sendall(format_send(frame))
         try:
             while frames:
                 frames -= self._is_reply(self._receive_until(b" >"), row.id)
@@ -351,8 +352,3 @@ def _row(link: str, worker: str, rate: float, viewers: int, values: list[float],
         return LatencyRow(link, worker, rate, viewers, 0, float("nan"), float("nan"), float("nan"), lost)
     p50, p99 = (values[min(len(values) - 1, int(share * len(values)))] for share in (0.5, 0.99))
     return LatencyRow(link, worker, rate, viewers, len(values), p50, p99, values[-1], lost)
-
-
-def _socketcand(frame: CanFrame) -> bytes:
-    data = "".join(f" {byte:02X}" for byte in frame.data)
-    return f"< send {frame.id:08X} {len(frame.data)}{data} >".encode()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Final, Generic, Protocol, TypeVar
+from collections.abc import Callable
+from typing import Final, Generic, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.wire_log import WireLog
@@ -13,6 +13,7 @@ from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reque
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
+from starhil.protocol.receiver import Receiver
 from starhil.protocol.serial_interface import HostEnd
 from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect
 from starhil.protocol.transports import Transport, open_can, open_serial
@@ -26,17 +27,6 @@ FLUSH_PERIOD_S: Final = 0.05
 """Period at which a receiver is polled for an incomplete message that has timed out."""
 
 Item = TypeVar("Item", bytes, CanFrame)
-Item_contra = TypeVar("Item_contra", bytes, CanFrame, contravariant=True)
-
-
-class Receiver(Protocol[Item_contra]):
-    """The host side of a framing: items in, replies and faults out."""
-
-    def feed(self, item: Item_contra, now: float, /) -> Sequence[Reply | LinkFault]:
-        """Decode an item received at a time in seconds."""
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Drop an incomplete message that has timed out."""
 
 
 class HostLink(ABC, Generic[Item]):
@@ -63,6 +53,8 @@ class HostLink(ABC, Generic[Item]):
 
     name: str
     """`serial` or `can`."""
+    _receiver: Receiver[Item, Reply]
+    """Decoder of the replies."""
 
     def __init__(self, transport: Transport[Item], description: str, log: WireLog | None) -> None:
         self.on_reply: Callable[[Reply], None] = lambda _reply: None
@@ -73,11 +65,6 @@ class HostLink(ABC, Generic[Item]):
         self._transport: Transport[Item] = transport
         self._lost: ProtocolError | None = None
         self._flusher: asyncio.Task[None] | None = None
-
-    @property
-    @abstractmethod
-    def _receiver(self) -> Receiver[Item]:
-        """Decoder of the replies."""
 
     @abstractmethod
     def request(self, request: Request, reply_size: int) -> None:
@@ -159,6 +146,7 @@ class SerialHostLink(HostLink[bytes]):
     """
 
     name = "serial"
+    _receiver: HostEnd
 
     def __init__(
         self,
@@ -172,20 +160,16 @@ class SerialHostLink(HostLink[bytes]):
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
         self._stack = build_serial_stack(icd)
         self._dialect = chosen_dialect(icd, dialect)
-        self._host_receiver = self._stack.host(self._dialect)
-
-    @property
-    def _receiver(self) -> HostEnd:
-        return self._host_receiver
+        self._receiver = self._stack.host(self._dialect)
 
     def request(self, request: Request, reply_size: int) -> None:
         """Frame and send a request."""
-        self._host_receiver.expect(request, reply_size)
+        self._receiver.expect(request, reply_size)
         self.send(self._stack.encode_request(request))
 
     def reset_receiver(self) -> None:
         """Discard the beginning of a reply."""
-        self._host_receiver = self._stack.host(self._dialect)
+        self._receiver = self._stack.host(self._dialect)
 
 
 class CanHostLink(HostLink[CanFrame]):
@@ -214,11 +198,7 @@ class CanHostLink(HostLink[CanFrame]):
         super().__init__(open_can(spec), f"CAN {spec}", log)
         self.host_address = host_address
         self.device_address = device_address
-        self._host_receiver = CanHostReceiver(host_address, device_address)
-
-    @property
-    def _receiver(self) -> CanHostReceiver:
-        return self._host_receiver
+        self._receiver = CanHostReceiver(host_address, device_address)
 
     def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- CAN replies name their type
         """Send a request as frames."""
@@ -227,4 +207,4 @@ class CanHostLink(HostLink[CanFrame]):
 
     def reset_receiver(self) -> None:
         """Discard the segments of an incomplete reply."""
-        self._host_receiver = CanHostReceiver(self.host_address, self.device_address)
+        self._receiver = CanHostReceiver(self.host_address, self.device_address)

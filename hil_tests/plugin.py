@@ -62,10 +62,10 @@ def starhil_emulator(
     other than 0 is an error.
     """
     from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-    from starhil.hil_tests.private_can_bus import PrivateCanBus
+    from starhil.hil_tests.private_can_bus import private_can_bus
 
     folder: Path = tmp_path_factory.mktemp("starhil")
-    with PrivateCanBus() as channel:
+    with private_can_bus() as channel:
         command = emulator_command(
             profile=request.config.getoption("--starhil-profile"),
             unit=request.config.getoption("--starhil-unit"),

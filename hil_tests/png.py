@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.results import write_whole
+from starid.files import write_atomically
 
 
-def encode_png(pixels: bytes, width: int, height: int) -> bytes:
-    """Encode a grey image as a PNG file.
+def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
+    """Write a grey image; the file is complete or not there.
 
     Parameters
     ----------
@@ -29,9 +29,4 @@ def encode_png(pixels: bytes, width: int, height: int) -> bytes:
     if width < 1 or height < 1 or len(pixels) != width * height:
         raise BenchError(f"an image of {width}x{height} needs {width * height} bytes, not {len(pixels)}")
     _, data = cv2.imencode(".png", np.frombuffer(pixels, np.uint8).reshape(height, width))
-    return data.tobytes()
-
-
-def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
-    """Write a grey image to `path`; the file is complete or not there."""
-    write_whole(path, encode_png(pixels, width, height))
+    write_atomically(path, lambda part: part.write_bytes(data.tobytes()))

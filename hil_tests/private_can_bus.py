@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from types import TracebackType
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Self
 
 from starhil.hil_tests.loop_thread import LoopThread
@@ -45,26 +46,15 @@ class HubThread:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
 
-class PrivateCanBus:
-    """A context manager for a CAN bus: vcan0 if the kernel has it, else a private hub."""
-
-    def __init__(self) -> None:
-        self._hub: HubThread | None = None
-
-    def __enter__(self) -> str:
-        if kernel_can_is_up(DEFAULT_BUS):
-            return DEFAULT_BUS
-        self._hub = HubThread().start()
-        return self._hub.channel
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._hub is not None:
-            self._hub.close()
+@contextmanager
+def private_can_bus() -> Iterator[str]:
+    """Give a run a CAN bus, and yield its channel: vcan0 if the kernel has it, else a private hub."""
+    if kernel_can_is_up(DEFAULT_BUS):
+        yield DEFAULT_BUS
+        return
+    with HubThread() as hub:
+        yield hub.channel

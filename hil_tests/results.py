@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +14,7 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.expect import show
 from starhil.hil_tests.interruption import Interrupted
 from starhil.protocol.values import Value
-
-_STDOUT: Final = 1
+from starid.files import is_stream, write_atomically
 
 PASSED: Final = "passed"
 FAILED: Final = "failed"
@@ -143,12 +140,12 @@ def prepare_report(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BenchError(f"{path}: its folder cannot be created: {error.strerror}") from None
-    if not _is_stream(path) and not os.access(path.parent, os.W_OK | os.X_OK):
+    if not is_stream(path) and not os.access(path.parent, os.W_OK | os.X_OK):
         raise BenchError(f"{path}: cannot be written: its folder takes no new files")
 
 
 def write_report(path: Path, data: bytes) -> None:
-    """Write a report as `write_whole` does; create its folder if needed.
+    """Write a report atomically, or into a device or the standard output; create its folder if needed.
 
     Raises
     ------
@@ -157,48 +154,9 @@ def write_report(path: Path, data: bytes) -> None:
     """
     prepare_report(path)
     try:
-        write_whole(path, data)
+        write_atomically(path, lambda part: part.write_bytes(data))
     except OSError as error:
         raise BenchError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file atomically; data go into a device, a pipe or the standard output, and a symbolic link stays one.
-
-    Raises
-    ------
-    OSError
-        It cannot be written.
-    """
-    if _is_stdout(path):
-        # the descriptor itself: a file opened again by its name would be written from its beginning
-        sys.stdout.flush()
-        with os.fdopen(os.dup(_STDOUT), "wb") as stream:
-            stream.write(data)
-        return
-    if _is_stream(path):
-        path.write_bytes(data)
-        return
-    target = path.resolve()
-    partial = target.with_name(target.name + ".part")
-    try:
-        partial.write_bytes(data)
-        partial.replace(target)
-    except OSError:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise
-
-
-def _is_stream(path: Path) -> bool:
-    return _is_stdout(path) or (path.exists() and not path.is_file() and not path.is_dir())
-
-
-def _is_stdout(path: Path) -> bool:
-    try:
-        return os.path.samestat(path.stat(), os.fstat(_STDOUT))
-    except OSError:
-        return False
 
 
 def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float) -> None:

@@ -182,9 +182,7 @@ class SessionRunner:
         deadline = None if step.within_s is None else time.monotonic() + step.within_s
         while True:
             outcome = self._try_once(step, link)
-            if outcome.problem is None:
-                return outcome
-            if deadline is None:
+            if outcome.problem is None or deadline is None:
                 return outcome
             if time.monotonic() >= deadline:
                 outcome.problem = f"not within {step.within_s:g} s: {outcome.problem}"
@@ -224,7 +222,7 @@ class SessionRunner:
             case SetParameter():
                 return self._set_parameter(step, action, client)
             case GetParameter():
-                return self._judge(step, client.run(client.core.read_parameter(action.parameter.name)))
+                return self._judge(step, client.read_parameter(action.parameter.name))
             case DownloadImage():
                 return self._download(action, client)
             case Send():
@@ -242,26 +240,25 @@ class SessionRunner:
             data = row.encode(values, check=action.refused is None)
         else:
             data = action.raw
-        return self._expect_acceptance_or_refusal(
-            lambda: (
-                client.run(
-                    client.core.command_raw(row.name, data, timeout_s=step.timeout_s, retries=step.retries)
-                ).latency_s
-            ),
-            action.refused,
-        )
+
+        def send() -> float:
+            return client.command_raw(
+                row.name, data, timeout_s=step.timeout_s, retries=step.retries
+            ).latency_s
+
+        return self._expect_acceptance_or_refusal(send, action.refused)
 
     def _set_parameter(self, step: Step, action: SetParameter, client: ObcClient) -> Outcome:
         parameter = action.parameter
         value = resolve(action.value, self._variables())
-        request = client.core.set_parameter(
-            parameter.name,
-            value,
-            timeout_s=step.timeout_s,
-            retries=step.retries,
-            checked=action.refused is None,
-        )
-        outcome = self._expect_acceptance_or_refusal(lambda: client.run(request).latency_s, action.refused)
+        accepted = action.refused is None
+
+        def send() -> float:
+            return client.set_parameter(
+                parameter.name, value, timeout_s=step.timeout_s, retries=step.retries, checked=accepted
+            ).latency_s
+
+        outcome = self._expect_acceptance_or_refusal(send, action.refused)
         if outcome.problem is None and action.refused is None:
             seen = client.get_parameter(parameter.name)
             wanted = parameter.check(value)

@@ -15,7 +15,7 @@ from starhil.hil_tests.bench import Bench, LinkOptions
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.results import (
     FAILED,
     PASSED,
@@ -139,7 +139,7 @@ def _open_bench(
     emulator = None
     if request.start:
         if options.can == "auto":
-            options = replace(options, can=stack.enter_context(PrivateCanBus()))
+            options = replace(options, can=stack.enter_context(private_can_bus()))
         state = stack.enter_context(temporary_folder("starhil-session-"))
         emulator = _emulator(request, script, options, folder, state)
     bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
@@ -186,9 +186,7 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
         wanted = {None: ("serial",), "both": ("serial", "can")}.get(script.link, (script.link,))
         options = replace(
-            options,
-            serial="auto" if "serial" in wanted else None,
-            can="auto" if "can" in wanted else None,
+            options, serial="auto" if "serial" in wanted else None, can="auto" if "can" in wanted else None
         )
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start: without it name the port")

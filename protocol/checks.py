@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, reduce
 from operator import xor
-from typing import Final, Literal, assert_never
+from typing import Final, assert_never
 
 import xxhash
 
@@ -15,16 +15,14 @@ from starhil.protocol.link_schema import (
     CrcCheck,
     CustomCheck,
     NoCheck,
+    Order,
     SumCheck,
     XorCheck,
     XxHashCheck,
 )
-from starhil.protocol.values import IcdError
+from starhil.protocol.values import SCALAR_SIZES, IcdError
 
-ByteOrder = Literal["little", "big"]
 CheckFunction = Callable[[bytes], bytes]
-
-WIDTHS: Final = {"u8": 1, "u16": 2, "u32": 4, "u64": 8}
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ NO_CHECK: Final = Check(0, frozenset(), lambda _covered: b"")
 
 
 def build_check(
-    model: CheckModel, byte_order: ByteOrder, custom: Mapping[str, CheckFunction] | None = None
+    model: CheckModel, byte_order: Order, custom: Mapping[str, CheckFunction] | None = None
 ) -> Check:
     """Return the check that a definition selects; `custom` holds the plugin's checks by name.
 
@@ -53,10 +51,10 @@ def build_check(
     """
     if isinstance(model, NoCheck):
         return NO_CHECK
-    order: ByteOrder = model.order or byte_order
+    order: Order = model.order or byte_order
     match model:
         case SumCheck():
-            compute = _sum_function(WIDTHS[model.type], model.complement, order)
+            compute = _sum_function(SCALAR_SIZES[model.type], model.complement, order)
         case XorCheck():
             initial = model.init
             return Check(1, frozenset(model.covers), lambda covered: bytes((reduce(xor, covered, initial),)))
@@ -75,7 +73,7 @@ def build_check(
     return Check(len(compute(b"")), frozenset(model.covers), compute)
 
 
-def _sum_function(width: int, complement: str, order: ByteOrder) -> CheckFunction:
+def _sum_function(width: int, complement: str, order: Order) -> CheckFunction:
     mask = (1 << 8 * width) - 1
 
     def compute(covered: bytes) -> bytes:
@@ -87,8 +85,8 @@ def _sum_function(width: int, complement: str, order: ByteOrder) -> CheckFunctio
     return compute
 
 
-def _crc_function(model: CrcCheck, order: ByteOrder) -> CheckFunction:
-    width = WIDTHS[model.type]
+def _crc_function(model: CrcCheck, order: Order) -> CheckFunction:
+    width = SCALAR_SIZES[model.type]
     mask = (1 << 8 * width) - 1
     for name, value in (("poly", model.poly), ("init", model.init), ("xor", model.xor)):
         if value > mask:
@@ -107,7 +105,7 @@ def crc(data: bytes, *, width: int, poly: int, init: int = 0, reflect: bool = Fa
     table = _crc_table(width, poly, reflect)
     bits = 8 * width
     if reflect:
-        register = _reversed(init, bits)
+        register = reversed_bits(init, bits)
         for byte in data:
             register = register >> 8 ^ table[(register ^ byte) & 0xFF]
     else:
@@ -125,13 +123,13 @@ def _crc_table(width: int, poly: int, reflect: bool) -> tuple[int, ...]:
     top, mask = 1 << (bits - 1), (1 << bits) - 1
     table = []
     for byte in range(256):
-        register = (_reversed(byte, 8) if reflect else byte) << (bits - 8)
+        register = (reversed_bits(byte, 8) if reflect else byte) << (bits - 8)
         for _ in range(8):
             register = (register << 1 ^ poly if register & top else register << 1) & mask
-        table.append(_reversed(register, bits) if reflect else register)
+        table.append(reversed_bits(register, bits) if reflect else register)
     return tuple(table)
 
 
-def _reversed(value: int, bits: int) -> int:
+def reversed_bits(value: int, bits: int) -> int:
     """Return the lowest bits of a value in reverse order."""
     return int(f"{value:0{bits}b}"[::-1], 2)

@@ -18,6 +18,7 @@ from typing import Any, Final, Literal
 
 import construct
 
+from starhil.protocol.link_schema import Order
 from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
@@ -33,30 +34,10 @@ from starhil.protocol.values import (
 RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
-Order = Literal["little", "big"]
-
-_SCALARS: Final[dict[tuple[str, Order], Any]] = {
-    ("u8", "little"): construct.Int8ul,
-    ("i8", "little"): construct.Int8sl,
-    ("u16", "little"): construct.Int16ul,
-    ("i16", "little"): construct.Int16sl,
-    ("u32", "little"): construct.Int32ul,
-    ("i32", "little"): construct.Int32sl,
-    ("u64", "little"): construct.Int64ul,
-    ("i64", "little"): construct.Int64sl,
-    ("f32", "little"): construct.Float32l,
-    ("f64", "little"): construct.Float64l,
-    ("u8", "big"): construct.Int8ub,
-    ("i8", "big"): construct.Int8sb,
-    ("u16", "big"): construct.Int16ub,
-    ("i16", "big"): construct.Int16sb,
-    ("u32", "big"): construct.Int32ub,
-    ("i32", "big"): construct.Int32sb,
-    ("u64", "big"): construct.Int64ub,
-    ("i64", "big"): construct.Int64sb,
-    ("f32", "big"): construct.Float32b,
-    ("f64", "big"): construct.Float64b,
-}
+STRUCT_CODES: Final = dict(
+    zip(("u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"), "BbHhLlQqfd", strict=True)
+)
+"""Type of a scalar → its code in a format of `struct`."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +58,11 @@ class Slot:
     def bits_key(self) -> str:
         """Name of the slot's group of bits in the construct; no field can have this name."""
         return f"bits of slot {self.index}"
+
+    @property
+    def format(self) -> str:
+        """Format of the scalar for `struct`."""
+        return ("<" if self.order == "little" else ">") + STRUCT_CODES[self.type]
 
 
 @dataclass(frozen=True)
@@ -343,7 +329,7 @@ def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
     if not fields[0].name:
         return construct.Padding(slot.size)
     return fields[0].name / (
-        construct.Bytes(slot.size) if slot.type == "bytes" else _SCALARS[slot.type, slot.order]
+        construct.Bytes(slot.size) if slot.type == "bytes" else construct.FormatField(*slot.format)
     )
 
 
@@ -371,6 +357,8 @@ class Row:
     """Arguments of the action that no field gives."""
     answers: tuple[str, ...] = ("reply",)
     """Answers in their order: `echo`, `reply`, `row:NAME`."""
+    zeros: bool = False
+    """Whether fields that are bound to nothing are sent as zeros on purpose."""
 
     def __repr__(self) -> str:
         """Return kind, id and name."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Generic, Literal, TypeVar, assert_never
+from typing import Final, TypeVar, assert_never
 
 from starhil.protocol.checks import CheckFunction, build_check
 from starhil.protocol.envelope import Envelope, Header, HeaderError
@@ -26,6 +26,7 @@ from starhil.protocol.link_schema import (
     EscapedFraming,
     FixedFraming,
     LengthFraming,
+    Order,
     SerialLinkModel,
     SlipFraming,
 )
@@ -44,7 +45,6 @@ from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_interface import RowShape, SerialStack
 from starhil.protocol.values import IcdError
 
-ByteOrder = Literal["little", "big"]
 _Message = TypeVar("_Message")
 
 
@@ -54,27 +54,21 @@ class _Classes:
 
     classes: Sequence[MessageClass]
     by_name: dict[str, MessageClass] = field(init=False)
-    _requests: dict[int, str] = field(init=False)
-    _replies: dict[int, str] = field(init=False)
+    requests: dict[int, str] = field(init=False)
+    replies: dict[int, str] = field(init=False)
     _unsolicited: set[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.by_name = {item.name: item for item in self.classes}
         coded = [item for item in self.classes if item.code is not None]
-        self._requests = {item.code: item.name for item in coded if item.code is not None}
-        self._replies = {}
+        self.requests = {item.code: item.name for item in coded if item.code is not None}
+        self.replies = {}
         self._unsolicited = set()
         for item in coded:
-            self._replies[self.reply_code(item.name, unsolicited=False)] = item.name
+            self.replies[self.reply_code(item.name, unsolicited=False)] = item.name
             if item.unsolicited is not None:
-                self._replies[item.unsolicited] = item.name
+                self.replies[item.unsolicited] = item.name
                 self._unsolicited.add(item.unsolicited)
-
-    def of_request(self, code: int) -> str:
-        return self._name(self._requests, code)
-
-    def of_reply(self, code: int) -> str:
-        return self._name(self._replies, code)
 
     def unsolicited(self, code: int | None) -> bool:
         return code in self._unsolicited
@@ -92,12 +86,6 @@ class _Classes:
         if item is None or item.code is None:
             raise ProtocolError(f"class {name!r} has no code on this link")
         return item
-
-    @staticmethod
-    def _name(names: Mapping[int, str], code: int) -> str:
-        if code not in names:
-            raise HeaderError(f"no class with code {code}")
-        return names[code]
 
 
 class ComposedStack(SerialStack):
@@ -122,7 +110,7 @@ class ComposedStack(SerialStack):
         link: SerialLinkModel,
         classes: Sequence[MessageClass] = (),
         rows: Sequence[RowShape] = (),
-        byte_order: ByteOrder = "little",
+        byte_order: Order = "little",
         *,
         framings: Mapping[str, Framing] | None = None,
         checks: Mapping[str, CheckFunction] | None = None,
@@ -140,10 +128,10 @@ class ComposedStack(SerialStack):
             self._rows_by_id.setdefault(row.id, row)
         overhead = {"start": len(self.framing.start), "check": self.check.size, "end": len(self.framing.end)}
         self.request_header: Final = Header(
-            link.request_header, byte_order, self.classes.of_request, overhead, "link.serial.request_header"
+            link.request_header, byte_order, self.classes.requests, overhead, "link.serial.request_header"
         )
         self.reply_header: Final = Header(
-            link.reply_header, byte_order, self.classes.of_reply, overhead, "link.serial.reply_header"
+            link.reply_header, byte_order, self.classes.replies, overhead, "link.serial.reply_header"
         )
         self._check_headers()
         longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)
@@ -177,26 +165,21 @@ class ComposedStack(SerialStack):
             return self._rows.get((klass, row_id))
         return self._rows.get((klass, row_id)) or self._rows_by_id.get(row_id)
 
-    def device(self) -> ComposedReceiver[Request]:
+    def device(self) -> Deframer[Request]:
         """Return a receiver for the device's end."""
-        return ComposedReceiver(self, self._receiving(self._request_of, self._request_size))
+        return self.deframer(self._request_of, self._request_size)
 
     def host(self, style: Dialect | None = None) -> ComposedHostReceiver:  # noqa: ARG002 -- one style
         """Return a receiver for the OBC's end."""
         return ComposedHostReceiver(self)
 
-    def receiving(
-        self, interpret: Callable[[bytes], Reply | LinkFault | None], measure: Callable[[bytes], int | None]
-    ) -> Receiving[Reply]:
-        """Return what a deframer of the OBC's end needs to know."""
-        return self._receiving(interpret, measure)
-
-    def _receiving(
+    def deframer(
         self,
         interpret: Callable[[bytes], _Message | LinkFault | None],
         measure: Callable[[bytes], int | None],
-    ) -> Receiving[_Message]:
-        return Receiving(interpret, measure, self.max_size, self.link.timeout)
+    ) -> Deframer[_Message]:
+        """Return a deframer of the bodies that `interpret` reads and `measure` sizes."""
+        return self.framing.deframer(Receiving(interpret, measure, self.max_size, self.link.timeout))
 
     def encode_request(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
@@ -338,39 +321,32 @@ class ComposedStack(SerialStack):
         return envelope.size + data + self.check.size
 
 
-class ComposedReceiver(Generic[_Message]):
-    """One end of a composed link."""
-
-    def __init__(self, stack: ComposedStack, receiving: Receiving[_Message]) -> None:
-        self._stack = stack
-        self._deframer: Deframer[_Message] = stack.framing.deframer(receiving)
-
-    @property
-    def busy(self) -> bool:
-        """Whether a message has begun and not ended, so that `flush` may become due."""
-        return self._deframer.busy
-
-    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
-        return self._deframer.feed(data, now)
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Abandon a message that has been silent for the timeout."""
-        return self._deframer.flush(now)
-
-
-class ComposedHostReceiver(ComposedReceiver[Reply]):
+class ComposedHostReceiver:
     """The OBC's end of a composed link.
 
     An echo of the request is verified and consumed; it is reported as the ACK of a telecommand that has no other answer.
     """
 
     def __init__(self, stack: ComposedStack) -> None:
-        super().__init__(stack, stack.receiving(self._reply_of, self._size))
+        self._stack = stack
+        self._deframer: Deframer[Reply] = stack.deframer(self._reply_of, self._size)
         self._pending: Request | None = None
         self._reply_size: int | None = None
         self._echo: bytes | None = None
         self._only_echo = False
+
+    @property
+    def busy(self) -> bool:
+        """Whether a message has begun and not ended, so that `flush` may become due."""
+        return self._deframer.busy
+
+    def feed(self, data: bytes, now: float) -> list[Reply | LinkFault]:
+        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+        return self._deframer.feed(data, now)
+
+    def flush(self, now: float) -> list[LinkFault]:
+        """Abandon a message that has been silent for the timeout."""
+        return self._deframer.flush(now)
 
     def expect(self, request: Request, reply_size: int) -> None:
         """Set the next request, and the data bytes of its telemetry (0 for a telecommand)."""

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel
-from starhil.protocol.values import IcdError
+from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel, Order
+from starhil.protocol.values import SCALAR_SIZES, IcdError
 
-ByteOrder = Literal["little", "big"]
-
-SIZES: Final = {
-    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "bits8": 1, "bits16": 2, "bits32": 4,
-}  # fmt: skip
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around in their field."""
 NANOSECONDS: Final = 1_000_000_000
@@ -39,7 +34,7 @@ class HeaderField:
 
     role: str | None
     size: int
-    order: ByteOrder
+    order: Order
     signed: bool
     const: int | None
     default: int
@@ -92,8 +87,8 @@ class Header:
         Fields as in the definition.
     byte_order
         That of the unit.
-    class_of
-        Returns the name of the class with this code; raises HeaderError.
+    classes
+        Name of the class of each code.
     overhead
         Bytes of `start`, `check` and `end`, for what a length may count.
     where
@@ -103,15 +98,15 @@ class Header:
     def __init__(
         self,
         models: Sequence[HeaderFieldModel],
-        byte_order: ByteOrder,
-        class_of: Callable[[int], str],
+        byte_order: Order,
+        classes: Mapping[int, str],
         overhead: Mapping[str, int],
         where: str,
     ) -> None:
         self.fields: Final = tuple(
             _field(model, byte_order, f"{where}: {number}") for number, model in enumerate(models, 1)
         )
-        self._class_of = class_of
+        self._classes = classes
         self._overhead = overhead
         self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
         """Roles that the header carries, in messages of any class."""
@@ -140,11 +135,8 @@ class Header:
 
     def length(self, header_size: int, data_size: int) -> int:
         """Return the value of the length field in a message of these sizes."""
-        return self._counted(self._length_field, header_size, data_size)
-
-    @property
-    def _length_field(self) -> HeaderField:
-        return next(field for field in self.fields if field.role == "length")
+        field = next(field for field in self.fields if field.role == "length")
+        return self._counted(field, header_size, data_size)
 
     def pack(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
         """Return the header of a message with this much data.
@@ -191,7 +183,9 @@ class Header:
                 if bit.role is not None:
                     values[bit.role] = found
             if "class" in values and not klass:
-                klass = self._class_of(values["class"])
+                if values["class"] not in self._classes:
+                    raise HeaderError(f"no class with code {values['class']}")
+                klass = self._classes[values["class"]]
             position += field.size
         return Envelope(values, position, klass)
 
@@ -219,8 +213,8 @@ def _bit_value(bit: _Bit, values: Mapping[str, int]) -> int:
     return value
 
 
-def _field(model: HeaderFieldModel, byte_order: ByteOrder, where: str) -> HeaderField:
-    size = SIZES[model.type]
+def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderField:
+    size = SCALAR_SIZES[model.type.replace("bits", "u")]
     if bool(model.bits) != model.type.startswith("bits"):
         raise IcdError(f"{where}: types bits8, bits16 and bits32 have `bits`, the other types have none")
     if model.role in ("ticks", "time") and round(model.scale * NANOSECONDS) < 1:

@@ -10,7 +10,7 @@ import binascii
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, SlipFraming
@@ -19,8 +19,6 @@ from starhil.protocol.serial_framing import Deframer as EscapeDeframer
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
-
-DEFAULT_SUBSTITUTES: Final = (0xDC, 0xDD)
 
 
 class BodySizeError(ProtocolError):
@@ -131,10 +129,7 @@ class Slip(Framing):
     """Frames between end bytes, with substituted bytes within (RFC 1055)."""
 
     def __init__(self, model: SlipFraming) -> None:
-        if model.xor is not None:
-            substitutes = (model.end ^ model.xor, model.escape ^ model.xor)
-        else:
-            substitutes = model.substitutes or DEFAULT_SUBSTITUTES
+        substitutes = model.escaped
         self.end = bytes((model.end,))
         self.escape = bytes((model.escape,))
         self._before = self.end if model.leading_end else b""

@@ -45,6 +45,7 @@ def unbound(icd: InterfaceDefinition) -> list[str]:
         f"unit {icd.name}: telemetry {row.name}: field {field.name}: no `value`, `const`, `parameter` or `default`; "
         "a field without a name is sent as zeros"
         for row in icd.telemetry.values()
+        if not row.zeros
         for field in row.named_fields.values()
         if (field.value, field.const, field.parameter, field.default, field.telecommand) == (None,) * 5
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -17,13 +18,15 @@ from starhil.protocol.device_model import DeviceModel, device_model, did_you_mea
 from starhil.protocol.icd import InterfaceDefinition, Names, RawTable
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import Layout
-from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel
+from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, Order
 from starhil.protocol.messages import ErrorCode, MessageClass, RequestKind
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
+SETS: Final = "set_"
+"""Beginning of the names of telecommands that telemetry reads back."""
 HIGHEST_ID: Final = 0xFF
 """Highest id where the link does not say how an id is sent."""
 
@@ -93,7 +96,7 @@ class _Builder:
         self._sections: list[Section] = []
         self._tables: dict[str, tuple[Path, object]] = {}
         self._plugin = Plugin()
-        self.byte_order: schema.Order = "little"
+        self.byte_order: Order = "little"
 
     def read(self, file: Path) -> None:
         """Read and validate one file."""
@@ -339,12 +342,9 @@ class _Builder:
             model.id, whole.name, whole.type, whole.unit, low, high, whole.default, whole.doc, enum
         )
         try:
-            default = parameter.check(whole.default)
+            self._parameters[whole.name] = replace(parameter, default=parameter.check(whole.default))
         except FieldError as error:
             raise IcdError(f"{where}: default: {error}") from None
-        self._parameters[whole.name] = Parameter(
-            model.id, whole.name, whole.type, whole.unit, low, high, default, whole.doc, enum
-        )
 
     @staticmethod
     def _limits(
@@ -381,7 +381,11 @@ class _Builder:
         models = [
             (file, row)
             for file, model in self._files
-            for row in (model.telecommand if kind == "telecommand" else model.telemetry)
+            for row in (
+                model.telecommand
+                if kind == "telecommand"
+                else [*model.telemetry, *_readbacks(model.telecommand)]
+            )
         ]
         waiting = [(file, model) for file, model in models if model.include]
         done: list[Row] = []
@@ -449,17 +453,24 @@ class _Builder:
         self, kind: RowKind, file: Path, model: schema.RowModel, rows: Mapping[str, Row]
     ) -> Iterator[Row]:
         where = f"{file}: {kind} {model.name}"
-        if (model.fields is None) == (model.include is None):
-            raise IcdError(f"{where}: needs either `fields` or `include`")
+        if model.fields is None and model.include is None:
+            raise IcdError(f"{where}: needs `fields` or `include`")
+        provenance = model.provenance or self._unit.provenance
+        if provenance is None:
+            raise IcdError(f"{where}: needs `provenance`, here or in [unit]")
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
             raise IcdError(f"{where}: last_id {last} is below id {model.id}")
-        if kind == "telemetry" and (model.action is not None or model.arguments):
-            raise IcdError(f"{where}: only telecommands have an action")
+        if kind == "telemetry" and (
+            model.action is not None or model.arguments or model.readback is not None
+        ):
+            raise IcdError(f"{where}: only telecommands have an action or a readback")
+        if model.readback is not None and not model.name.startswith(SETS):
+            raise IcdError(f"{where}: a telecommand with a readback is named {SETS}…")
         klass = self._class_of(kind, model, where)
         for number, row_id in enumerate(range(model.id, last + 1), 1):
             single = model.last_id is None
-            layout = Layout(self, where, kind, model.provenance, None if single else number)
+            layout = Layout(self, where, kind, provenance, None if single else number)
             for name in model.include or ():
                 if name not in rows:
                     raise IcdError(f"{where}: include: no row named {name!r}{did_you_mean(name, rows)}")
@@ -476,8 +487,8 @@ class _Builder:
                 fields=tuple(layout.fields),
                 slots=tuple(layout.slots),
                 doc=model.doc,
-                provenance=model.provenance,
-                source=model.source or (self._unit.source if model.provenance == "confirmed" else ""),
+                provenance=provenance,
+                source=model.source or (self._unit.source if provenance == "confirmed" else ""),
                 klass=klass,
                 action=model.action,
                 arguments={
@@ -486,6 +497,7 @@ class _Builder:
                 answers=tuple(
                     self._class_answers.get(klass, ["reply"]) if model.answer is None else model.answer
                 ),
+                zeros=model.unbound is not None,
             )
 
     def _check_answers(self, row: Row, rows: Mapping[str, Row]) -> None:
@@ -496,3 +508,14 @@ class _Builder:
                 raise IcdError(f"{where}: must be echo, reply or row:NAME")
             if kind == "row" and (name not in rows or rows[name].kind != "telemetry"):
                 raise IcdError(f"{where}: no telemetry of this name{did_you_mean(name, rows)}")
+
+
+def _readbacks(telecommands: list[schema.RowModel]) -> Iterator[schema.RowModel]:
+    """Yield the telemetry that reports what telecommands were last accepted with."""
+    for model in telecommands:
+        if model.readback is not None:
+            name = model.name.removeprefix(SETS)
+            yield schema.RowModel(
+                id=model.readback, name=name, doc="As set.", provenance=model.provenance, source=model.source,
+                size=model.size, include=[model.name],
+            )  # fmt: skip

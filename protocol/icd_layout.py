@@ -6,30 +6,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final, Protocol
 
-from starhil.protocol.codec import Field, FieldKind, Order, Row, RowKind, Slot
-from starhil.protocol.icd_schema import BitModel, FieldModel, Scalar
-from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, IcdError
+from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
+from starhil.protocol.field_text import fields_of
+from starhil.protocol.icd_schema import BitModel, FieldModel, RepeatModel, Scalar
+from starhil.protocol.link_schema import Order
+from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError
 
-_SLOT_TYPES: Final[dict[str, str]] = {
-    "enum8": "u8",
-    "enum16": "u16",
-    "enum32": "u32",
-    "bits8": "u8",
-    "bits16": "u16",
-    "bits32": "u32",
-}
-_SIZES: Final[dict[str, int]] = {
-    "u8": 1,
-    "i8": 1,
-    "u16": 2,
-    "i16": 2,
-    "u32": 4,
-    "i32": 4,
-    "u64": 8,
-    "i64": 8,
-    "f32": 4,
-    "f64": 8,
-}
 NUMBER: Final = "[n]"
 
 
@@ -81,19 +63,39 @@ class Layout:
     def add(self, model: FieldModel) -> None:
         """Append a field, a series of numbered fields, a repeated group, or the bits of a bit field."""
         where = f"{self._where}: field {model.name or 'unused'}"
+        if model.text is not None:
+            for item in self._of_text(model):
+                self._place(item, f"{self._where}: field {item.name or 'unused'}", "", self._number)
+            return
         if model.repeat is not None:
-            if model.model_fields_set - {"repeat", "doc"}:
-                raise IcdError(f"{where}: `repeat` stands alone, with its own fields")
-            for number in range(1, model.repeat.count + 1):
-                for item in model.repeat.fields:
-                    if item.repeat is not None or item.count is not None:
-                        raise IcdError(f"{where}: a repeated group holds neither `repeat` nor `count`")
-                    self._place(item, where, f"_{number}", number)
+            self._add_repeat(model, model.repeat, where)
             return
         if model.count is None:
             self._place(model, where, "", self._number)
         for number in range(1, (model.count or 0) + 1):
             self._place(model, where, f"_{number}", number)
+
+    def _add_repeat(self, model: FieldModel, repeat: RepeatModel, where: str) -> None:
+        if model.model_fields_set - {"repeat", "doc"}:
+            raise IcdError(f"{where}: `repeat` stands alone, with its own fields")
+        group = [single for item in repeat.fields for single in self._of_text(item)]
+        if any(item.repeat is not None or item.count is not None for item in group):
+            raise IcdError(f"{where}: a repeated group holds neither `repeat` nor `count`")
+        for number in range(repeat.first, repeat.first + repeat.count):
+            for item in group:
+                self._place(item, where, f"_{number}", number)
+
+    def _of_text(self, model: FieldModel) -> list[FieldModel]:
+        """Return the fields that a text stands for, or the field itself."""
+        if model.text is None:
+            return [model]
+        where = f"{self._where}: field {model.text!r}"
+        if model.model_fields_set != {"text"}:
+            raise IcdError(f"{where}: `text` stands alone")
+        try:
+            return fields_of(model.text)
+        except IcdError as error:
+            raise IcdError(f"{where}: {error}") from None
 
     def _place(self, model: FieldModel, where: str, suffix: str, number: int | None) -> None:
         if model.type is None:
@@ -114,11 +116,9 @@ class Layout:
         if type_ in ("bytes", "text"):
             slot = self._slot("bytes", model.size or 0)
         else:
-            scalar = _SLOT_TYPES.get(type_, type_)
-            slot = self._slot(scalar, _SIZES[scalar], model.order)
+            slot = self._scalar_slot(type_, model.order)
         self._check_numbers(model, where)
         enum, aliases = self._enumeration(model, where, named=type_.startswith("enum"))
-        bound = _minimum_maximum(model)
         return Field(
             name=model.name + suffix if model.name else "",
             kind=_kind(model, type_, enum),
@@ -126,8 +126,8 @@ class Layout:
             unit=model.unit,
             scale=model.scale,
             bias=model.offset,
-            minimum=bound[0],
-            maximum=bound[1],
+            minimum=model.min if model.const is None else model.const,
+            maximum=model.max if model.const is None else model.const,
             enum=enum,
             default=_default(model.default, enum, where),
             parameter=self._definitions.check_parameter(model.parameter, model.unit, where),
@@ -156,8 +156,7 @@ class Layout:
         where = f"{self._where}: field {model.name or 'unused'}"
         if not model.bits or (model.count is not None):
             raise IcdError(f"{where}: type {model.type} needs `bits` and takes no count")
-        scalar = _SLOT_TYPES[str(model.type)]
-        slot = self._slot(scalar, _SIZES[scalar], model.order)
+        slot = self._scalar_slot(str(model.type), model.order)
         shift = 0
         for bit in model.bits:
             here = f"{self._where}: field {bit.name or 'unused'}"
@@ -198,6 +197,11 @@ class Layout:
             const=bit.const,
             aliases=aliases,
         )
+
+    def _scalar_slot(self, type_: str, order: Order | None) -> Slot:
+        """Return the slot of a number, an enumeration or a bit field."""
+        scalar = type_.replace("enum", "u").replace("bits", "u")
+        return self._slot(scalar, SCALAR_SIZES[scalar], order)
 
     def _slot(self, scalar: str, size: int, order: Order | None = None) -> Slot:
         slot = Slot(len(self.slots), scalar, self.size, size, order or self._definitions.byte_order)
@@ -268,10 +272,6 @@ def _kind(model: FieldModel, type_: str, enum: EnumDefinition | None) -> FieldKi
         return "enum"
     kinds: dict[str, FieldKind] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
     return kinds.get(type_, "integer")
-
-
-def _minimum_maximum(model: FieldModel) -> tuple[float | None, float | None]:
-    return (model.min, model.max) if model.const is None else (model.const, model.const)
 
 
 def _numbered(name: str | None, number: int | None, where: str) -> str | None:

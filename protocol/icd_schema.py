@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from starhil.protocol.link_schema import HEX, LinkModel
+from starhil.protocol.link_schema import HEX, LinkModel, Order
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Provenance = Literal["confirmed", "proxy", "ours"]
@@ -16,7 +16,6 @@ FieldType = Literal[
 ]  # fmt: skip
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
 Kind = Literal["telecommand", "telemetry"]
-Order = Literal["little", "big"]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Scalar = bool | int | float | str
 Code = Annotated[int, Field(ge=0, le=0xFFFF, json_schema_extra=HEX)]
@@ -39,6 +38,8 @@ class UnitModel(_Model):
     """Public source of the confirmed rows that name no source."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Lowest telemetry ID; lower IDs are telecommands. Omit it if the class or the row decides."""
+    provenance: Provenance | None = None
+    """Provenance of the rows that name none."""
     plugin: str | None = None
     """Python file beside the definition, with custom quantities, actions, framings or checks."""
 
@@ -120,14 +121,18 @@ class RepeatModel(_Model):
     """A group of fields, sent `count` times; `[n]` in the name of a quantity or argument is the number of the repetition."""
 
     count: Annotated[int, Field(ge=1, le=256)]
-    """Number of repetitions; the names of their fields end in _1, _2 …"""
+    """Number of repetitions; the names of their fields end in _1, _2 …, unless `first` is given."""
     fields: list[FieldModel] = Field(min_length=1)
     """Fields of the group."""
+    first: Annotated[int, Field(ge=0, le=256)] = 1
+    """Number of the first repetition."""
 
 
 class FieldModel(_BoundModel):
-    """One field of a row; unused and sent as zeros if it has no name."""
+    """One field of a row; unused and sent as zeros if it has no name. A text in place of the table is its `text`."""
 
+    text: str | None = None
+    """Fields in short, as in `i16 mag{0,1}_{x,y,z} uT 0.01`, in place of all other keys."""
     count: Annotated[int, Field(ge=2, le=64)] | None = None
     """Expands to the fields name_1 … name_count; `[n]` in a quantity's or argument's name is the number."""
     repeat: RepeatModel | None = None
@@ -156,6 +161,11 @@ class FieldModel(_BoundModel):
     provenance: Provenance | None = None
     """Provenance; default: the row's."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_text(cls, given: object) -> object:
+        return {"text": given} if isinstance(given, str) else given
+
 
 class RowModel(_Model):
     """A telecommand or telemetry row."""
@@ -170,16 +180,20 @@ class RowModel(_Model):
     """Class of the row; required if the unit has several classes of its kind."""
     doc: str
     """Description."""
-    provenance: Provenance
-    """`confirmed`: from a public source; `proxy`: public for another unit of the family; `ours`: chosen here."""
+    provenance: Provenance | None = None
+    """`confirmed`: from a public source; `proxy`: public for another unit of the family; `ours`: chosen here; default: the unit's."""
     source: str = ""
     """Public source of the row."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
     fields: list[FieldModel] | None = None
-    """Fields, in their order on the wire."""
+    """Fields, in their order on the wire, after those of `include`; each is a table or a text."""
     include: list[str] | None = None
     """Rows whose fields this row concatenates, in order."""
+    unbound: Literal["zeros"] | None = None
+    """`zeros`: fields that are bound to nothing are sent as zeros on purpose; without it they are an error."""
+    readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    """ID of the telemetry that reports the arguments that a telecommand named `set_…` was last accepted with; it has the name without `set_`."""
     action: str | None = None
     """Action that a telecommand performs."""
     arguments: dict[Name, Scalar] = {}

@@ -69,6 +69,13 @@ class SlipFraming(_Model):
     leading_end: bool = True
     """Whether an `end` byte also precedes each message."""
 
+    @property
+    def escaped(self) -> tuple[int, int]:
+        """Bytes that follow an escape byte in place of `end` and `escape`."""
+        if self.xor is not None:
+            return self.end ^ self.xor, self.escape ^ self.xor
+        return self.substitutes or (0xDC, 0xDD)
+
 
 class LengthFraming(_Model):
     """`start`, a message whose size the header's `length` field gives, `end`."""

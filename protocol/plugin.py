@@ -53,27 +53,21 @@ class Plugin:
 _loading: ContextVar[Plugin | None] = ContextVar("plugin that is being loaded", default=None)
 
 
-def _table(name: str) -> dict[str, Any]:
-    plugin = _loading.get()
-    if plugin is None:
-        raise IcdError("a plugin's functions are registered only while its unit is being loaded")
-    table: dict[str, Any] = getattr(plugin, name)
-    return table
-
-
 def quantity(name: str, *, unit: str = "", doc: str = "") -> Callable[[Function], Function]:
     """Make a function of the device's snapshot a quantity that rows can bind with `value`."""
+    return _registering("quantities", name, lambda function: PluginQuantity(function, unit, doc))
+
+
+def _registering(
+    table: str, name: str, entry: Callable[[Any], Any] = lambda function: function
+) -> Callable[[Function], Function]:
+    """Return what enters a function, or what `entry` makes of it, in a table of the plugin being loaded."""
 
     def register(function: Function) -> Function:
-        _table("quantities")[name] = PluginQuantity(function, unit, doc)  # type: ignore[arg-type]
-        return function
-
-    return register
-
-
-def _registering(table: str, name: str) -> Callable[[Function], Function]:
-    def register(function: Function) -> Function:
-        _table(table)[name] = function
+        plugin = _loading.get()
+        if plugin is None:
+            raise IcdError("a plugin's functions are registered only while its unit is being loaded")
+        getattr(plugin, table)[name] = entry(function)
         return function
 
     return register

@@ -382,8 +382,7 @@ class HostReceiver(_Receiver[Reply]):
             return Reply(ReplyKind.TELEMETRY, row_id, data)
         if len(data) != 1:
             return LinkFault(
-                FaultKind.UART_PROTOCOL,
-                f"ACK of telecommand {row_id} has {len(data)} bytes, must be 1",
+                FaultKind.UART_PROTOCOL, f"ACK of telecommand {row_id} has {len(data)} bytes, must be 1"
             )
         self._expected = None
         code = error_code(data[0])

@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol
 
-from starhil.protocol.messages import LinkFault, Reply, Request, RequestKind
+from starhil.protocol.messages import Reply, Request, RequestKind
+from starhil.protocol.receiver import Receiver
 from starhil.protocol.serial_framing import Dialect
 
-_Message_co = TypeVar("_Message_co", covariant=True)
 
-
-class Receiver(Protocol[_Message_co]):
-    """One end of a serial line: bytes in, messages and faults out."""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a message is incomplete."""
-        ...
-
-    def feed(self, data: bytes, now: float, /) -> Sequence[_Message_co | LinkFault]:
-        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
-        ...
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Drop an incomplete message that has timed out; return the faults."""
-        ...
-
-
-class HostEnd(Receiver[Reply], Protocol):
+class HostEnd(Receiver[bytes, Reply], Protocol):
     """The OBC's end."""
 
     def expect(self, request: Request, reply_size: int) -> None:
@@ -63,7 +44,7 @@ class SerialStack(ABC):
         return True
 
     @abstractmethod
-    def device(self) -> Receiver[Request]:
+    def device(self) -> Receiver[bytes, Request]:
         """Return a receiver for the device's end."""
 
     @abstractmethod

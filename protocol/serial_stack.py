@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from starhil.protocol.checks import CheckFunction
-from starhil.protocol.composed_stack import ByteOrder, ComposedStack
+from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.framings import Framing
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.link_schema import CubeSpaceFraming, SerialLinkModel
+from starhil.protocol.link_schema import CubeSpaceFraming, Order, SerialLinkModel
 from starhil.protocol.messages import DEFAULT_MAX_SIZE, MessageClass, Reply, Request, RequestKind
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver
 from starhil.protocol.serial_framing import encode_reply as encode_cubespace_reply
@@ -66,7 +66,7 @@ def build_stack(
     link: SerialLinkModel,
     classes: Sequence[MessageClass] = (),
     rows: Sequence[RowShape] = (),
-    byte_order: ByteOrder = "little",
+    byte_order: Order = "little",
     *,
     framings: Mapping[str, Framing] | None = None,
     checks: Mapping[str, CheckFunction] | None = None,

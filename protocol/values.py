@@ -26,6 +26,11 @@ INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
 )
 """Lowest and highest raw value of each integer type."""
 
+SCALAR_SIZES: Final[Mapping[str, int]] = MappingProxyType(
+    {"f32": 4, "f64": 8} | {name: int(name[1:]) // 8 for name in INTEGER_RANGES}
+)
+"""Bytes of each type of number."""
+
 F32_MAX: Final = 3.4028234663852886e38
 """Largest finite single-precision number."""
 

@@ -16,8 +16,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.errors import StaridError
 
 SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
@@ -25,12 +26,12 @@ SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 FASTEST_M_S: Final = 1e6
 """Largest observer velocity accepted, m/s: 13 times that of a low orbit about the Earth at perihelion."""
 
-REST: Final[NDArray[np.float64]] = np.zeros(3)
+REST: Final[Array] = np.zeros(3)
 """β of an observer at rest."""
 REST.flags.writeable = False
 
 
-def checked_beta(velocity_m_s: ArrayLike | None) -> NDArray[np.float64]:
+def checked_beta(velocity_m_s: ArrayLike | None) -> Array:
     """β = v/c (3,) of an observer; zeros for None.
 
     Raises
@@ -52,7 +53,7 @@ def checked_beta(velocity_m_s: ArrayLike | None) -> NDArray[np.float64]:
     return velocity / SPEED_OF_LIGHT_M_S
 
 
-def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> NDArray[np.float64]:
+def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> Array:
     """Directions (…, 3) as an observer sees them who moves relative to the barycentre.
 
     Parameters
@@ -65,6 +66,6 @@ def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> NDArray[np.floa
     p, beta = np.asarray(directions, dtype=np.float64), checked_beta(velocity_m_s)
     inverse_gamma = math.sqrt(1.0 - float(beta @ beta))
     along = (p @ beta)[..., None]
-    seen = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
-    unit: NDArray[np.float64] = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
-    return unit
+    seen: Array = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
+    seen /= 1.0 + along
+    return seen

@@ -21,8 +21,9 @@ from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.errors import StaridError
 
 ARCSEC_PER_RAD: Final = 180.0 * 3600.0 / math.pi
@@ -58,7 +59,7 @@ class AttitudeError:
     cross_boresight_arcsec: float
     roll_arcsec: float
     total_arcsec: float
-    rotation_vector_rad: NDArray[np.float64]
+    rotation_vector_rad: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ class Attitude:
         The quaternion is not four finite numbers, or all of them are zero.
     """
 
-    quaternion_xyzw: NDArray[np.float64]
+    quaternion_xyzw: Array
 
     def __post_init__(self) -> None:
         values = np.array(self.quaternion_xyzw, dtype=np.float64)
@@ -154,7 +155,7 @@ class Attitude:
         return cls(np.array([0.0, 0.0, 0.0, 1.0]))
 
     @cached_property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Array:
         """Rotation matrix (3, 3) ICRS→sensor, read-only: ``v_sensor = matrix @ v_icrs``."""
         x, y, z, w = self.quaternion_xyzw.tolist()
         m = np.array(
@@ -168,9 +169,9 @@ class Attitude:
         return m
 
     @property
-    def boresight(self) -> NDArray[np.float64]:
+    def boresight(self) -> Array:
         """Unit vector (3,) of the boresight in ICRS."""
-        axis: NDArray[np.float64] = self.matrix[2]
+        axis: Array = self.matrix[2]
         return axis
 
     @cached_property
@@ -201,14 +202,14 @@ class Attitude:
         """Roll, degrees in [0, 360): celestial north, counter-clockwise in the image, from image up."""
         return self._radec_roll[2]
 
-    def to_sensor(self, vectors_icrs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_sensor(self, vectors_icrs: Array) -> Array:
         """Vectors (n, 3) or (3,) in ICRS, expressed in the sensor frame."""
-        turned: NDArray[np.float64] = vectors_icrs @ self.matrix.T
+        turned: Array = vectors_icrs @ self.matrix.T
         return turned
 
-    def to_icrs(self, vectors_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_icrs(self, vectors_sensor: Array) -> Array:
         """Vectors (n, 3) or (3,) in the sensor frame, expressed in ICRS."""
-        turned: NDArray[np.float64] = vectors_sensor @ self.matrix
+        turned: Array = vectors_sensor @ self.matrix
         return turned
 
     def rotated(self, rotation_vector_sensor_rad: ArrayLike) -> Attitude:
@@ -263,7 +264,7 @@ def propagate(attitude: Attitude, rate_rad_s: ArrayLike, dt: float) -> Attitude:
     return attitude.rotated(np.asarray(rate_rad_s, dtype=np.float64) * dt)
 
 
-def rate_between(first: Attitude, second: Attitude, dt: float) -> NDArray[np.float64]:
+def rate_between(first: Attitude, second: Attitude, dt: float) -> Array:
     """Constant rate (3,) in rad/s, sensor frame, that leads from the first to the second in `dt` seconds."""
     return second.error_to(first).rotation_vector_rad / dt
 
@@ -279,18 +280,14 @@ def _turn(angle: float) -> float:
     return 0.0 if degrees == 360.0 else degrees
 
 
-def _local_frame(
-    ra: float, dec: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _local_frame(ra: float, dec: float) -> tuple[Array, Array, Array]:
     """Return the unit vectors to north, to east and outward at a point of the sky (radians)."""
     sa, ca, sd, cd = math.sin(ra), math.cos(ra), math.sin(dec), math.cos(dec)
     north = np.array([-sd * ca, -sd * sa, cd])
     return north, np.array([-sa, ca, 0.0]), np.array([cd * ca, cd * sa, sd])
 
 
-def _multiply(
-    left: tuple[float, ...] | list[float], right: tuple[float, ...] | list[float]
-) -> NDArray[np.float64]:
+def _multiply(left: tuple[float, ...] | list[float], right: tuple[float, ...] | list[float]) -> Array:
     """Hamilton product of two scalar-last quaternions: the rotation `right`, then `left`."""
     ax, ay, az, aw = left
     bx, by, bz, bw = right
@@ -304,7 +301,7 @@ def _multiply(
     )
 
 
-def quaternion_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_of(matrix: Array) -> Array:
     """Scalar-last unit quaternion (4,) of a (nearly) rotation matrix, by its largest component (Shepperd 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)

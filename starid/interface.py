@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final, Protocol, cast, runtime_checkable
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -57,9 +57,9 @@ class StarIdentifier(Protocol):
 
     def identify(
         self,
-        xy_px: NDArray[np.float64],
-        flux: NDArray[np.float64],
-        xy_sigma_px: NDArray[np.float64] | None = None,
+        xy_px: Array,
+        flux: Array,
+        xy_sigma_px: Array | None = None,
         *,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
@@ -83,10 +83,10 @@ class StarIdentifier(Protocol):
 
     def track(
         self,
-        xy_px: NDArray[np.float64],
-        flux: NDArray[np.float64],
-        predicted: Attitude | NDArray[np.float64],
-        xy_sigma_px: NDArray[np.float64] | None = None,
+        xy_px: Array,
+        flux: Array,
+        predicted: Attitude | Array,
+        xy_sigma_px: Array | None = None,
         *,
         window_px: float | None = None,
         observer_velocity: ArrayLike | None = None,

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array, Indices32, Mask
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -37,9 +38,9 @@ class MissingStars:
         Faintest V to which nearly all predicted stars are detected: only brighter ones can be missing.
     """
 
-    hip: NDArray[np.int32]
-    xy_px: NDArray[np.float64]
-    magnitude: NDArray[np.float64]
+    hip: Indices32
+    xy_px: Array
+    magnitude: Array
     complete_to: float
 
 
@@ -87,7 +88,7 @@ def missing_stars(
     return MissingStars(stars.hip[near][lost], xy[lost], magnitude[lost], limit)
 
 
-def _complete_to(magnitude: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+def _complete_to(magnitude: Array, seen: Mask) -> float:
     """Faint end of the last half-magnitude bin that is complete; −inf where none is."""
     limit = -math.inf
     if magnitude.size == 0:

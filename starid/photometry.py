@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from starid.arrays import Array
 
 EVEN_PAIR: Final = 0.45
 """Brightness ratio from which the fit of one spot to two stars lies at their common centre of light."""
@@ -35,7 +37,7 @@ _RED_WHOLLY_FROM: Final = 1.7
 _NO_COLOUR_V_HP: Final = -0.12
 
 
-def v_from_hp(hp: ArrayLike, b_v: ArrayLike, v_i: ArrayLike) -> NDArray[np.float64]:
+def v_from_hp(hp: ArrayLike, b_v: ArrayLike, v_i: ArrayLike) -> Array:
     """Johnson V of stars from their Hipparcos magnitude and colours.
 
     Three pieces, each V − Hp read off by linear interpolation:
@@ -70,28 +72,28 @@ def v_from_hp(hp: ArrayLike, b_v: ArrayLike, v_i: ArrayLike) -> NDArray[np.float
     no_b_v, no_v_i = np.isnan(b_v_), np.isnan(v_i_)
     share = np.where(no_v_i, 0.0, share)
     blue = np.where(no_b_v, np.where(share > 0.0, by_v_i, _NO_COLOUR_V_HP), by_b_v)
-    mixed: NDArray[np.float64] = hp_ + (1.0 - share) * blue + share * np.where(no_v_i, 0.0, by_v_i)
+    mixed: Array = hp_ + (1.0 - share) * blue + share * np.where(no_v_i, 0.0, by_v_i)
     return mixed
 
 
-def absolute_magnitude(magnitude: ArrayLike, parallax_mas: ArrayLike) -> NDArray[np.float64]:
+def absolute_magnitude(magnitude: ArrayLike, parallax_mas: ArrayLike) -> Array:
     """Absolute magnitude, eq. 2.1 of the thesis: M = m + 5·log10(π) − 10 with π in milliarcseconds.
 
     NaN where the parallax is not positive.
     """
     parallax = np.asarray(parallax_mas, np.float64)
     positive = np.where(parallax > 0.0, parallax, np.nan)
-    absolute: NDArray[np.float64] = np.asarray(magnitude, np.float64) + 5.0 * np.log10(positive) - 10.0
+    absolute: Array = np.asarray(magnitude, np.float64) + 5.0 * np.log10(positive) - 10.0
     return absolute
 
 
-def flux_ratio(magnitude: ArrayLike) -> NDArray[np.float64]:
+def flux_ratio(magnitude: ArrayLike) -> Array:
     """Flux of magnitudes in units of a star of magnitude zero: 10^(−0.4·m)."""
-    ratio: NDArray[np.float64] = 10.0 ** (-0.4 * np.asarray(magnitude, np.float64))
+    ratio: Array = 10.0 ** (-0.4 * np.asarray(magnitude, np.float64))
     return ratio
 
 
-def fitted_share(distance: NDArray[np.float64], brightness_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
+def fitted_share(distance: Array, brightness_ratio: Array) -> Array:
     """Share of the way to the common centre of light by which an unresolved companion shifts a star's fitted position.
 
     The fit of a single spot gives less weight to light at its rim: the shift by a faint companion falls as a Gaussian of

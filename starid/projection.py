@@ -18,8 +18,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Mask
 from starid.jit import compiled
 
 PINHOLE: Final = 0
@@ -89,7 +89,7 @@ def from_plane(model: float, a: float, b: float) -> tuple[float, float, float, b
 
 
 @compiled
-def distort(params: NDArray[np.float64], a: float, b: float) -> tuple[float, float]:
+def distort(params: Array, a: float, b: float) -> tuple[float, float]:
     """Brown–Conrady distortion of plane coordinates."""
     s = a * a + b * b
     radial = 1.0 + s * (params[K1] + s * (params[K2] + s * params[K3]))
@@ -101,7 +101,7 @@ def distort(params: NDArray[np.float64], a: float, b: float) -> tuple[float, flo
 
 
 @compiled
-def distort_slopes(params: NDArray[np.float64], a: float, b: float) -> tuple[float, float, float]:
+def distort_slopes(params: Array, a: float, b: float) -> tuple[float, float, float]:
     """Return the derivatives of `distort`: (∂a'/∂a, ∂a'/∂b = ∂b'/∂a, ∂b'/∂b)."""
     s = a * a + b * b
     k1, k2, k3 = params[K1], params[K2], params[K3]
@@ -116,7 +116,7 @@ def distort_slopes(params: NDArray[np.float64], a: float, b: float) -> tuple[flo
 
 
 @compiled
-def undistort(params: NDArray[np.float64], a: float, b: float) -> tuple[float, float, bool]:
+def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
     """Inverse of `distort` by damped Newton steps inside the one-to-one disc; False where there is none."""
     limit2 = params[LIMIT2]
     u, v = a, b
@@ -155,7 +155,7 @@ def undistort(params: NDArray[np.float64], a: float, b: float) -> tuple[float, f
 
 
 @compiled
-def project_one(params: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, bool]:
+def project_one(params: Array, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """Pixel (u, v) of a direction of the sensor frame, and whether it falls on the pixel array.
 
     Directions beyond the field, on the one-to-one part of the lens, still get their true position, which a
@@ -172,7 +172,7 @@ def project_one(params: NDArray[np.float64], x: float, y: float, z: float) -> tu
 
 
 @compiled
-def back_project_one(params: NDArray[np.float64], u: float, v: float) -> tuple[float, float, float, bool]:
+def back_project_one(params: Array, u: float, v: float) -> tuple[float, float, float, bool]:
     """Return the unit direction (x, y, z) that a pixel position sees; NaN where it sees none."""
     a, b, solved = undistort(params, (u - params[CX]) / params[FX], (v - params[CY]) / params[FY])
     if not solved:
@@ -181,9 +181,7 @@ def back_project_one(params: NDArray[np.float64], u: float, v: float) -> tuple[f
 
 
 @compiled
-def project_kernel(
-    params: NDArray[np.float64], vectors: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def project_kernel(params: Array, vectors: Array) -> tuple[Array, Mask]:
     """`project_one` over vectors (n, 3): positions (n, 2) in pixels and the mask (n,) of those inside."""
     n = vectors.shape[0]
     xy = np.empty((n, 2))
@@ -194,7 +192,7 @@ def project_kernel(
 
 
 @compiled
-def back_project_kernel(params: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def back_project_kernel(params: Array, xy: Array) -> Array:
     """`back_project_one` over positions (n, 2): unit vectors (n, 3)."""
     n = xy.shape[0]
     vectors = np.empty((n, 3))
@@ -229,7 +227,7 @@ def plane_slopes(
 
 
 @compiled
-def jacobian_kernel(params: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def jacobian_kernel(params: Array, vectors: Array) -> Array:
     """Return the derivative (n, 2, 3) of the pixel position by the direction at vectors (n, 3)."""
     n = vectors.shape[0]
     jacobian = np.empty((n, 2, 3))

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 from starid.camera import Camera
 from starid.errors import StaridError
@@ -33,7 +33,7 @@ class Reason(StrEnum):
     BAD_INPUT = "bad_input"
 
 
-def _nan(*shape: int) -> NDArray[np.float64]:
+def _nan(*shape: int) -> Array:
     return np.full(shape, math.nan)
 
 
@@ -75,17 +75,17 @@ class Solution:
 
     valid: bool
     reason: Reason
-    quaternion_xyzw: NDArray[np.float64] = field(default_factory=lambda: _nan(4))
-    detection_index: NDArray[np.int64] = field(default_factory=_NO_INDEX.copy)
-    catalog_index: NDArray[np.int64] = field(default_factory=_NO_INDEX.copy)
-    hip: NDArray[np.int32] = field(default_factory=_NO_HIP.copy)
-    covariance: NDArray[np.float64] = field(default_factory=lambda: _nan(3, 3))
+    quaternion_xyzw: Array = field(default_factory=lambda: _nan(4))
+    detection_index: Indices = field(default_factory=_NO_INDEX.copy)
+    catalog_index: Indices = field(default_factory=_NO_INDEX.copy)
+    hip: Indices32 = field(default_factory=_NO_HIP.copy)
+    covariance: Array = field(default_factory=lambda: _nan(3, 3))
     rms_px: float = math.nan
     sigma_px: float = math.nan
     probability_false: float = 1.0
     elapsed: float = 0.0
     mode: Mode = "lost_in_space"
-    rate_rad_s: NDArray[np.float64] | None = None
+    rate_rad_s: Array | None = None
     camera: Camera | None = None
 
     def __post_init__(self) -> None:
@@ -111,7 +111,7 @@ class Solution:
         return Attitude(self.quaternion_xyzw)
 
     @property
-    def matches(self) -> NDArray[np.int64]:
+    def matches(self) -> Indices:
         """Matched pairs (m, 2): row of the detections, Hipparcos number."""
         return np.column_stack([self.detection_index, self.hip.astype(np.int64)])
 

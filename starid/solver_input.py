@@ -6,11 +6,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.errors import StaridError
-
-Array = NDArray[np.float64]
 
 FARTHEST_PX: Final = 1e9
 """Largest coordinate accepted: no image is as large, and squares of positions must not overflow."""

@@ -6,8 +6,9 @@ import dataclasses
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.attitude import Attitude, propagate, rate_between
 from starid.errors import StaridError
 from starid.interface import StarIdentifier
@@ -48,7 +49,7 @@ class Tracker:
             raise StaridError(f"tracker longest_gap_s: must be seconds > 0, not {longest_gap_s}")
         self.identifier = identifier
         self.attitude: Attitude | None = None
-        self.rate_rad_s: NDArray[np.float64] | None = None
+        self.rate_rad_s: Array | None = None
         self._time_s = 0.0
         self._longest_gap_s = longest_gap_s
         self._window_px = window_px
@@ -69,10 +70,10 @@ class Tracker:
 
     def update(
         self,
-        xy_px: NDArray[np.float64],
-        flux: NDArray[np.float64],
+        xy_px: Array,
+        flux: Array,
         time_s: float,
-        xy_sigma_px: NDArray[np.float64] | None = None,
+        xy_sigma_px: Array | None = None,
         *,
         rate_hint_rad_s: ArrayLike | None = None,
         observer_velocity: ArrayLike | None = None,

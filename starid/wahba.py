@@ -21,16 +21,15 @@ from collections.abc import Callable
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array
 from starid.attitude import Attitude, quaternion_of
 from starid.errors import StaridError
 
 Method = Literal["davenport", "quest", "esoq2", "foam", "svd"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 """Names of the estimators."""
-
-Matrix = NDArray[np.float64]
 
 _LEAST_GAP: Final = 1e-12
 """Distance of the two largest eigenvalues of K, for weights that sum to 1, below which roll is undetermined."""
@@ -41,10 +40,7 @@ _POLISHING_PASSES: Final = 2
 
 
 def solve_wahba(
-    body: ArrayLike,
-    reference: ArrayLike,
-    weights: ArrayLike | None = None,
-    method: Method = "davenport",
+    body: ArrayLike, reference: ArrayLike, weights: ArrayLike | None = None, method: Method = "davenport"
 ) -> Attitude:
     """Attitude that minimises Wahba's loss.
 
@@ -89,7 +85,7 @@ def solve_wahba(
     return _SOLVERS[method](profile)
 
 
-def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Matrix:
+def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Array:
     """Covariance (3, 3), rad², of the attitude's error as a rotation vector in the sensor frame.
 
     For directions whose error is isotropic about the line of sight with σᵢ per axis, and weights 1/σᵢ²:
@@ -116,12 +112,12 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Matrix:
     smallest = np.linalg.eigvalsh(fisher)[0] if len(b) else 0.0
     if not smallest > _LEAST_GAP * information.sum():
         raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
-    inverse: Matrix = np.linalg.inv(fisher)
-    symmetric: Matrix = 0.5 * (inverse + inverse.T)
+    inverse: Array = np.linalg.inv(fisher)
+    symmetric: Array = 0.5 * (inverse + inverse.T)
     return symmetric
 
 
-def _directions(name: str, values: ArrayLike) -> Matrix:
+def _directions(name: str, values: ArrayLike) -> Array:
     """Unit vectors (n, 3), or an error that names the array."""
     try:
         table = np.asarray(values, dtype=np.float64)
@@ -132,11 +128,11 @@ def _directions(name: str, values: ArrayLike) -> Matrix:
     norms = np.linalg.norm(table, axis=1)
     if not (np.isfinite(norms).all() and (norms > 0.0).all()):
         raise StaridError(f"wahba: {name} directions must be finite and not zero")
-    unit: Matrix = table / norms[:, None]
+    unit: Array = table / norms[:, None]
     return unit
 
 
-def _davenport_matrix(profile: Matrix) -> Matrix:
+def _davenport_matrix(profile: Array) -> Array:
     """K (4, 4) of the attitude profile matrix B = Σ w b rᵀ."""
     (a, b, c), (d, e, f), (g, h, i) = profile.tolist()
     x, y, z = f - h, g - c, b - d
@@ -150,12 +146,12 @@ def _davenport_matrix(profile: Matrix) -> Matrix:
     )
 
 
-def _attitude(quaternion: Matrix) -> Attitude:
+def _attitude(quaternion: Array) -> Attitude:
     """Attitude of a quaternion in the convention of the literature."""
     return Attitude(quaternion * _CONJUGATE)
 
 
-def _largest_eigenvalue(profile: Matrix) -> float:
+def _largest_eigenvalue(profile: Array) -> float:
     """λ_max of K by Newton's method from its upper bound 1 on the quartic of FOAM (M&M eq. 40).
 
     ψ(λ) = (λ² − ‖B‖²)² − 8λ det B − 4‖adj B‖². All roots are real, so from above the steps shrink
@@ -178,7 +174,7 @@ def _largest_eigenvalue(profile: Matrix) -> float:
     return value
 
 
-def _adjoint(m: Matrix) -> Matrix:
+def _adjoint(m: Array) -> Array:
     """Adjoint (transposed cofactors) of a 3×3 matrix."""
     (a, b, c), (d, e, f), (g, h, i) = m.tolist()
     return np.array(
@@ -190,13 +186,13 @@ def _adjoint(m: Matrix) -> Matrix:
     )
 
 
-def _determinant(m: Matrix) -> float:
+def _determinant(m: Array) -> float:
     """Determinant of a 3×3 matrix."""
     (a, b, c), (d, e, f), (g, h, i) = m.tolist()
     return float(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g))
 
 
-def _polished(profile: Matrix, quaternion_at: Callable[[float], Matrix]) -> Matrix:
+def _polished(profile: Array, quaternion_at: Callable[[float], Array]) -> Array:
     """Quaternion at λ_max, with λ improved by the Rayleigh quotient.
 
     The quartic loses digits of λ when two eigenvalues are close (stars close together, two stars). The
@@ -209,53 +205,53 @@ def _polished(profile: Matrix, quaternion_at: Callable[[float], Matrix]) -> Matr
     return quaternion
 
 
-def _with_reference_turned(profile: Matrix, axis: int) -> Matrix:
+def _with_reference_turned(profile: Array, axis: int) -> Array:
     """Profile matrix after the reference frame has made half a turn about an axis; 3 means none."""
     if axis == 3:
         return profile
     signs = np.full(3, -1.0)
     signs[axis] = 1.0
-    turned: Matrix = profile * signs
+    turned: Array = profile * signs
     return turned
 
 
-def _turned_back(quaternion: Matrix, axis: int) -> Matrix:
+def _turned_back(quaternion: Array, axis: int) -> Array:
     """Undo `_with_reference_turned`: the quaternion of A = A'·R(axis, 180°) (M&M eq. 60)."""
     x, y, z, w = quaternion.tolist()
     return np.array([(w, -z, y, -x), (z, w, -x, -y), (-y, x, w, -z), (x, y, z, w)][axis])
 
 
-def _davenport(profile: Matrix) -> Attitude:
+def _davenport(profile: Array) -> Attitude:
     """Davenport's q-method: K q = λ_max q (M&M eq. 13)."""
     _, vectors = np.linalg.eigh(_davenport_matrix(profile))
     return _attitude(vectors[:, -1])
 
 
-def _svd(profile: Matrix) -> Attitude:
+def _svd(profile: Array) -> Attitude:
     """B = U Σ Vᵀ, A = U diag(1, 1, det U det V) Vᵀ."""
     u, _, vt = np.linalg.svd(profile)
     u[:, 2] *= np.sign(_determinant(u) * _determinant(vt))
     return Attitude.from_matrix(u @ vt)
 
 
-def _foam(profile: Matrix) -> Attitude:
+def _foam(profile: Array) -> Attitude:
     """A = [(κ + ‖B‖²) B + λ adj Bᵀ − B Bᵀ B] / ζ, ζ = κλ − det B, κ = ½(λ² − ‖B‖²)."""
     norm2 = float(np.sum(profile * profile))
     determinant = _determinant(profile)
     cofactors = _adjoint(profile).T
     cubic = profile @ profile.T @ profile
 
-    def quaternion_at(value: float) -> Matrix:
+    def quaternion_at(value: float) -> Array:
         kappa = 0.5 * (value * value - norm2)
         zeta = kappa * value - determinant
         matrix = ((kappa + norm2) * profile + value * cofactors - cubic) / zeta
-        conjugated: Matrix = quaternion_of(matrix) * _CONJUGATE
+        conjugated: Array = quaternion_of(matrix) * _CONJUGATE
         return conjugated
 
     return _attitude(_polished(profile, quaternion_at))
 
 
-def _quest(profile: Matrix) -> Attitude:
+def _quest(profile: Array) -> Attitude:
     """QUEST with sequential rotations.
 
     The Gibbs vector of the answer is singular at half a turn, so the reference frame is turned by half a
@@ -270,7 +266,7 @@ def _quest(profile: Matrix) -> Attitude:
     return _attitude(_turned_back(quaternion, axis))
 
 
-def _quest_vector(profile: Matrix) -> Callable[[float], Matrix]:
+def _quest_vector(profile: Array) -> Callable[[float], Array]:
     """Return q ∝ ((αI + βS + S²) z, γ) as a function of λ."""
     k = _davenport_matrix(profile)
     sigma, z = float(k[3, 3]), k[:3, 3]
@@ -279,7 +275,7 @@ def _quest_vector(profile: Matrix) -> Callable[[float], Matrix]:
     sz = s @ z
     ssz = s @ sz
 
-    def vector_at(value: float) -> Matrix:
+    def vector_at(value: float) -> Array:
         alpha = value * value - sigma * sigma + kappa
         gamma = (value + sigma) * alpha - delta
         return np.append(alpha * z + (value - sigma) * sz + ssz, gamma)
@@ -287,7 +283,7 @@ def _quest_vector(profile: Matrix) -> Callable[[float], Matrix]:
     return vector_at
 
 
-def _esoq2(profile: Matrix) -> Attitude:
+def _esoq2(profile: Array) -> Attitude:
     """ESOQ2: the axis e is the null vector of M = (λ − σ)[(λ + σ)I − S] − z zᵀ.
 
     It is the largest cross product of two rows. M vanishes at zero rotation, so the reference frame is
@@ -299,7 +295,7 @@ def _esoq2(profile: Matrix) -> Attitude:
     sigma, z = float(k[3, 3]), k[:3, 3]
     s = k[:3, :3] + sigma * np.eye(3)
 
-    def quaternion_at(value: float) -> Matrix:
+    def quaternion_at(value: float) -> Array:
         m = (value - sigma) * ((value + sigma) * np.eye(3) - s) - np.outer(z, z)
         adjoint = _adjoint(m)
         y = adjoint[:, int(np.argmax(np.abs(np.diag(adjoint))))]
@@ -308,13 +304,13 @@ def _esoq2(profile: Matrix) -> Attitude:
     return _attitude(_turned_back(_polished(turned, quaternion_at), axis))
 
 
-def _unit(vector: Matrix) -> Matrix:
+def _unit(vector: Array) -> Array:
     """Vector of length 1."""
-    scaled: Matrix = vector / np.linalg.norm(vector)
+    scaled: Array = vector / np.linalg.norm(vector)
     return scaled
 
 
-_SOLVERS: Final[dict[str, Callable[[Matrix], Attitude]]] = {
+_SOLVERS: Final[dict[str, Callable[[Array], Attitude]]] = {
     "davenport": _davenport,
     "quest": _quest,
     "esoq2": _esoq2,

@@ -27,7 +27,7 @@ from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sky.view import Sky
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen import build_dictionary
@@ -267,7 +267,7 @@ def test_library(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def bus():
-    with PrivateCanBus() as channel:
+    with private_can_bus() as channel:
         yield channel
 
 

@@ -31,16 +31,11 @@ READY_WITHIN_S = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One session of the demo: the script, and the link and channel it uses."""
+    """One session of the demo: the script, the link that it uses, which names the folder of its logs, and the channel."""
 
     script: str
     link: str
     channel: str
-
-    @property
-    def folder_name(self) -> str:
-        """Folder of this leg's logs below the output folder."""
-        return self.link
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +90,7 @@ def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Compa
 
 def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
     """Run the OBC's session as a separate process; return whether every step passed."""
-    folder = out / leg.folder_name
+    folder = out / leg.link
     command = [
         str(Path(sys.executable).with_name("starhil")), "session", leg.script, f"--{leg.link}", leg.channel,
         "--log", str(folder), "--junit", str(folder / "junit.xml"), "--truth", str(truth_log),
@@ -195,7 +190,7 @@ def main() -> int:
         console.print("demo: a session failed; see its steps above", style="red")
         return 1
     truth = read_csv(truth_log)
-    comparisons = {leg.link: compare(read_csv(out / leg.folder_name / "attitude.csv"), truth) for leg in legs}
+    comparisons = {leg.link: compare(read_csv(out / leg.link / "attitude.csv"), truth) for leg in legs}
     good = report(comparisons, console)
     plot(comparisons, out / "error.png")
     console.print(

@@ -61,18 +61,18 @@ OF_PARAMETERS: Final = ("exposure_s", "gain")
 LARGE: Final = 1e6
 """Numbers from here on are shown with an exponent where that loses nothing."""
 
-Row = tuple[str, str, str, str, str]
+Row = tuple[str, ...]
 HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
 
 
 # --- parts of a table ---
 
 
-def table(rows: list[Row]) -> str:
+def table(rows: list[Row], head: Row = HEAD) -> str:
     """Return a Markdown table, without the columns in which no row has anything."""
-    shown = [column for column in range(len(HEAD)) if any(row[column] for row in rows)]
+    shown = [column for column in range(len(head)) if any(row[column] for row in rows)]
     lines = [
-        "| " + " | ".join(row[column].replace("|", "\\|") for column in shown) + " |" for row in (HEAD, *rows)
+        "| " + " | ".join(row[column].replace("|", "\\|") for column in shown) + " |" for row in (head, *rows)
     ]
     return "\n".join([lines[0], "|" + "---|" * len(shown), *lines[1:]])
 
@@ -233,28 +233,30 @@ def truth() -> str:
     from starhil.emulator.truth.config import AttitudeConfig, MountConfig, SegmentConfig, TruthConfig
 
     parts = [
-        f'### `kind = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
-        for model in models_in(TruthConfig)
-    ]
-    parts += [
-        f'### Segment `do = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
-        for model in models_in(SegmentConfig)
-    ]
-    parts += [
-        f"### {title}\n\n{plain_text(model.__doc__ or '')}\n\n{table(model_rows(model))}"
+        described(title, model)
         for title, model in (("An attitude", AttitudeConfig), ("A mount", MountConfig))
     ]
-    return "\n\n".join(parts)
+    return "\n\n".join(
+        (*alternatives(TruthConfig, "`kind"), *alternatives(SegmentConfig, "Segment `do"), *parts)
+    )
 
 
 def orbit() -> str:
     """The ways to give an orbit."""
     from starhil.emulator.truth.config import OrbitConfig
 
-    return "\n\n".join(
-        f'### `kind = "{kind_of(model)}"`\n\n{plain_text(model.__doc__ or "")}\n\n{table(model_rows(model)[1:])}'
-        for model in models_in(OrbitConfig)
-    )
+    return "\n\n".join(alternatives(OrbitConfig, "`kind"))
+
+
+def alternatives(annotation: Any, key: str) -> Iterator[str]:
+    """Yield the section of each model of a union; its first key distinguishes it, and stands in the heading."""
+    for model in models_in(annotation):
+        yield described(f'{key} = "{kind_of(model)}"`', model, skipped=1)
+
+
+def described(title: str, model: type[BaseModel], skipped: int = 0) -> str:
+    """Return the section of a model, without its first keys."""
+    return f"### {title}\n\n{plain_text(model.__doc__ or '')}\n\n{table(model_rows(model)[skipped:])}"
 
 
 def kind_of(model: type[BaseModel]) -> str:
@@ -441,26 +443,26 @@ def quantities() -> str:
     from starhil.protocol.device_model import device_model
 
     model = device_model()
-    lines = ["| quantity | type | unit | meaning |", "|---|---|---|---|"]
+    rows: list[Row] = []
     for item in model.quantities.values():
         kind = item.type if item.enum is None else f"name: {', '.join(model.enums[item.enum].values)}"
         count = f" n from 1 to {item.count}." if item.count else ""
-        lines.append(f"| `{item.name}` | {kind} | {item.unit} | {item.doc}{count} |")
-    return "\n".join(lines)
+        rows.append((f"`{item.name}`", kind, item.unit, item.doc + count))
+    return table(rows, ("quantity", "type", "unit", "meaning"))
 
 
 def actions() -> str:
     """Every action of the device model and its arguments."""
     from starhil.protocol.device_model import device_model
 
-    lines = ["| action | argument | type | unit | default | meaning |", "|---|---|---|---|---|---|"]
+    rows: list[Row] = []
     for action in device_model().actions.values():
-        lines.append(f"| `{action.name}` | | | | | {action.doc} |")
+        rows.append((f"`{action.name}`", "", "", "", "", action.doc))
         for item in action.arguments:
             value = "required" if item.required else literal(item.default)
             kind = item.type if item.enum is None else f"name of {item.enum}"
-            lines.append(f"| | `{item.name}` | {kind} | {item.unit} | {value} | {item.doc} |")
-    return "\n".join(lines)
+            rows.append(("", f"`{item.name}`", kind, item.unit, value, item.doc))
+    return table(rows, ("action", "argument", "type", "unit", "default", "meaning"))
 
 
 def device_parameters() -> str:
@@ -521,28 +523,16 @@ def option_row(parameter: Any) -> str:
     """Return the row of an argument or option."""
     argument = parameter.param_type_name == "argument"
     names = [argument_name(parameter)] if argument else [*parameter.opts, *parameter.secondary_opts]
-    value = (
-        "required"
-        if parameter.required
-        else ""
-        if callable(parameter.default)
-        else shown_default(parameter.default)
-    )
+    value = "required" if parameter.required else shown_default(parameter.default)
     low, high = getattr(parameter, "min", None), getattr(parameter, "max", None)
-    bounds = (
-        ""
-        if low is None and high is None
-        else f" {low:g} or more."
-        if high is None
-        else f" {low:g} to {high:g}."
-    )
+    bounds = "" if low is None else f" {low:g} or more." if high is None else f" {low:g} to {high:g}."
     text = plain_text(parameter.help or "").replace("|", "\\|") + bounds
     return f"| {', '.join(f'`{name}`' for name in names)} | {value} | {text} |"
 
 
 def shown_default(value: Any) -> str:
     """Return the default of an option; flags that are off and options that are not given have none."""
-    if value is None or value is False or value in ("", (), []):
+    if value is None or value is False or value in ("", (), []) or callable(value):
         return ""
     return f"`{' '.join(str(item) for item in value)}`" if isinstance(value, tuple | list) else f"`{value}`"
 

@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import random
 import socket
 import sys
@@ -130,12 +129,6 @@ def processes(pid: int) -> Iterator[int]:
         yield from processes(int(child))
 
 
-def memory_mb(pids: Sequence[int]) -> float:
-    """Resident memory of processes, MB."""
-    pages = sum(int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) for pid in pids)
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def descriptors(pids: Sequence[int]) -> int:
     """Open descriptors of processes."""
     return sum(len(list(Path(f"/proc/{pid}/fd").iterdir())) for pid in pids)
@@ -222,15 +215,11 @@ class Soak:
             control.do("clear_faults")
         finally:
             control.close()
-        latencies = {link: self._latency_p99_ms(link) for link in self._links}
-        pids = [pid for process in (self._emulator, self._hub) for pid in processes(process.process.pid)]
-        return Sample(
-            self.elapsed_s,
-            memory_mb(pids),
-            settled_descriptors(pids),
-            latencies["serial"],
-            latencies["can"],
-        )
+        latencies = (self._latency_p99_ms("serial"), self._latency_p99_ms("can"))
+        both = (self._emulator, self._hub)
+        memory_mb = sum(process.memory_bytes() for process in both) / 1e6
+        pids = [pid for process in both for pid in processes(process.process.pid)]
+        return Sample(self.elapsed_s, memory_mb, settled_descriptors(pids), *latencies)
 
     def _client(self, link: str, timeout_s: float) -> ObcClient:
         if link == "serial":

@@ -76,11 +76,6 @@ class GuestError(Exception):
 # --- on the host ---
 
 
-def missing_programs() -> dict[str, str]:
-    """Return the needed programs that are not there, each with the package that brings it."""
-    return {name: package for name, package in NEEDED.items() if shutil.which(name, path=SYSTEM_PATH) is None}
-
-
 def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, memory: str) -> int:
     """Run `command` in a fresh guest and return its exit status.
 
@@ -89,7 +84,7 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
     GuestError
         A program is missing, the time is over, or the guest did not come up.
     """
-    missing = missing_programs()
+    missing = {name: NEEDED[name] for name in NEEDED if shutil.which(name, path=SYSTEM_PATH) is None}
     if missing:
         packages = " ".join(sorted(missing.values()))
         raise GuestError(

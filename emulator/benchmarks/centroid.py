@@ -125,8 +125,7 @@ def measure_centroids(
     frames: int = 30,
     seed: int = 1,
     sensor: SensorModel | None = None,
-    camera: Camera | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _text: None,
 ) -> list[CentroidRow]:
     """Measure the accuracy of centroids on frames of random attitude.
 
@@ -138,7 +137,7 @@ def measure_centroids(
         Frames a rate.
     seed : int
         Seed of attitudes, directions and noise.
-    sensor, camera : optional
+    sensor : optional
         Default: the product's.
     progress : callable, optional
         Receives a line about each step.
@@ -153,12 +152,10 @@ def measure_centroids(
             f"bench centroid: frames and rates must be at least one each, not {frames} and {len(rates_deg_s)}"
         )
     sensor = SensorModel() if sensor is None else sensor
-    camera = Camera.from_fov() if camera is None else camera
-    renderer = Renderer(camera, load_catalog(), sensor, seed)
+    renderer = Renderer(Camera.from_fov(), load_catalog(), sensor, seed)
     rows: list[CentroidRow] = []
     for rate in rates_deg_s:
-        if progress is not None:
-            progress(f"{rate:g} °/s: {frames} frames")
+        progress(f"{rate:g} °/s: {frames} frames")
         table = np.concatenate([_one_frame(renderer, rate, index, seed) for index in range(frames)])
         rows += _rows(rate, table)
     return rows

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.campaign import WRONG_DEG, open_store
+from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_store, run_parts
 from starhil.emulator.benchmarks.hard_sky import direction_around
 from starhil.emulator.device.cycle import as_quaternion, as_triple
 from starhil.emulator.device.device import orbit_of, profile_defaults
@@ -300,22 +299,10 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
 }
 """Influence → function that makes a frame's conditions."""
 
-_of_thread = threading.local()
-
-
-def _device_of_thread(plan: EcssPlan) -> EcssDevice:
-    import cv2
-
-    made: EcssDevice | None = getattr(_of_thread, "device", None)
-    if made is None or made.plan != plan:
-        cv2.setNumThreads(1)
-        made = _of_thread.device = EcssDevice(plan)
-    return made
-
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
     """Solve the frames of a part; return outcomes, errors about x, y and z in arcseconds, and numbers of field and condition."""
-    device = _device_of_thread(plan)
+    device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)
     outcome = np.zeros(len(numbers), dtype="U24")
@@ -337,10 +324,6 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
     return {"outcome": outcome, "error_arcsec": errors, "labels": labels}
 
 
-def _run_named(plan: EcssPlan, condition: Condition, chunk: int) -> tuple[str, int, Results]:
-    return condition.name, chunk, run_part(plan, condition, chunk)
-
-
 def run_ecss(
     plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1
 ) -> Iterator[tuple[str, int, Results]]:
@@ -360,23 +343,14 @@ def run_ecss(
     EmulatorError, StaridError
         The profile is invalid, or the folder holds another campaign.
     """
-    from joblib import Parallel, delayed
-
     profile = load_profile(plan.profile, plan.overrides)
     described = {**asdict(plan), "device": profile.model_dump(mode="json")}
     store = None if folder is None else open_store(folder, described)
-    todo = []
-    for condition, chunk in parts(plan):
-        kept = None if store is None else store.load(f"{condition.name}-{chunk:04d}")
-        if kept is None:
-            todo.append((condition, chunk))
-        else:
-            yield condition.name, chunk, kept
-    work = (delayed(_run_named)(plan, condition, chunk) for condition, chunk in todo)
-    for name, chunk, results in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
-        if store is not None:
-            store.save(f"{name}-{chunk:04d}", results)
-        yield name, chunk, results
+    named = {f"{condition.name}-{chunk:04d}": (condition, chunk) for condition, chunk in parts(plan)}
+    calls = {name: (run_part, plan, *part) for name, part in named.items()}
+    for name, results in run_parts(calls, store, jobs):
+        condition, chunk = named[name]
+        yield condition.name, chunk, results
 
 
 def parts(plan: EcssPlan) -> list[tuple[Condition, int]]:

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -268,43 +269,32 @@ def write_report(report: EcssReport, folder: Path) -> tuple[Path, ...]:
         "availability.csv": _availability_csv(report),
     }
     for name, text in texts.items():
-        _write(folder / name, text)
+        write_atomically(folder / name, partial(Path.write_text, data=text, encoding="utf-8"))
     return (*(folder / name for name in texts), *plots)
 
 
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+def _csv(head: str, rows: Iterable[Sequence[object]]) -> str:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([head.split(), *rows])
+    return stream.getvalue()
 
 
 def _errors_csv(report: EcssReport) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["error", "x_arcsec", "y_arcsec", "z_arcsec", "x_least", "y_least", "z_least"])
+    rows = []
     for line in (*report.lines, report.total, report.measured):
         sizes = ["", "", ""] if line.arcsec is None else [f"{size:.6g}" for size in line.arcsec]
-        writer.writerow([line.name, *sizes, *(f"{least:.6g}" for least in line.resolution_arcsec)])
-    return stream.getvalue()
+        rows.append([line.name, *sizes, *(f"{least:.6g}" for least in line.resolution_arcsec)])
+    return _csv("error x_arcsec y_arcsec z_arcsec x_least y_least z_least", rows)
 
 
 def _availability_csv(report: EcssReport) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["influence", "value", "frames", "correct", "wrong", "invalid", "reasons"])
+    rows = []
     for outcome in report.outcomes:
         invalid = outcome.frames - outcome.correct - outcome.wrong
         reasons = " ".join(f"{reason}:{count}" for reason, count in outcome.reasons.items())
-        writer.writerow(
-            [
-                outcome.influence,
-                outcome.value,
-                outcome.frames,
-                outcome.correct,
-                outcome.wrong,
-                invalid,
-                reasons,
-            ]
-        )
-    return stream.getvalue()
+        counts = (outcome.frames, outcome.correct, outcome.wrong, invalid)
+        rows.append([outcome.influence, outcome.value, *counts, reasons])
+    return _csv("influence value frames correct wrong invalid reasons", rows)
 
 
 def _plot_errors(report: EcssReport, folder: Path) -> Path:

@@ -190,7 +190,7 @@ def run(
     camera: Camera = DEFAULT_CAMERA,
     budget_s: float = 120.0,
     raw: bool = False,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _row: None,
 ) -> dict[str, Any]:
     """Run all solvers on the same scenes.
 
@@ -235,8 +235,7 @@ def run(
         field_of = _Field(seen, limit)
         field_of.add(names, made, skipped, raw=raw)
         for row in members:
-            if progress is not None:
-                progress(row)
+            progress(row)
             tallies += _run_row(row, frames, seed, field_of, budget_s)
     tallies.sort(key=lambda tally: list(rows).index(tally.row))
     return {

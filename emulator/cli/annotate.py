@@ -19,6 +19,8 @@ _SHADOW_BGR: Final = (20, 16, 12)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _SUB_PIXEL_BITS: Final = 4
 _DARK: Final = 0.06
+RADIUS_PX: Final = 8.0
+"""Radius of the circles, pixels."""
 
 
 def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
@@ -49,7 +51,6 @@ def annotate(
     xy_px: npt.NDArray[np.float64],
     labels: Sequence[str],
     *,
-    radius_px: float = 8.0,
     missed_xy_px: npt.NDArray[np.float64] | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Draw circles and names on an image.
@@ -62,8 +63,6 @@ def annotate(
         Centres of the circles, pixels.
     labels : sequence of n str
         Labels of the circles; empty for none.
-    radius_px : float
-        Radius of the circles.
     missed_xy_px : ndarray (m, 2), optional
         Positions to mark in another colour, such as unidentified detections.
 
@@ -77,13 +76,13 @@ def annotate(
     size = max(0.32, min(width, height) / 2600.0)
     taken: list[tuple[int, int, int, int]] = []
     for x, y in xy_px:
-        _circle(canvas, x, y, radius_px, MARK_BGR)
-        taken.append((round(x - radius_px), round(y - radius_px), round(x + radius_px), round(y + radius_px)))
+        _circle(canvas, x, y, RADIUS_PX, MARK_BGR)
+        taken.append((round(x - RADIUS_PX), round(y - RADIUS_PX), round(x + RADIUS_PX), round(y + RADIUS_PX)))
     for (x, y), label in zip(xy_px, labels, strict=True):
         if not label:
             continue
         (text_width, text_height), _ = cv2.getTextSize(label, _FONT, size, 1)
-        positions = _label_positions(x, y, radius_px, text_width, text_height)
+        positions = _label_positions(x, y, RADIUS_PX, text_width, text_height)
         for forced, (left, base) in [*((False, position) for position in positions), (True, positions[0])]:
             box = (left, base - text_height, left + text_width, base + 2)
             inside = box[0] >= 0 and box[1] >= 0 and box[2] < width and box[3] < height
@@ -93,7 +92,7 @@ def annotate(
                 cv2.putText(canvas, label, (left, base), _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
                 break
     for x, y in missed_xy_px if missed_xy_px is not None else ():
-        _circle(canvas, x, y, radius_px, MISS_BGR)
+        _circle(canvas, x, y, RADIUS_PX, MISS_BGR)
     return canvas
 
 

@@ -130,8 +130,7 @@ def centroid(
     seed: Seed = 1,
     bits: Annotated[int, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = 8,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf.")),
+        Path | None, typer.Option("-o", "--output", help=output_help("Plot to write: .png, .svg or .pdf."))
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -160,21 +159,40 @@ _FRAME_COLUMNS: Final[tuple[Column, ...]] = (
 )
 
 
+_BODIES_COLUMNS: Final[tuple[Column, ...]] = (
+    ("in the field", lambda row: row.in_field),
+    *_FRAME_COLUMNS[:2],
+    ("without ms", _figure("without_ms", 2)),
+    ("with ms", _figure("with_ms", 2)),
+    ("ratio", _figure("ratio", 3)),
+)
+
+
 @group.command("frame")
 def frame(
     frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 200,
     seed: Seed = 1,
     rate: Annotated[float, typer.Option(help="Body rate during the exposures, degrees/s.")] = 0.0,
+    bodies: Annotated[
+        bool,
+        typer.Option(
+            "--bodies", help="Compare images with bodies and aberration to the same images without, at rest."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure the processor time to render, detect and identify an image on one core."""
-    from starhil.emulator.benchmarks.frame import measure_frames
+    from starhil.emulator.benchmarks.frame import measure_bodies, measure_frames
 
-    rows = measure_frames(frames, seed, rate, progress=_progress())
+    rows: list[Any]
+    if bodies:
+        rows = measure_bodies(frames, seed, _progress())
+    else:
+        rows = measure_frames(frames, seed, rate, progress=_progress())
     if as_json:
         print(json.dumps({"seed": seed, "rows": _dicts(rows)}))
     else:
-        _print_table(_FRAME_COLUMNS, rows)
+        _print_table(_BODIES_COLUMNS if bodies else _FRAME_COLUMNS, rows)
 
 
 @group.command("bus")
@@ -227,7 +245,7 @@ def bus(
         figures = measure(icd, target, seconds, rate, report, realtime=realtime)
     good = figures.good(p99_limit_ms)
     if as_json:
-        print(json.dumps({**figures.as_dict(), "good": good}))
+        print(json.dumps({**dataclasses.asdict(figures), "good": good}))
     else:
         print_figures(figures, good)
     raise typer.Exit(0 if good else 1)

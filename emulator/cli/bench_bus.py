@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -83,10 +83,6 @@ class BusFigures:
         """Whether nothing was lost or wrong and 99 % of the CAN replies arrived within the limit."""
         can_good = self.can is None or (self.can.good and self.can.latency.p99_ms <= p99_limit_ms)
         return can_good and (self.serial is None or self.serial.good)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain values."""
-        return asdict(self)
 
 
 @contextmanager

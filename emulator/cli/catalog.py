@@ -15,7 +15,6 @@ from starhil.emulator.errors import EmulatorError
 if TYPE_CHECKING:
     from starid.catalog import StarCatalog
 
-_COLUMNS = ("hip", "ra_deg", "dec_deg", "v", "hp", "b_v", "v_i", "absolute_v", "parallax_mas", "pm_mas_yr")
 _TABLE = {
     "hip": ("HIP", 0),
     "ra_deg": ("RA °", 4),
@@ -79,19 +78,16 @@ def _radius(degrees: float) -> float:
 
 def _records(catalog: StarCatalog) -> list[dict[str, Any]]:
     """Return each star's values as a dictionary; unknown ones are None."""
-    motion = (catalog.pm_ra_mas_yr**2 + catalog.pm_dec_mas_yr**2) ** 0.5
-    columns = (
-        *(catalog.hip.tolist(), (catalog.ra_rad * (180.0 / math.pi)).tolist()),
-        *((catalog.dec_rad * (180.0 / math.pi)).tolist(), catalog.v.tolist(), catalog.hp.tolist()),
-        *(catalog.b_v.tolist(), catalog.v_i.tolist(), catalog.absolute_v.tolist()),
-        *(catalog.parallax_mas.tolist(), motion.tolist()),
-    )
+    columns = {
+        "hip": catalog.hip,
+        "ra_deg": catalog.ra_rad * (180.0 / math.pi),
+        "dec_deg": catalog.dec_rad * (180.0 / math.pi),
+        **{name: getattr(catalog, name) for name in ("v", "hp", "b_v", "v_i", "absolute_v", "parallax_mas")},
+        "pm_mas_yr": (catalog.pm_ra_mas_yr**2 + catalog.pm_dec_mas_yr**2) ** 0.5,
+    }
     return [
-        {
-            name: None if isinstance(value, float) and math.isnan(value) else value
-            for name, value in zip(_COLUMNS, values, strict=True)
-        }
-        for values in zip(*columns, strict=True)
+        {key: None if value != value else value for key, value in zip(columns, values, strict=True)}
+        for values in zip(*(column.tolist() for column in columns.values()), strict=True)
     ]
 
 

@@ -106,10 +106,7 @@ def build(
 
 
 @group.command("info")
-def info(
-    file: Annotated[Path, typer.Argument(help="Database file.")],
-    as_json: AsJson = False,
-) -> None:
+def info(file: Annotated[Path, typer.Argument(help="Database file.")], as_json: AsJson = False) -> None:
     """Verify a database file and show the parameters it was built with."""
     import dataclasses
 

@@ -15,6 +15,10 @@ from starhil.protocol.unit_folders import DEFAULT_UNIT
 group = typer.Typer(help="List or export the interface definition.", no_args_is_help=True)
 
 
+_ROW_KEYS = ("id", "kind", "name", "size", "provenance")
+_PARAMETER_KEYS = ("id", "name", "unit", "default")
+
+
 class Format(StrEnum):
     """Formats of an export."""
 
@@ -84,10 +88,7 @@ def _write(path: Path, text: str) -> None:
 
 
 @group.command("list")
-def list_rows(
-    unit: Unit = DEFAULT_UNIT,
-    as_json: AsJson = False,
-) -> None:
+def list_rows(unit: Unit = DEFAULT_UNIT, as_json: AsJson = False) -> None:
     """List telecommands, telemetry and parameters, one per line."""
     import json
 
@@ -95,28 +96,12 @@ def list_rows(
 
     definition = load_unit(unit)
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "name": definition.name,
-                    "version": definition.version,
-                    "rows": [
-                        {
-                            "id": r.id,
-                            "kind": r.kind,
-                            "name": r.name,
-                            "size": r.size,
-                            "provenance": r.provenance,
-                        }
-                        for r in definition.rows
-                    ],
-                    "parameters": [
-                        {"id": p.id, "name": p.name, "unit": p.unit, "default": p.default}
-                        for p in definition.parameters.values()
-                    ],
-                }
-            )
-        )
+        rows = [{key: getattr(row, key) for key in _ROW_KEYS} for row in definition.rows]
+        parameters = [
+            {key: getattr(p, key) for key in _PARAMETER_KEYS} for p in definition.parameters.values()
+        ]
+        head = {"name": definition.name, "version": definition.version}
+        print(json.dumps({**head, "rows": rows, "parameters": parameters}))
         return
     for row in definition.rows:
         print(f"{row.id:4d}  {row.kind:11s}  {row.size:4d} B  {row.provenance:9s}  {row.name}")

@@ -82,12 +82,7 @@ def command(
         raise EmulatorError(f"--fov {fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
     scene = _scene(profile, fov, size, model)
     camera = scene.camera
-    changes = {
-        "exposure_s": exposure,
-        "limiting_magnitude": limit,
-        "bits": bits,
-        "gain": gain,
-    }
+    changes = {"exposure_s": exposure, "limiting_magnitude": limit, "bits": bits, "gain": gain}
     sensor = scene.sensor.with_(**{name: value for name, value in changes.items() if value is not None})
     catalog = load_catalog(scene.catalog_path or None, scene.epoch)
     renderer = Renderer(camera, catalog, sensor, seed, scene.sky.objects)

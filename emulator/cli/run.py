@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import UnitChoice
+from starhil.emulator.cli.options import DIALECTS, UnitChoice, one_of
 from starhil.emulator.cli.output import output_help, prepare_output
-
-if TYPE_CHECKING:
-    from starhil.emulator.profile import LinksConfig
 
 
 def command(
@@ -133,14 +130,13 @@ def command(
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.launch import Run, RunOptions, path_of_head, with_own_seeds
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
-    from starhil.protocol.serial_framing import Dialect
 
     levels = ("debug", "info", "warning", "error")
     if log not in levels:
         raise EmulatorError(f"--log {log}: must be one of {', '.join(levels)}")
     logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
-    if dialect is not None and dialect not in list(Dialect):
-        raise EmulatorError(f"--dialect {dialect}: must be a, b or c")
+    if dialect is not None:
+        one_of("--dialect", dialect, DIALECTS)
     if head and profile is not None:
         raise EmulatorError(
             f"{profile}: a profile and --head exclude each other; give it as --head {profile}"
@@ -168,11 +164,9 @@ def command(
         ]
         profiles.append(load_profile(name, overrides))
     profiles = with_own_seeds(profiles)
-    if (
-        (control, view) == ("off", "off")
-        and not (truth_log or record)
-        and not any(_is_reachable(each.links) for each in profiles)
-    ):
+    links = [each.links for each in profiles]
+    reachable = any((on.serial.port, on.can.channel, on.canopen.node) != ("off", "off", 0) for on in links)
+    if (control, view) == ("off", "off") and not (truth_log or record or reachable):
         raise EmulatorError(
             "no link: the device cannot be reached and nothing is recorded; "
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
@@ -244,11 +238,6 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
 def _folder_of_head(folder: Path, number: int) -> Path:
     """Return the state folder of a head; the second head's is `head-2` in the first head's."""
     return folder if number == 1 else folder / f"head-{number}"
-
-
-def _is_reachable(links: LinksConfig) -> bool:
-    """Whether a device has any link."""
-    return (links.serial.port, links.can.channel) != ("off", "off") or bool(links.canopen.node)
 
 
 def _as_toml(value: str | int) -> str:

@@ -18,6 +18,9 @@ group = typer.Typer(
     no_args_is_help=True,
 )
 
+_ROW_KEYS = ("kind", "klass", "id", "name", "size", "action", "provenance")
+_FIELD_KEYS = ("name", "offset", "type", "unit", "value", "argument", "parameter", "const")
+
 UnitArgument = Annotated[
     str,
     typer.Argument(metavar="UNIT", help="Name of a bundled unit, or a folder of TOML files."),
@@ -171,25 +174,6 @@ def _summary(icd: Any) -> dict[str, Any]:
 
 
 def _row(row: Any) -> dict[str, Any]:
-    return {
-        "kind": row.kind,
-        "class": row.klass,
-        "id": row.id,
-        "name": row.name,
-        "size": row.size,
-        "action": row.action,
-        "provenance": row.provenance,
-        "fields": [
-            {
-                "name": field.name,
-                "offset": field.offset,
-                "type": field.type,
-                "unit": field.unit,
-                "value": field.value,
-                "argument": field.argument,
-                "parameter": field.parameter,
-                "const": field.const,
-            }
-            for field in row.named_fields.values()
-        ],
-    }
+    named = {"class" if key == "klass" else key: getattr(row, key) for key in _ROW_KEYS}
+    fields = [{key: getattr(field, key) for key in _FIELD_KEYS} for field in row.named_fields.values()]
+    return {**named, "fields": fields}

@@ -1,9 +1,9 @@
 """The actions of the device: a function for each name that `configs/units/model.toml` declares.
 
 An action gets its arguments by name, range-checked and in the declared units. It returns the messages that follow
-the answer (mostly none), or None if it continues in the background and ends the acknowledge itself. It raises
-`Refused` to answer with an error; `argument` in it names the argument at fault. A telecommand that continues is
-answered at once, unless its action is in `ANSWERED_WHEN_DONE`.
+the answer, if there are any. It raises `Refused` to answer with an error; `argument` in it names the argument at fault.
+An action that continues in the background says so in the acknowledge, and ends it itself; its telecommand is answered
+at once, unless the action is in `ANSWERED_WHEN_DONE`.
 """
 
 from __future__ import annotations
@@ -33,28 +33,25 @@ SRAM_STORED: Final = 0
 """Bank of the image that save_image stored; the other bank holds the last exposure."""
 
 
-def nothing(_device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def nothing(_device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Accept the telecommand and do nothing."""
-    return []
 
 
-def reset(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def reset(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Restart once the answer is sent."""
     device.scheduler.at(device.clock.now_ns(), lambda _due_ns: device.reset("command"))
-    return []
 
 
-def set_clock(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def set_clock(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Set the clock to the sum of the arguments, since the unit's epoch."""
     reported_ns = round(float(arguments.get("unix") or 0.0) * NANOSECONDS)
     for name, nanoseconds in (("seconds", NANOSECONDS), ("milliseconds", 1_000_000), ("microseconds", 1_000)):
         reported_ns += round((arguments.get(name) or 0) * nanoseconds)
     reported_ns += round(arguments.get("nanoseconds") or 0)
     device.time.set_unix_ns(device.icd.conventions.unix_ns(reported_ns, device.time.unix_ns()))
-    return []
 
 
-def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Set the parameters that the row's fields name, all or none."""
     changes: Mapping[str, Value] = arguments[PARAMETERS]
     try:
@@ -62,10 +59,9 @@ def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowled
     except MessageError as error:
         culprit = str(error).partition(":")[0]
         raise Refused(ErrorCode.INVALID_PARAMETER, argument=culprit) from None
-    return []
 
 
-def open_image(device: Device, arguments: Arguments, acknowledge: Acknowledge) -> list[Reply] | None:
+def open_image(device: Device, arguments: Arguments, acknowledge: Acknowledge) -> None:
     """Open an image for download in numbered chunks."""
     images = device.images
     if images.busy:
@@ -76,16 +72,16 @@ def open_image(device: Device, arguments: Arguments, acknowledge: Acknowledge) -
             raise Refused(ErrorCode.SEQUENCE)
         if not images.open_stored(edge):
             raise Refused(ErrorCode.INVALID_PARAMETER, argument="image_size")
-        return []
+        return
 
     def opened(found: bool) -> None:
         acknowledge.end(ErrorCode.OK if found else ErrorCode.SEQUENCE)
 
+    acknowledge.continues = True
     images.open_last(edge, opened)
-    return None
 
 
-def load_image_chunk(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def load_image_chunk(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Load a chunk of the open image."""
     images = device.images
     if images.busy and images.download is None:
@@ -95,10 +91,9 @@ def load_image_chunk(device: Device, arguments: Arguments, _acknowledge: Acknowl
     if int(arguments["number"]) >= images.frames:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="number")
     images.frame = int(arguments["number"])
-    return []
 
 
-def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Capture an image and store it."""
     if arguments["camera"] != "star":
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="camera")
@@ -107,17 +102,15 @@ def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) 
     if device.images.busy:
         raise Refused(ErrorCode.BUSY)
     device.images.save(edge_of(str(arguments["image_size"])))
-    return []
 
 
-def set_mode(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def set_mode(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Command a mode."""
     if not device.command_mode(Mode(str(arguments["mode"]))):
         raise Refused(ErrorCode.SEQUENCE)
-    return []
 
 
-def set_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def set_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Set one parameter and select it."""
     chosen = device.icd.parameters_by_id.get(int(arguments["parameter"]))
     if chosen is None:
@@ -127,16 +120,14 @@ def set_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledg
     except MessageError:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="value") from None
     device.selected_parameter = chosen.id
-    return []
 
 
-def select_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def select_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Select the parameter that telemetry reports."""
     chosen = int(arguments["parameter"])
     if chosen not in device.icd.parameters_by_id:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="parameter")
     device.selected_parameter = chosen
-    return []
 
 
 def save_parameters(device: Device, _arguments: Arguments, acknowledge: Acknowledge) -> None:
@@ -145,28 +136,26 @@ def save_parameters(device: Device, _arguments: Arguments, acknowledge: Acknowle
     def done(error: EmulatorError | None) -> None:
         acknowledge.end(ErrorCode.OK if error is None else ErrorCode.INTERNAL)
 
+    acknowledge.continues = True
     device.save_parameters(done)
 
 
-def restore_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def restore_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Load the stored parameters."""
     device.restore_parameters()
-    return []
 
 
-def default_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def default_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Set all parameters to their defaults."""
     device.parameters.set_defaults()
-    return []
 
 
-def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Clear the counters and flags of the links."""
     device.counters.clear()
-    return []
 
 
-def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Send a list of telemetry rows unsolicited, instead of the previous list."""
     rate_hz = float(arguments["rate"])
     wanted = []
@@ -178,24 +167,21 @@ def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -
             raise Refused(ErrorCode.INVALID_PARAMETER, argument=name)
         wanted.append(Subscription(row, rate_hz or None))
     device.subscriptions.replace("request", wanted)
-    return []
 
 
-def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Select one telemetry row and its rate by the parameters for them."""
     row_id = int(arguments["telemetry"])
     if device.icd.telemetry_row(row_id) is None:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="telemetry")
     device.parameters.set({"unsolicited_selection": row_id, "unsolicited_rate": arguments["rate"]})
-    return []
 
 
-def load_file_block(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def load_file_block(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Load a block of a file."""
     offset, length = int(arguments["offset"]), int(arguments["length"])
     if not device.files.load(str(arguments["file_type"]), int(arguments["file_counter"]), offset, length):
         raise Refused(ErrorCode.INVALID_PARAMETER)
-    return []
 
 
 def start_burst(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
@@ -205,10 +191,9 @@ def start_burst(device: Device, arguments: Arguments, _acknowledge: Acknowledge)
     return device.files.burst(ignore_hole_map=bool(arguments["ignore_hole_map"]))
 
 
-def set_hole_map(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def set_hole_map(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Report which packets have arrived."""
     device.files.arrived.set_part(int(arguments["section"]), bytes(arguments["map"]))
-    return []
 
 
 ACTIONS: Final[dict[str, Action]] = {

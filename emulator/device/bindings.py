@@ -127,8 +127,8 @@ class TelecommandBinding:
                 self._parameters.append((field.name, field.parameter))
                 self._index[field.parameter] = index
 
-    def execute(self, device: Device, data: bytes, acknowledge: Acknowledge) -> list[Reply] | None:
-        """Decode and perform the telecommand, as the functions in `actions` do.
+    def execute(self, device: Device, data: bytes, acknowledge: Acknowledge) -> list[Reply]:
+        """Decode and perform the telecommand; return the messages that follow the answer.
 
         Raises Refused or MessageError with the index of the field at fault.
         """
@@ -145,7 +145,7 @@ class TelecommandBinding:
             raise
         if self._reported:
             device.accepted[self.row.name] = values
-        return replies
+        return replies or []
 
 
 def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any], Any]:

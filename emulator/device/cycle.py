@@ -14,7 +14,8 @@ import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,8 @@ from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starid.attitude import Attitude, propagate
 
 log = logging.getLogger("starhil.device")
+
+Argument = TypeVar("Argument")
 
 MAX_PENDING: Final = 2
 """Pending requests at which the next exposure is skipped; more if more fit into the modelled time."""
@@ -216,6 +219,16 @@ class FrameCycle:
         self._generation += 1
         self._in_flight.clear()
 
+    def _until_stopped(self, act: Callable[[Argument], None]) -> Callable[[Argument], None]:
+        """Return an action that does nothing once the cycle has been stopped."""
+        generation = self._generation
+
+        def act_unless_stopped(argument: Argument) -> None:
+            if generation == self._generation:
+                act(argument)
+
+        return act_unless_stopped
+
     def reset(self) -> None:
         """Stop and discard all attitudes, as the device restarts."""
         self.stop()
@@ -266,14 +279,9 @@ class FrameCycle:
         exposure_s = self._exposure_s()
         start_ns = due_ns + int(self._parameters["delay_time"]) * 1_000_000
         end_ns = start_ns + round(exposure_s * NANOSECONDS)
-        mode, generation = self.mode(), self._generation
         mid_ns = start_ns + round(exposure_s * NANOSECONDS / 2)
-
-        def close(close_ns: int) -> None:
-            if generation == self._generation:
-                self._end_exposure(close_ns, start_ns, mid_ns, mode, exposure_s, period_ns / NANOSECONDS)
-
-        self._scheduler.at(end_ns, close)
+        begun = (start_ns, mid_ns, self.mode(), exposure_s, period_ns / NANOSECONDS)
+        self._scheduler.at(end_ns, self._until_stopped(lambda close_ns: self._end_exposure(close_ns, *begun)))
 
     def _end_exposure(
         self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
@@ -285,18 +293,8 @@ class FrameCycle:
         request = self.request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         self._in_flight.append(frame)
         ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
-        generation = self._generation
-
-        def arrived(answer: PipelineReply) -> None:
-            if generation == self._generation:
-                self._result_arrived(frame, answer)
-
-        def ready(due_ns: int) -> None:
-            if generation == self._generation:
-                self._schedule_publication(frame, due_ns)
-
-        self._imager.submit(request, arrived)
-        self._scheduler.at(ready_ns, ready)
+        self._imager.submit(request, self._until_stopped(partial(self._result_arrived, frame)))
+        self._scheduler.at(ready_ns, self._until_stopped(partial(self._schedule_publication, frame)))
         if self.after_exposure is not None:
             then, self.after_exposure = self.after_exposure, None
             then()
@@ -403,13 +401,7 @@ class FrameCycle:
         known_ns = due_ns + round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
         now_ns = self._now_ns()
         if known_ns > now_ns:
-            generation = self._generation
-
-            def finish(finish_ns: int) -> None:
-                if generation == self._generation:
-                    self._publish_in_order(frame, finish_ns)
-
-            self._scheduler.at(known_ns, finish)
+            self._scheduler.at(known_ns, self._until_stopped(partial(self._publish_in_order, frame)))
             return
         if frame.waiting_since_ns is not None:
             frame.late = True

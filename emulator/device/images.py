@@ -49,24 +49,9 @@ class StoredImage:
         """Return the image as a grey BMP file."""
         offset = BMP_HEAD.size + len(PALETTE)
         size = offset + len(self.pixels)
-        head = BMP_HEAD.pack(
-            b"BM",
-            size,
-            0,
-            0,
-            offset,
-            40,
-            self.edge,
-            -self.edge,
-            1,
-            8,
-            0,
-            len(self.pixels),
-            2835,
-            2835,
-            256,
-            0,
-        )
+        planes, bits, compression, per_metre, colours = 1, 8, 0, 2835, 256
+        layout = (planes, bits, compression, len(self.pixels), per_metre, per_metre, colours, 0)
+        head = BMP_HEAD.pack(b"BM", size, 0, 0, offset, 40, self.edge, -self.edge, *layout)
         return head + PALETTE + self.pixels
 
 

@@ -9,6 +9,7 @@ from typing import Final
 
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.codec import STRUCT_CODES
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import FieldError, MessageError, Parameter, Value
 
@@ -17,19 +18,6 @@ ParameterValue = bool | int | float | str
 ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
 """Pairs whose first parameter must not exceed the second."""
 
-_WIRE_FORMATS: Final = {
-    "bool": "<B",
-    "enum8": "<B",
-    "u8": "<B",
-    "i8": "<b",
-    "u16": "<H",
-    "i16": "<h",
-    "u32": "<I",
-    "i32": "<i",
-    "f32": "<f",
-    "f64": "<d",
-}
-"""Type of a parameter → its format in memory."""
 ORBIT_SIZE: Final = ("orbit_semi_major_axis", "orbit_eccentricity")
 """Parameters that determine the perigee."""
 
@@ -45,9 +33,14 @@ def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
     return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
 
 
+def memory_format(definition: Parameter) -> str:
+    """Return the format of a parameter in memory, for `struct`."""
+    return "<" + STRUCT_CODES["u8" if definition.type in ("bool", "enum8") else definition.type]
+
+
 def memory_bits(definition: Parameter) -> int:
     """Return the number of bits of a parameter in memory."""
-    return 8 * struct.calcsize(_WIRE_FORMATS[definition.type])
+    return 8 * struct.calcsize(memory_format(definition))
 
 
 def flipped_number(value: float, wire_format: str, bit: int) -> float:
@@ -149,7 +142,7 @@ class Parameters(Mapping[str, ParameterValue]):
         A setting that is not valid is replaced by the default, as the device finds it when it checks its parameters.
         """
         definition = self._definitions[name]
-        flipped = flipped_number(self.number(name), _WIRE_FORMATS[definition.type], bit)
+        flipped = flipped_number(self.number(name), memory_format(definition), bit)
         try:
             self.set({name: flipped})
         except MessageError:

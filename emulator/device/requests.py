@@ -202,7 +202,7 @@ class Requests:
             log_internal_error(f"telecommand {request.id}", error)
             acknowledge.end(ErrorCode.INTERNAL)
             return ErrorCode.INTERNAL, []
-        if replies is not None:
+        if not acknowledge.continues:
             acknowledge.end()
             return ErrorCode.OK, replies
         if not binding.answered_when_done:

@@ -7,7 +7,6 @@ writer is killed. A corrupt file is set aside under another name, and the device
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import hashlib
 import json
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.durable_file import replace_durably
 from starhil.protocol.user_file import UnsuitableFileError, read_user_file
 
 FORMAT: Final = 1
@@ -102,27 +102,15 @@ class FileStore:
             ) from None
         if content is None:
             self.corrupt = True
-            os.replace(self.path, self.path.with_name(STATE_FILE + ".corrupt"))  # noqa: PTH105 (pairs with save)
+            self.path.replace(self.path.with_name(STATE_FILE + ".corrupt"))
             return {}
         return content
 
     def save(self, content: dict[str, Any]) -> None:
         """Save the whole content, or none of it."""
-        temporary = self.path.with_name(STATE_FILE + ".new")
         try:
-            with temporary.open("wb") as file:
-                file.write(_encode(content))
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, self.path)  # noqa: PTH105 (the atomic step, named as the system call)
-            folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            replace_durably(self.path, _encode(content))
         except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
             raise EmulatorError(
                 f"state file {self.path}: cannot be written ({error.strerror}); the previous state is kept"
             ) from None

@@ -6,7 +6,6 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
@@ -16,33 +15,16 @@ from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, Request
+from starhil.protocol.receiver import Receiver
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
-Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
 Style = TypeVar("Style")
 
 log = logging.getLogger("starhil.link")
 
 FLUSH_S: Final = 0.51
 """Delay after which an incomplete message is dropped, seconds: just above the receivers' timeout of 0.5 s."""
-
-
-class Receiver(Protocol[Arriving_contra]):
-    """The receiving side of a framing."""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a message is incomplete."""
-        ...
-
-    def feed(self, item: Arriving_contra, now: float, /) -> Sequence[Request | LinkFault]:
-        """Decode received input; return the requests and faults that it completes."""
-        ...
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Drop an incomplete message that has timed out; return the faults."""
-        ...
 
 
 class Link(Protocol):
@@ -99,7 +81,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         device.on_reset.append(self._reset_receiver)
 
     @abstractmethod
-    def _new_receiver(self) -> Receiver[Item]:
+    def _new_receiver(self) -> Receiver[Item, Request]:
         """Return a new receiver for the framing."""
 
     @abstractmethod

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
-from starhil.emulator.links.base import DeviceLink, Receiver
-from starhil.protocol.messages import Reply
+from starhil.emulator.links.base import DeviceLink
+from starhil.protocol.messages import Reply, Request
+from starhil.protocol.receiver import Receiver
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
 from starhil.protocol.transports.paced import SerialTransport
@@ -61,7 +62,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
             self._baud = self._wanted_baud()
             self._port.set_baud(self._baud)
 
-    def _new_receiver(self) -> Receiver[bytes]:
+    def _new_receiver(self) -> Receiver[bytes, Request]:
         return self._stack.device()
 
     @property

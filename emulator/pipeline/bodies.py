@@ -6,15 +6,12 @@ import math
 from dataclasses import replace
 from typing import Final
 
-import numpy as np
-
 from starhil.emulator.pipeline.messages import FrameResult
-from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.directions import disc_in_field, icrs_vector
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 
-_BORDER_SAMPLES: Final = 33
 _WITHOUT_STARS: Final = frozenset({"too_few_stars", "no_match", "prediction_lost", "detection_failed"})
 
 
@@ -30,19 +27,10 @@ def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tupl
     if sky.earth is not None:
         bodies += (("earth", sky.earth.ra_deg, sky.earth.dec_deg, sky.earth.radius_deg),)
     return tuple(
-        name for name, ra, dec, radius in bodies if _reaches(icrs_vector(ra, dec), radius, attitude, camera)
+        name
+        for name, ra, dec, radius in bodies
+        if disc_in_field(attitude.to_sensor(icrs_vector(ra, dec)), math.radians(radius), camera)
     )
-
-
-def _reaches(centre: np.ndarray, radius_deg: float, attitude: Attitude, camera: Camera) -> bool:
-    """Return whether a disc around an ICRS direction reaches the field."""
-    direction = attitude.to_sensor(centre)
-    _, inside = camera.project(direction[None, :])
-    if inside[0]:
-        return True
-    edge = camera.back_project(camera.border(_BORDER_SAMPLES))
-    nearest = float(np.nanmax(edge @ direction, initial=-1.0))
-    return nearest >= math.cos(math.radians(min(radius_deg, 180.0)))
 
 
 def with_bodies(result: FrameResult, in_field: tuple[str, ...]) -> FrameResult:

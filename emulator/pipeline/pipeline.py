@@ -162,7 +162,8 @@ class Pipeline:
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
             self._process_frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
         if self._sky.by_date:
-            self._renderer.render(Attitude.identity(), objects=_WARM_UP_BODIES)
+            for earth in (_WARM_UP_BODIES.earth, EarthLimb(180.0, 80.0, radius_deg=5.0)):
+                self._renderer.render(Attitude.identity(), objects=replace(_WARM_UP_BODIES, earth=earth))
         self._last = None
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:

@@ -19,10 +19,8 @@ from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
-from starhil.emulator.sky.light import AreaLight, AreaPainter, add_area
-from starhil.emulator.sky.light_grid import add_glare
+from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.objects import PointSource, SkyObjects
-from starhil.emulator.sky.wide_earth import add_earth
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, companions
@@ -35,6 +33,12 @@ _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
 _FLOOD_WELLS: Final = 10.0
 """Full wells of electrons in every pixel when light passes the baffle."""
+
+_BRIGHTER: Final = 4.0
+"""Electrons, over those that saturate a pixel, above which light need not be exact: also for pixels of low sensitivity."""
+
+_GLARE_SHARE: Final = 0.05
+"""Glare below which none is drawn, as a share of the read noise."""
 
 _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
@@ -292,7 +296,9 @@ class Renderer:
     ) -> npt.NDArray[np.float64]:
         """Add point sources at fixed directions; return their positions (n, 2)."""
         xy = np.full((len(planets), 2), np.nan)
-        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets]).reshape(-1, 3)
+        if not planets:
+            return xy
+        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
         near = self._near(vectors, attitude, rate, exposure_s)
         if not near.size:
             return xy
@@ -349,19 +355,17 @@ class Renderer:
             self._still += self._pattern.dark_e_s if factor == 1.0 else self._pattern.dark_e_s * factor
             self._still *= np.float32(exposure_s)
             self._still_conditions = (exposure_s, temperature_c)
-        sensitivity = self._pattern.sensitivity
-        if area is not None and area.flooded:
-            self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
-        elif area is not None and area.glare is not None:
-            add_glare(self._work, self._still, sensitivity, area.glare, exposure_s)
-        else:
+        if area is None:
             np.copyto(self._work, self._still)
-        if area is not None and area.earth is not None:
-            add_earth(self._work, self._still, sensitivity, area.earth, float(self._sky_e_s), exposure_s)
-        if area is not None and area.electrons_s is not None and area.transmission is not None:
-            add_area(
-                self._work, area.electrons_s, area.transmission, sensitivity, float(self._sky_e_s), exposure_s
+        elif area.flooded:
+            self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
+        else:
+            limits = (
+                _GLARE_SHARE * self.sensor.read_noise_e,
+                _BRIGHTER * self.sensor.saturation_dn * self.sensor.gain_e_per_dn,
             )
+            sky_e_s = float(self._sky_e_s)
+            area.draw(self._work, self._still, self._pattern.sensitivity, sky_e_s, exposure_s, *limits)
         return self._work
 
     def _paths(

@@ -2,7 +2,9 @@
 
 All directions are apparent: with light time, the observer's parallax and aberration. The Sun's place is good
 to 0.1″, the Moon's to 20″ (`erfa.moon98`), the planets' to 1.5′ (`erfa.plan94`). Magnitudes of the planets
-follow Mallama & Hilton 2018, Saturn's with its rings.
+follow Mallama & Hilton 2018, Saturn's with its rings. The series are evaluated once a slot of time and its motion is
+interpolated: Earth, Sun and Moon on cubics through places and velocities at both ends (1 m and 20 µm/s), the planets on
+straight lines (0.01″ for Mercury).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import EarthLimb, Moon, PointSource, SunGlare
 from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
-from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, earth_and_sun, in_metres, terrestrial_time
+from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
 Vector = NDArray[np.float64]
 
@@ -50,8 +52,8 @@ _SATURN_POLE: Final = (0.08547, 0.07323, 0.99365)
 
 _LIGHT_TIME_ROUNDS: Final = 2
 
-PLANETS_KEPT_S: Final = 600.0
-"""Time for which the planets move on straight lines, seconds: 0.01″ for Mercury."""
+SLOT_S: Final = 600.0
+"""Length of a slot of time; leap seconds fall between two."""
 
 
 @dataclass(frozen=True)
@@ -71,35 +73,45 @@ class Observer:
     relative_velocity_m_s: Vector | None = None
 
     @cached_property
-    def _earth_and_sun(self) -> tuple[Vector, Vector, Vector]:
-        return earth_and_sun(self.unix_s)
+    def _motion(self) -> Vector:
+        """Barycentric places (3, 3) of Earth, Sun and Moon, m, and then their velocities (3, 3), m/s, ICRS."""
+        slot, since_s = divmod(self.unix_s, SLOT_S)
+        u = since_s / SLOT_S
+        powers = np.array([[1.0, u, u**2, u**3], [0.0, 1.0 / SLOT_S, 2.0 * u / SLOT_S, 3.0 * u**2 / SLOT_S]])
+        motion: Vector = (powers @ _cubics_of(int(slot))).reshape(2, 3, 3)
+        return motion
 
-    @property
-    def earth(self) -> tuple[Vector, Vector]:
-        """Barycentric position, m, and velocity, m/s, of the Earth's centre, ICRS."""
-        return self._earth_and_sun[:2]
-
-    @property
+    @cached_property
     def sun(self) -> Vector:
         """Barycentric position (3,) of the Sun, m, ICRS."""
-        return self._earth_and_sun[2]
+        sun: Vector = self._motion[0, 1]
+        return sun
+
+    @cached_property
+    def moon(self) -> Vector:
+        """Barycentric position (3,) of the Moon when the light left it that arrives now, m, ICRS."""
+        moon, velocity = self._motion[:, 2]
+        seen: Vector = moon - math.dist(moon, self.position_m) / SPEED_OF_LIGHT_M_S * velocity
+        return seen
 
     @cached_property
     def position_m(self) -> Vector:
         """Barycentric position (3,), ICRS."""
-        position = self.earth[0]
+        position: Vector = self._motion[0, 0]
         return position if self.offset_m is None else position + self.offset_m
 
     @cached_property
     def velocity_m_s(self) -> Vector:
         """Barycentric velocity (3,), ICRS."""
-        velocity = self.earth[1]
+        velocity: Vector = self._motion[1, 0]
         return velocity if self.relative_velocity_m_s is None else velocity + self.relative_velocity_m_s
 
     @cached_property
-    def sun_direction(self) -> Vector:
-        """Apparent direction (3,) of the Sun."""
-        return self.towards(self.sun)
+    def directions(self) -> Vector:
+        """Apparent directions (9, 3) of Sun, Moon and the planets."""
+        slot, since_s = divmod(self.unix_s, SLOT_S)
+        places, velocities, _ = _planets_of(int(slot))
+        return self.towards(np.vstack([self.sun, self.moon, places + since_s * velocities]))
 
     def towards(self, place_m: Vector) -> Vector:
         """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
@@ -107,16 +119,14 @@ class Observer:
         return aberrated(gap / np.linalg.norm(gap, axis=-1, keepdims=True), self.velocity_m_s)
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
-        """Return the directions (n, 3) of stars with parallax and aberration."""
+        """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
         shift = parallax_rad[:, None] * (self.position_m / ASTRONOMICAL_UNIT_M)
-        places = vectors - shift
-        places /= np.linalg.norm(places, axis=1, keepdims=True)
-        return aberrated(places, self.velocity_m_s)
+        return aberrated(vectors - shift, self.velocity_m_s)
 
 
 def sun_seen_by(observer: Observer, style: SunGlare) -> SunGlare:
     """Return the Sun in its place, with the other fields of `style`."""
-    return dataclasses.replace(style, **_place(observer.sun_direction))
+    return dataclasses.replace(style, **_place(observer.directions[0]))
 
 
 def moon_seen_by(observer: Observer, style: Moon) -> Moon:
@@ -124,26 +134,19 @@ def moon_seen_by(observer: Observer, style: Moon) -> Moon:
 
     Its magnitude follows Allen (1976): −12.73 + 0.026 i + 4·10⁻⁹ i⁴ for the phase angle i in degrees.
     """
-    import erfa
-
-    offset, velocity = in_metres(erfa.moon98(*terrestrial_time(observer.unix_s)))
-    earth, earth_velocity = observer.earth
-    place = earth + offset
-    delay_s = _length(place - observer.position_m) / SPEED_OF_LIGHT_M_S
-    place = place - delay_s * (earth_velocity + velocity)
-    to_observer, to_sun = observer.position_m - place, observer.sun - place
+    to_observer, to_sun = observer.position_m - observer.moon, observer.sun - observer.moon
     distance, sun_distance = _length(to_observer), _length(to_sun)
     phase = _angle(to_observer / distance, to_sun / sun_distance)
     degrees = math.degrees(phase)
     light = 5.0 * math.log10(distance / MOON_DISTANCE_M * sun_distance / ASTRONOMICAL_UNIT_M)
-    direction = observer.towards(place)
+    sun, moon = observer.directions[:2]
     return dataclasses.replace(
         style,
-        **_place(direction),
+        **_place(moon),
         diameter_deg=2.0 * math.degrees(math.asin(min(MOON_RADIUS_M / distance, 1.0))),
         magnitude=-12.73 + 0.026 * degrees + 4e-9 * degrees**4 + light,
         illuminated=0.5 * (1.0 + math.cos(phase)),
-        bright_limb_deg=_position_angle(direction, observer.sun_direction),
+        bright_limb_deg=_position_angle(moon, sun),
     )
 
 
@@ -158,7 +161,7 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
     if observer.relative_velocity_m_s is not None:
         nadir = aberrated(nadir, observer.relative_velocity_m_s)
     to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
-    sun = _place(observer.sun_direction)
+    sun = _place(observer.directions[0])
     return dataclasses.replace(
         style,
         **_place(nadir),
@@ -171,13 +174,35 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
 
 def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
     """Return the planets from Mercury to Neptune in their places, with their magnitudes."""
-    slot = math.floor(observer.unix_s / PLANETS_KEPT_S)
-    places, velocities, magnitudes = _planets_of(slot)
-    now = observer.towards(places + (observer.unix_s - slot * PLANETS_KEPT_S) * velocities)
+    magnitudes = _planets_of(int(observer.unix_s // SLOT_S))[2]
     return tuple(
         PointSource(**_place(direction), magnitude=magnitude, name=name)
-        for (name, _, _), magnitude, direction in zip(_PLANETS, magnitudes, now, strict=True)
+        for (name, _, _), magnitude, direction in zip(
+            _PLANETS, magnitudes, observer.directions[2:], strict=True
+        )
     )
+
+
+@lru_cache(maxsize=2)
+def _cubics_of(slot: int) -> Vector:
+    """Coefficients (4, 9), m, of the barycentric places of Earth, Sun and Moon by the share of a slot that is over."""
+    first, rest = terrestrial_time(slot * SLOT_S)
+    (start, slope), (end, last_slope) = (_series(first, rest + k * SLOT_S / DAY_S) for k in (0, 1))
+    rise = end - start
+    return np.stack([start, slope, 3.0 * rise - 2.0 * slope - last_slope, slope + last_slope - 2.0 * rise])
+
+
+def _series(first: float, rest: float) -> tuple[Vector, Vector]:
+    """Barycentric places (9,) of Earth, Sun and Moon at a terrestrial time, m, and their motion in a slot's length."""
+    import erfa
+
+    heliocentric, barycentric = (in_metres(pv) for pv in erfa.epv00(first, rest))
+    moon = in_metres(erfa.moon98(first, rest))
+    place, velocity = (
+        np.concatenate([earth, earth - about_sun, earth + about_earth])
+        for earth, about_sun, about_earth in zip(barycentric, heliocentric, moon, strict=True)
+    )
+    return place, SLOT_S * velocity
 
 
 @lru_cache(maxsize=2)
@@ -188,7 +213,7 @@ def _planets_of(slot: int) -> tuple[Vector, Vector, tuple[float, ...]]:
     """
     import erfa
 
-    observer = Observer(slot * PLANETS_KEPT_S)
+    observer = Observer(slot * SLOT_S)
     numbers = np.array([number for _, number, _ in _PLANETS])
     first, rest = terrestrial_time(observer.unix_s)
     delay_s = np.zeros(len(numbers))
@@ -222,7 +247,7 @@ def visible_share_of_sun(observer: Observer, earth: EarthLimb | None) -> float:
     if earth is None:
         return 1.0
     radius = math.asin(SUN_RADIUS_M / _length(observer.sun - observer.position_m))
-    above = _angle(observer.sun_direction, icrs_vector(earth.ra_deg, earth.dec_deg))
+    above = _angle(observer.directions[0], icrs_vector(earth.ra_deg, earth.dec_deg))
     height = (above - math.radians(earth.radius_deg)) / radius
     if abs(height) >= 1.0:
         return 1.0 if height > 0.0 else 0.0

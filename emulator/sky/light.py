@@ -10,8 +10,8 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.directions import icrs_vector
-from starhil.emulator.sky.light_grid import GLARE_STEP, Image
+from starhil.emulator.sky.directions import disc_in_field, icrs_vector
+from starhil.emulator.sky.light_grid import GLARE_STEP, Image, fill, interpolated
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
 from starid.attitude import Attitude
@@ -21,13 +21,19 @@ from starid.jit import compiled_ieee
 Glare: TypeAlias = tuple[npt.NDArray[np.float32], float, float, bool]
 """Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""
 
+Box: TypeAlias = tuple[slice, slice]
+"""Rows and columns of part of an image."""
+
 _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
 _SUN_SOFT_DEG: Final = 3.0
 
-_SMOOTH_PX: Final = 7.0 * GLARE_STEP
-"""Distance to a source, or softness of its glare, from which its light is smooth, pixels."""
+_SMOOTH_PX: Final = 13.0 * GLARE_STEP
+"""Distance to a source, or softness of its glare, from which its light is smooth, pixels: interpolated within 0.5 %."""
+
+_EDGE_PX: Final = 8.0
+"""Pixels around the Moon's disc into which its edge is blurred."""
 
 _SPOT_SIGMAS: Final = 2.0
 """Width of a spot in units of its standard deviation."""
@@ -37,66 +43,123 @@ _WIDE_EARTH_DEG: Final = 20.0
 
 
 @dataclass(frozen=True)
+class Patch:
+    """Light and shadow in part of an image.
+
+    Attributes
+    ----------
+    box : (slice, slice)
+        Its rows and columns.
+    light : ndarray (h', w'), float32
+        Electrons/s in a pixel of mean sensitivity.
+    passed : ndarray (h', w'), float32
+        Fraction of the light from behind that is visible, 0…1.
+    hides_glare : bool
+        Whether it is in front of the light scattered in the lens too.
+    """
+
+    box: Box
+    light: Image
+    passed: Image
+    hides_glare: bool = True
+
+    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
+        rows, columns = self.box
+        column, row = np.rint(xy_px).astype(np.int64).T - np.array([[columns.start], [rows.start]])
+        inside = (column >= 0) & (column < self.passed.shape[1]) & (row >= 0) & (row < self.passed.shape[0])
+        seen = np.ones(len(xy_px))
+        seen[inside] = self.passed[row[inside], column[inside]]
+        return seen
+
+    def cover(self, mean: Image, still: Image, sensitivity: Image, sky_e_s: float, exposure_s: float) -> None:
+        """Put it in front of the mean electrons (h, w), in place; `still` is of sky and dark current alone."""
+        sensed = sensitivity[self.box] * np.float32(exposure_s)
+        behind, sky = mean[self.box], sensed * np.float32(sky_e_s)
+        if self.hides_glare:
+            dark = still[self.box] - sky
+            seen = dark + (behind - dark) * self.passed
+        else:
+            seen = behind - sky * (1.0 - self.passed)
+        np.maximum(seen + sensed * self.light, 0.0, out=mean[self.box])
+
+
+@dataclass(frozen=True)
 class AreaLight:
     """Light of extended objects, and the fraction of the sky's light that passes them.
 
     Attributes
     ----------
+    size : (int, int)
+        Width and height of the image, pixels.
     glare : ndarray (gh, gw), float32, or None
         Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row.
-    electrons_s : ndarray (h, w), float32, or None
-        Other light in every pixel, electrons/s.
-    transmission : ndarray (h, w), float32, or None
-        Fraction of the light from behind that is visible, 0…1; None together with `electrons_s`.
+    earth : WideEarth or None
+        An Earth in front of `glare`, sky and the patches before the last `in_front`.
+    behind, in_front : tuple of Patch
+        What lies behind and in front of that Earth.
     flooded : bool
         Light passes the baffle and saturates the image; the rest is then empty.
-    earth : WideEarth or None
-        An Earth in front of `glare` and sky; the other light and shadow are then None.
     """
 
+    size: tuple[int, int]
     glare: Image | None = None
-    electrons_s: Image | None = None
-    transmission: Image | None = None
-    flooded: bool = False
     earth: WideEarth | None = None
+    behind: tuple[Patch, ...] = ()
+    in_front: tuple[Patch, ...] = ()
+    flooded: bool = False
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
-        if self.earth is not None:
-            return self.earth.seen_at(xy_px)
-        if self.transmission is None:
-            return np.full(len(xy_px), 0.0 if self.flooded else 1.0)
-        height, width = self.transmission.shape
-        columns = np.clip(np.rint(xy_px[:, 0]), 0, width - 1).astype(np.int64)
-        rows = np.clip(np.rint(xy_px[:, 1]), 0, height - 1).astype(np.int64)
-        return self.transmission[rows, columns].astype(np.float64)
+        """Return the transmission (n,) at positions (n, 2); outside the image that of its edge."""
+        seen = np.full(len(xy_px), 0.0 if self.flooded else 1.0)
+        if self._layers:
+            nearest = np.clip(xy_px, 0.0, np.array(self.size) - 1.0)
+            for layer in self._layers:
+                seen *= layer.seen_at(nearest)
+        return seen
 
     @property
     def covered_share(self) -> float:
-        """Fraction of the image that receives less than half of the sky's light."""
-        if self.earth is not None:
+        """Fraction of the image that receives less than half of the sky's light, by every `GLARE_STEP`-th pixel."""
+        if self.earth is not None and len(self._layers) == 1:
             return self.earth.covered_share
-        if self.transmission is None:
+        if not self._layers:
             return float(self.flooded)
-        return float(np.count_nonzero(self.transmission < 0.5) / self.transmission.size)
+        x, y = np.meshgrid(*(np.arange(GLARE_STEP // 2, size, GLARE_STEP) for size in self.size))
+        return float(np.mean(self.seen_at(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)) < 0.5))
 
+    @property
+    def _layers(self) -> tuple[Patch | WideEarth, ...]:
+        return (*self.behind, *(() if self.earth is None else (self.earth,)), *self.in_front)
 
-@compiled_ieee
-def add_area(
-    mean: Image,
-    electrons_s: Image,
-    transmission: Image,
-    sensitivity: Image,
-    sky_e_s: float,
-    exposure_s: float,
-) -> None:
-    """Add light (h, w) to the mean electrons, and take away the sky that it hides."""
-    sky, exposure = np.float32(sky_e_s), np.float32(exposure_s)
-    for y in range(mean.shape[0]):
-        to, light, passed, gain = mean[y], electrons_s[y], transmission[y], sensitivity[y]
-        for x in range(to.size):
-            added = (light[x] + (passed[x] - np.float32(1.0)) * sky) * gain[x] * exposure
-            to[x] = max(to[x] + added, np.float32(0.0))
+    def draw(
+        self,
+        mean: Image,
+        still: Image,
+        sensitivity: Image,
+        sky_e_s: float,
+        exposure_s: float,
+        least_e: float,
+        saturated_e: float,
+    ) -> None:
+        """Fill the mean electrons (h, w) with `still`, which is of sky and dark current, and all light and shadow.
+
+        Glare of less than `least_e` electrons everywhere is left out, and where the light is more than `saturated_e` it
+        need not be exact.
+        """
+        glare = self.glare if self.glare is not None and exposure_s * np.max(self.glare) > least_e else None
+        if glare is None and self.earth is None:
+            np.copyto(mean, still)
+        else:
+            none = np.empty((0, 0), dtype=np.float32)
+            hidden = none if self.earth is None else self.earth.grid[2]
+            fill(mean, still, sensitivity, none if glare is None else glare, hidden, exposure_s)
+        for patch in self.behind:
+            patch.cover(mean, still, sensitivity, sky_e_s, exposure_s)
+        if self.earth is not None:
+            self.earth.cover(mean, still, sensitivity, sky_e_s, exposure_s, saturated_e)
+        for patch in self.in_front:
+            patch.cover(mean, still, sensitivity, sky_e_s, exposure_s)
 
 
 def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
@@ -136,8 +199,7 @@ def _sun_of(earth: EarthLimb) -> npt.NDArray[np.float64] | None:
 def _off_axis_deg(attitude: Attitude, body: SunGlare | Moon | EarthLimb) -> float:
     """Angle of a body's centre from the boresight, degrees."""
     place, boresight = icrs_vector(body.ra_deg, body.dec_deg), attitude.boresight
-    chord = float(np.linalg.norm(place - boresight))
-    return math.degrees(2.0 * math.asin(min(0.5 * chord, 1.0)))
+    return math.degrees(2.0 * math.asin(min(0.5 * math.dist(place.tolist(), boresight.tolist()), 1.0)))
 
 
 @compiled_ieee
@@ -258,11 +320,9 @@ class AreaPainter:
         steps = (GLARE_STEP * np.arange(-(-size // GLARE_STEP) + 1) for size in self._size)
         return self._directions_of(*steps)
 
-    @cached_property
-    def _buffers(self) -> tuple[Image, Image]:
-        """Light and transmission (h, w) of the last image, to be used again."""
-        shape = (self._camera.height, self._camera.width)
-        return np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+    @property
+    def _everything(self) -> Box:
+        return slice(0, self._camera.height), slice(0, self._camera.width)
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -275,67 +335,48 @@ class AreaPainter:
         return np.ascontiguousarray(vectors.T.reshape(3, rows.size, columns.size), dtype=np.float32)
 
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
-        """Return light and transmission of all extended objects at one attitude, valid until the next call."""
+        """Return light and transmission of all extended objects at one attitude."""
         if baffle_passed(objects, attitude):
-            return AreaLight(flooded=True)
-        moon, earth = objects.moon, objects.earth
-        if earth is not None and not self._earth_in_field(earth, attitude):
-            earth = None
-        covered = bool(objects.obstructions) or objects.blank
-        disc = None if moon is None else self._moon_box(moon, attitude)
-        smooth, sharp = self._sorted_glare(objects, attitude, sharp=covered)
-        wide = earth is not None and earth.radius_deg >= _WIDE_EARTH_DEG
-        if earth is not None and (covered or sharp or disc or not wide):
-            covered, wide = True, False
-            smooth, sharp = [], smooth + sharp
-        glare = None
-        if smooth:
-            glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
-            for source in smooth:
-                _add_glare(glare, self._grid_directions, *source)
-        if earth is not None and wide:
-            return AreaLight(glare, earth=self._wide_earth(earth, attitude))
-        if not (sharp or covered or disc):
-            return AreaLight(glare)
-        electrons_s, transmission = self._buffers
-        electrons_s.fill(0.0)
-        transmission.fill(1.0)
-        for source in sharp:
-            _add_glare(electrons_s, self._directions, *source)
-        light = AreaLight(glare, electrons_s, transmission)
-        if moon is not None and disc is not None:
-            self._paint_moon(electrons_s, transmission, moon, attitude, disc)
-        if earth is not None:
-            self._paint_earth(electrons_s, transmission, earth, attitude)
-        for obstruction in objects.obstructions:
-            cover = self._obstruction_transmission(obstruction)
-            electrons_s *= cover
-            transmission *= cover
+            return AreaLight(self._size, flooded=True)
+        glare, behind = self._glare(objects, attitude)
+        if objects.moon is not None:
+            behind += self._moon_patch(objects.moon, attitude)
+        earth: WideEarth | None = None
+        in_front: list[Patch] = []
+        if objects.earth is not None and self._in_reach(objects.earth, attitude):
+            if objects.earth.radius_deg >= _WIDE_EARTH_DEG:
+                earth = self._wide_earth(objects.earth, attitude)
+            else:
+                in_front = self._small_earth(objects.earth, attitude)
+        covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
         if objects.blank:
-            electrons_s[:] = 0.0
-            transmission[:] = 0.0
-        return light
+            covers.append(np.zeros(self._size[::-1], dtype=np.float32))
+        in_front += [Patch(self._everything, np.zeros_like(cover), cover) for cover in covers]
+        return AreaLight(self._size, glare, earth, tuple(behind), tuple(in_front))
 
-    def _sorted_glare(
-        self, objects: SkyObjects, attitude: Attitude, *, sharp: bool
-    ) -> tuple[list[Glare], list[Glare]]:
-        """Return the glare of Sun and Moon as arguments of the kernel: what is smooth over the image, and the rest.
-
-        With `sharp`, all of it is taken as not smooth, since something covers part of it.
-        """
-        sorted_glare: tuple[list[Glare], list[Glare]] = ([], [])
+    def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, list[Patch]]:
+        """Return the glare of Sun and Moon on the grid, and what it lacks near them."""
+        total, near = None, []
         for body in (objects.sun, objects.moon):
             if body is None:
                 continue
             off_axis = _off_axis_deg(attitude, body)
             if off_axis > body.reach_deg:
                 continue
-            source = attitude.to_sensor(icrs_vector(body.ra_deg, body.dec_deg)).astype(np.float32)
+            direction = attitude.to_sensor(icrs_vector(body.ra_deg, body.dec_deg))
             strength, soft, cube = self._glare_of(body)
+            source: Glare = (direction.astype(np.float32), strength, soft * soft, cube)
+            glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
+            _add_glare(glare, self._grid_directions, *source)
+            total = glare if total is None else total + glare
             outside = math.radians(off_axis) - self._camera.field_radius_rad
-            smooth = max(soft, outside) > _SMOOTH_PX * self._camera.pixel_scale_rad and not sharp
-            sorted_glare[0 if smooth else 1].append((source, strength, soft * soft, cube))
-        return sorted_glare
+            if max(soft, outside) < _SMOOTH_PX * self._camera.pixel_scale_rad:
+                box = self._box_around(direction, _SMOOTH_PX * self._camera.pixel_scale_rad)
+                if box is not None:
+                    light = -interpolated(glare, *box)
+                    _add_glare(light, self._directions_in(box), *source)
+                    near.append(Patch(box, light, np.ones_like(light), hides_glare=False))
+        return total, near
 
     def _glare_of(self, body: SunGlare | Moon) -> tuple[float, float, bool]:
         """Strength and softness of a body's stray light, and whether it falls with the cube of the angle."""
@@ -351,32 +392,22 @@ class AreaPainter:
         """Electrons/s from the whole Moon."""
         return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
 
-    def _moon_box(self, moon: Moon, attitude: Attitude) -> tuple[slice, slice] | None:
-        """Return the part of the image that the Moon's disc may touch; None if it is outside."""
-        source = attitude.to_sensor(icrs_vector(moon.ra_deg, moon.dec_deg))
-        xy, _ = self._camera.project(source[None, :])
-        return self._box(xy[0], math.radians(moon.diameter_deg) / self._camera.pixel_scale_rad + 8.0)
-
-    def _paint_moon(
-        self,
-        electrons_s: Image,
-        transmission: Image,
-        moon: Moon,
-        attitude: Attitude,
-        box: tuple[slice, slice],
-    ) -> None:
-        """Add the Moon's disc with the terminator."""
+    def _moon_patch(self, moon: Moon, attitude: Attitude) -> list[Patch]:
+        """Return the Moon's disc with the terminator; nothing if it is outside the image."""
         import cv2
 
         source = attitude.to_sensor(icrs_vector(moon.ra_deg, moon.dec_deg))
         radius = math.radians(moon.diameter_deg) / 2.0
+        box = self._box_around(source, radius + _EDGE_PX * self._camera.pixel_scale_rad)
+        if box is None:
+            return []
         # position on the disc in units of its radius, towards the bright limb and across
         ra, dec, angle = (math.radians(value) for value in (moon.ra_deg, moon.dec_deg, moon.bright_limb_deg))
         north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
         east = np.array([-math.sin(ra), math.cos(ra), 0.0])
         towards = attitude.to_sensor(math.cos(angle) * north + math.sin(angle) * east) / radius
         across = attitude.to_sensor(math.cos(angle) * east - math.sin(angle) * north) / radius
-        directions = self._directions[(slice(None), *box)]
+        directions = self._directions_in(box)
         u = np.tensordot(towards, directions, axes=1)
         v = np.tensordot(across, directions, axes=1)
         before = np.tensordot(source, directions, axes=1) > 0.0
@@ -386,38 +417,52 @@ class AreaPainter:
         lit = inside * np.clip(0.5 + (u - edge) * scale, 0.0, 1.0)
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
         disc = (lit * (self._moonlight(moon) / area)).astype(np.float32)
-        electrons_s[box] += cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px)
-        transmission[box] *= (1.0 - inside).astype(np.float32)
+        light = np.asarray(cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px), dtype=np.float32)
+        return [Patch(box, light, (1.0 - inside).astype(np.float32), hides_glare=False)]
 
-    def _box(self, xy: npt.NDArray[np.float64], reach: float) -> tuple[slice, slice] | None:
-        """Return the slices of the image within `reach` pixels of a position; None if outside."""
-        if not np.all(np.isfinite(xy)):
-            return None
-        left, right = max(math.floor(xy[0] - reach), 0), min(math.ceil(xy[0] + reach) + 1, self._camera.width)
-        top, bottom = (
-            max(math.floor(xy[1] - reach), 0),
-            min(math.ceil(xy[1] + reach) + 1, self._camera.height),
-        )
-        return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+    def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
+        """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
+        margin = 2.0 * GLARE_STEP * self._camera.pixel_scale_rad
+        cosines = np.tensordot(direction.astype(np.float32), self._grid_directions, axes=1)
+        near = cosines >= math.cos(min(radius_rad + margin, math.pi))
+        spans = []
+        for axis, size in enumerate(self._size[::-1]):
+            points = GLARE_STEP * np.flatnonzero(near.any(axis=1 - axis))
+            if not points.size or points[0] >= size:
+                return None
+            spans.append(slice(int(points[0]), min(int(points[-1]) + 1, size)))
+        return spans[0], spans[1]
 
-    def _paint_earth(
-        self, electrons_s: Image, transmission: Image, earth: EarthLimb, attitude: Attitude
-    ) -> None:
-        """Add the Earth's disc, pixel by pixel."""
+    def _directions_in(self, box: Box) -> Image:
+        """Return the directions (3, h', w') of the pixels in part of the image."""
+        return np.ascontiguousarray(self._directions[(slice(None), *box)])
+
+    def _small_earth(self, earth: EarthLimb, attitude: Attitude) -> list[Patch]:
+        """Return the Earth's disc, pixel by pixel; nothing if it is outside the image."""
         nadir, sun = self._earth_and_sun(earth, attitude)
+        box = self._box_around(nadir, self._reach_rad(earth))
+        if box is None:
+            return []
+        directions = self._directions_in(box)
+        light, passed = np.zeros_like(directions[0]), np.ones_like(directions[0])
         angles = (math.radians(earth.radius_deg), self._atmosphere_rad(earth))
-        _add_earth(electrons_s, transmission, self._directions, nadir, sun, angles, earth.electrons_s)
+        _add_earth(light, passed, directions, nadir, sun, angles, earth.electrons_s)
+        return [Patch(box, light, passed)]
 
     def _wide_earth(self, earth: EarthLimb, attitude: Attitude) -> WideEarth:
         """Return the Earth on the grid."""
         nadir, sun = self._earth_and_sun(earth, attitude)
         directions = self._grid_directions
-        cosine = np.tensordot(nadir, directions, axes=1)
-        height = np.arccos(np.clip(cosine, -1.0, 1.0)) - math.radians(earth.radius_deg)
-        grid = np.stack([cosine, np.tensordot(sun, directions, axes=1), height / self._atmosphere_rad(earth)])
+        grid = np.empty_like(directions)
+        towards = np.array([nadir, sun], dtype=np.float32)
+        np.matmul(towards, directions.reshape(3, -1), out=grid[:2].reshape(2, -1))
+        np.arccos(np.clip(grid[0], -1.0, 1.0, out=grid[2]), out=grid[2])
+        grid[2] -= np.float32(math.radians(earth.radius_deg))
+        grid[2] *= np.float32(1.0 / self._atmosphere_rad(earth))
         distance = 1.0 / math.sin(math.radians(earth.radius_deg))
         behind = -distance * float(nadir @ sun) if np.any(sun) else 1.0
-        return WideEarth(grid.astype(np.float32), distance, behind, earth.electrons_s)
+        step_rad = GLARE_STEP * self._camera.pixel_scale_rad
+        return WideEarth(grid, distance, behind, earth.electrons_s, step_rad)
 
     def _earth_and_sun(
         self, earth: EarthLimb, attitude: Attitude
@@ -432,10 +477,14 @@ class AreaPainter:
         spot = _SPOT_SIGMAS * self._psf_sigma_px * self._camera.pixel_scale_rad
         return max(math.radians(earth.atmosphere_deg), spot)
 
-    def _earth_in_field(self, earth: EarthLimb, attitude: Attitude) -> bool:
+    def _reach_rad(self, earth: EarthLimb) -> float:
+        """Return the angle from the Earth's centre to which the glow of its limb reaches."""
+        return math.radians(earth.radius_deg) + GLOW_HEIGHTS * self._atmosphere_rad(earth)
+
+    def _in_reach(self, earth: EarthLimb, attitude: Attitude) -> bool:
         """Whether the Earth or the glow of its limb reaches into the field."""
-        reach_deg = earth.radius_deg + GLOW_HEIGHTS * earth.atmosphere_deg
-        return _off_axis_deg(attitude, earth) <= reach_deg + math.degrees(self._camera.field_radius_rad) + 1.0
+        nadir = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg))
+        return disc_in_field(nadir, self._reach_rad(earth), self._camera)
 
     def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
         """Return the transmission (h, w) of an obstruction."""

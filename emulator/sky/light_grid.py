@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.jit import compiled_ieee
+from starid.jit import compiled_ieee, inner
 
 Image = npt.NDArray[np.float32]
 
@@ -16,29 +16,66 @@ GLARE_STEP: Final = 8
 
 
 @compiled_ieee
-def expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32]) -> None:
-    """Interpolate a row of the glare's grid at every column."""
-    whole = line.size // GLARE_STEP
-    for i in range(whole):
-        first, slope = row[i], (row[i + 1] - row[i]) * np.float32(1.0 / GLARE_STEP)
+def expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32], first: int, last: int) -> None:
+    """Interpolate the cells from `first` to before `last` of a row of the grid at every column."""
+    for i in range(first, last):
+        start, slope = row[i], (row[i + 1] - row[i]) * np.float32(1.0 / GLARE_STEP)
         for k in range(GLARE_STEP):
-            line[i * GLARE_STEP + k] = first + slope * np.float32(k)
-    for x in range(whole * GLARE_STEP, line.size):
-        slope = (row[whole + 1] - row[whole]) * np.float32(1.0 / GLARE_STEP)
-        line[x] = row[whole] + slope * np.float32(x - whole * GLARE_STEP)
+            line[i * GLARE_STEP + k] = start + slope * np.float32(k)
 
 
 @compiled_ieee
-def add_glare(out: Image, still: Image, sensitivity: Image, grid: Image, exposure_s: float) -> None:
-    """Fill (h, w) with `still` plus smooth light, interpolated linearly between the points of its grid."""
-    upper, lower = np.empty(out.shape[1], dtype=np.float32), np.empty(out.shape[1], dtype=np.float32)
-    expand(grid[0], lower)
-    for y in range(out.shape[0]):
-        if y % GLARE_STEP == 0:
-            upper, lower = lower, upper
-            expand(grid[y // GLARE_STEP + 1], lower)
-        share = np.float32(y % GLARE_STEP) * np.float32(exposure_s / GLARE_STEP)
-        rest = np.float32(exposure_s) - share
-        to, base, gain = out[y], still[y], sensitivity[y]
-        for x in range(to.size):
-            to[x] = base[x] + gain[x] * (rest * upper[x] + share * lower[x])
+def fill(
+    out: Image, still: Image, sensitivity: Image, glare: Image, height: Image, exposure_s: float
+) -> None:
+    """Fill (h, w) with `still` plus smooth light, interpolated linearly between the points of its grid.
+
+    Without `glare` (of size 0) there is no light. Where all corners of a cell have a `height` of at most 0 the image is
+    left as it is, unless that has size 0.
+    """
+    rows, width = out.shape
+    cells = (width + GLARE_STEP - 1) // GLARE_STEP
+    upper = np.empty(cells * GLARE_STEP, dtype=np.float32)
+    lower = np.empty(cells * GLARE_STEP, dtype=np.float32)
+    for band in range((rows + GLARE_STEP - 1) // GLARE_STEP):
+        end = 0
+        while end < cells:
+            start = end
+            while end < cells and not (height.size and _is_hidden(height, band, end)):
+                end += 1
+            if start == end:
+                end += 1
+                continue
+            if glare.size:
+                expand(glare[band], upper, start, end)
+                expand(glare[band + 1], lower, start, end)
+            run = slice(start * GLARE_STEP, min(end * GLARE_STEP, width))
+            above, below = upper[run], lower[run]
+            for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, rows)):
+                to, base, gain = out[y, run], still[y, run], sensitivity[y, run]
+                if not glare.size:
+                    to[:] = base
+                    continue
+                share = np.float32(y % GLARE_STEP) * np.float32(exposure_s / GLARE_STEP)
+                rest = np.float32(exposure_s) - share
+                for x in range(to.size):
+                    to[x] = base[x] + gain[x] * (rest * above[x] + share * below[x])
+
+
+@inner
+def _is_hidden(height: Image, row: int, column: int) -> bool:
+    """Whether no corner of a cell is above the limb."""
+    return bool(
+        max(height[row, column], height[row, column + 1]) <= 0.0
+        and max(height[row + 1, column], height[row + 1, column + 1]) <= 0.0
+    )
+
+
+def interpolated(grid: Image, rows: slice, columns: slice) -> Image:
+    """Return the light of a grid in part (h', w') of the image."""
+    for line, axis in ((rows, 0), (columns, 1)):
+        pixel = np.arange(line.start, line.stop)
+        cell = pixel // GLARE_STEP
+        share = np.expand_dims((pixel % GLARE_STEP / GLARE_STEP).astype(np.float32), 1 - axis)
+        grid = grid.take(cell, axis) * (1 - share) + grid.take(cell + 1, axis) * share
+    return grid

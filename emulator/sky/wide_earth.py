@@ -1,4 +1,9 @@
-"""An Earth that covers much of the field, drawn from a coarse grid."""
+"""An Earth that covers much of the field, drawn from a coarse grid.
+
+Each cell of the grid is one of four sorts, by what its corners are: clear sky, disc so bright that it saturates, disc
+whose light is smooth, and limb, terminator or a disc seen at a grazing angle. Only those of the last sort are computed pixel
+by pixel.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +15,23 @@ import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.sky.light_grid import GLARE_STEP, Image, expand
-from starid.jit import compiled_ieee
+from starid.jit import compiled_ieee, inner
 
 GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
+
+_LEAST_E: Final = 0.05
+"""Light of the atmosphere that is left out, electrons."""
+
+_ERROR_E: Final = 1.0
+"""Largest error of light that is interpolated in a cell, electrons."""
+
+_CLEAR: Final = 0
+_BRIGHT: Final = 1
+_SMOOTH: Final = 2
+_DETAILED: Final = 3
+
+Line = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -31,104 +49,211 @@ class WideEarth:
         Cosine of the Sun's zenith distance at the point opposite to the nadir.
     brightness : float
         Electrons/s per pixel where the Sun is in the zenith.
+    step_rad : float
+        Angle between points of the grid.
     """
 
     grid: Image
     distance: float
     behind: float
     brightness: float
+    step_rad: float
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the atmosphere at positions (n, 2)."""
         height = self.grid[2]
-        limits = np.array(height.shape)[::-1] - 2
-        cell = np.clip(np.floor(xy_px / GLARE_STEP), 0, limits).astype(np.int64)
-        along, down = (xy_px / GLARE_STEP - cell).T
-        column, row = cell.T
-        upper = height[row, column] * (1.0 - along) + height[row, column + 1] * along
-        lower = height[row + 1, column] * (1.0 - along) + height[row + 1, column + 1] * along
+        across, down = (xy_px / GLARE_STEP).T
+        column = np.minimum(across.astype(np.int64), height.shape[1] - 2)
+        row = np.minimum(down.astype(np.int64), height.shape[0] - 2)
+        across, down = across - column, down - row
+        upper = height[row, column] * (1.0 - across) + height[row, column + 1] * across
+        lower = height[row + 1, column] * (1.0 - across) + height[row + 1, column + 1] * across
         seen: npt.NDArray[np.float64] = np.clip(upper * (1.0 - down) + lower * down, 0.0, 1.0)
         return seen
 
     @property
     def covered_share(self) -> float:
         """Fraction of the cells of the grid that receive less than half of the sky's light."""
-        return float(np.mean(self.grid[2, :-1, :-1] < 0.5))
+        return float(np.count_nonzero(self.grid[2, :-1, :-1] < 0.5) / self.grid[2, :-1, :-1].size)
+
+    def cover(
+        self,
+        mean: Image,
+        still: Image,
+        sensitivity: Image,
+        sky_e_s: float,
+        exposure_s: float,
+        saturated_e: float,
+    ) -> None:
+        """Put the Earth in front of the mean electrons (h, w), in place.
+
+        `still` is `mean` without the light of bodies: sky and dark current. Cells with more than `saturated_e` electrons in
+        every pixel need no more than that.
+        """
+        body = (self.distance, self.behind, self.brightness, self.step_rad)
+        _cover(mean, still, sensitivity, self.grid, body, (sky_e_s, exposure_s, saturated_e))
 
 
-@compiled_ieee
-def _glow(height: npt.NDArray[np.float32], line: npt.NDArray[np.float32]) -> None:
-    """Brightness of the atmosphere relative to the disc's, from its height at every `GLARE_STEP`-th column."""
-    line[:] = 1.0
-    for i in range(height.size - 1):
-        first, last = height[i], height[i + 1]
-        if max(first, last) <= 0.0:
+@inner
+def _glow(height: Line, line: Line, first: int, last: int) -> None:
+    """Brightness of the atmosphere relative to the disc's in some cells, from its height at every `GLARE_STEP`-th column."""
+    for i in range(first, last):
+        start, end = height[i], height[i + 1]
+        if max(start, end) <= 0.0:
+            line[i * GLARE_STEP : (i + 1) * GLARE_STEP] = 1.0
             continue
-        start, end = i * GLARE_STEP, min((i + 1) * GLARE_STEP, line.size)
-        if min(first, last) > GLOW_HEIGHTS:
-            line[start:end] = 0.0
-            continue
-        share, ratio = math.exp(-first), math.exp((first - last) / GLARE_STEP)
-        for x in range(start, end):
+        share, ratio = math.exp(-start), math.exp((start - end) / GLARE_STEP)
+        for x in range(i * GLARE_STEP, (i + 1) * GLARE_STEP):
             line[x] = min(share, 1.0)
             share *= ratio
 
 
-def add_earth(
-    mean: Image, still: Image, sensitivity: Image, earth: WideEarth, sky_e_s: float, exposure_s: float
-) -> None:
-    """Put a wide Earth in front of the mean electrons (h, w), in place.
+@inner
+def _shades(cosine: Line, lit: Line, shade: Line, emergent: Line, far: float, behind: float) -> None:
+    """Cosines of the zenith distances of the Sun and of the observer where lines of sight meet a sphere of radius 1."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    distance, opposite = np.float32(far), np.float32(behind)
+    far2 = distance * distance
+    for i in range(cosine.size):
+        emergent[i] = np.sqrt(max(one - far2 * (one - cosine[i] * cosine[i]), zero))
+        shade[i] = opposite + (distance * cosine[i] - emergent[i]) * lit[i]
 
-    `still` is `mean` without the glare of Sun and Moon: sky and dark current.
+
+@inner
+def _sort_cells(
+    sorts: npt.NDArray[np.int32],
+    heights: tuple[Line, Line],
+    shades: tuple[Line, Line],
+    emergents: tuple[Line, Line],
+    light: tuple[float, float, float, float],
+) -> None:
+    """Sort the cells between two rows of the grid.
+
+    `light` is of the disc with the Sun in the zenith, electrons; what saturates a pixel; the height that glow reaches; and the
+    error of linear interpolation, which grows as the inverse cube of the cosine of the observer's zenith distance.
     """
-    body = (earth.distance, earth.behind, earth.brightness)
-    _add_wide_earth(mean, still, sensitivity, earth.grid, body, sky_e_s, exposure_s)
+    saturated, reach, error = (
+        np.float32(light[1] / max(light[0], 1e-9)),
+        np.float32(light[2]),
+        np.float32(light[3] / _ERROR_E),
+    )
+    zero, one = np.float32(0.0), np.float32(1.0)
+    (h, next_h), (s, next_s), (e, next_e) = heights, shades, emergents
+    for i in range(sorts.size - 1):
+        low = min(h[i], h[i + 1], next_h[i], next_h[i + 1])
+        high = max(h[i], h[i + 1], next_h[i], next_h[i + 1])
+        least = min(s[i], s[i + 1], next_s[i], next_s[i + 1])
+        most = max(s[i], s[i + 1], next_s[i], next_s[i + 1])
+        nearest = min(e[i], e[i + 1], next_e[i], next_e[i + 1])
+        clear = (low > reach) | ((low > one) & (most <= zero))
+        smooth = (most <= zero) | ((least >= zero) & (error < nearest * nearest * nearest))
+        disc = _BRIGHT if least > saturated else (_SMOOTH if smooth else _DETAILED)
+        sorts[i] = _CLEAR if clear else (_DETAILED if high > zero else disc)
+    sorts[-1] = -1
+
+
+@inner
+def _draw_bright(to: Line, gain: Line, shades: tuple[Line, Line], share: np.float32, full_e: float) -> None:
+    """Draw a row of disc that saturates."""
+    full, (above, below) = np.float32(full_e), shades
+    for x in range(to.size):
+        to[x] = gain[x] * full * (above[x] + share * (below[x] - above[x]))
+
+
+@inner
+def _draw_smooth(
+    to: Line,
+    base: Line,
+    gain: Line,
+    shades: tuple[Line, Line],
+    share: np.float32,
+    light: tuple[np.float32, np.float32],
+) -> None:
+    """Draw a row of disc whose shade is smooth."""
+    above, below = shades
+    full, sky = light
+    zero = np.float32(0.0)
+    for x in range(to.size):
+        shade = max(above[x] + share * (below[x] - above[x]), zero)
+        to[x] = max(base[x] + gain[x] * (full * shade - sky), zero)
+
+
+@inner
+def _draw_detailed(
+    to: Line,
+    base: Line,
+    gain: Line,
+    planes: tuple[Line, Line, Line, Line, Line, Line, Line],
+    share: np.float32,
+    body: tuple[np.float32, np.float32, np.float32],
+    sky: np.float32,
+) -> None:
+    """Draw a row pixel by pixel, from the planes of the grid above and below it, and the glow."""
+    near, next_near, lit, next_lit, high, next_high, glow = planes
+    far, behind, full = body
+    zero, one = np.float32(0.0), np.float32(1.0)
+    far2 = far * far
+    for x in range(to.size):
+        cosine = near[x] + share * (next_near[x] - near[x])
+        along = far * cosine - np.sqrt(max(one - far2 * (one - cosine * cosine), zero))
+        shade = behind + along * (lit[x] + share * (next_lit[x] - lit[x]))
+        clear = min(max(high[x] + share * (next_high[x] - high[x]), zero), one)
+        light = full * glow[x] * min(max(shade, zero), one)
+        dark = base[x] - gain[x] * sky
+        to[x] = max(dark + (to[x] - dark) * clear + gain[x] * light, zero)
 
 
 @compiled_ieee
-def _add_wide_earth(
+def _cover(
     mean: Image,
     still: Image,
     sensitivity: Image,
     grid: Image,
-    body: tuple[float, float, float],
-    sky_e_s: float,
-    exposure_s: float,
+    body: tuple[float, float, float, float],
+    light: tuple[float, float, float],
 ) -> None:
-    """As `add_earth`, with the Earth's grid, and its distance, `behind` and brightness."""
-    width = mean.shape[1]
-    upper, lower = np.empty((3, width), dtype=np.float32), np.empty((3, width), dtype=np.float32)
-    for k in range(3):
-        expand(grid[k, 0], lower[k])
-    height = np.empty(grid.shape[2], dtype=np.float32)
-    light, glow = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
-    zero, one = np.float32(0.0), np.float32(1.0)
-    far, far2, behind = np.float32(body[0]), np.float32(body[0] * body[0]), np.float32(body[1])
-    full, sky, exposure = np.float32(body[2]), np.float32(sky_e_s), np.float32(exposure_s)
-    for y in range(mean.shape[0]):
-        cell, share = y // GLARE_STEP, np.float32(y % GLARE_STEP) / np.float32(GLARE_STEP)
-        if y % GLARE_STEP == 0:
-            upper, lower = lower, upper
-            nearest = min(np.min(grid[2, cell]), np.min(grid[2, cell + 1]))
-            for k in range(3):
-                expand(grid[k, cell + 1], lower[k])
-        if nearest > GLOW_HEIGHTS:
-            continue
-        for i in range(height.size):
-            height[i] = grid[2, cell, i] + share * (grid[2, cell + 1, i] - grid[2, cell, i])
-        _glow(height, glow)
-        near, next_near = upper[0], lower[0]
-        lit, next_lit = upper[1], lower[1]
-        for x in range(width):
-            # brightness by the Sun's zenith distance where the line of sight meets a sphere of radius 1
-            cosine = near[x] + share * (next_near[x] - near[x])
-            along = far * cosine - np.sqrt(max(one - far2 * (one - cosine * cosine), zero))
-            shade = behind + along * (lit[x] + share * (next_lit[x] - lit[x]))
-            light[x] = full * glow[x] * min(max(shade, zero), one)
-        high, next_high = upper[2], lower[2]
-        to, base, gain = mean[y], still[y], sensitivity[y]
-        for x in range(width):
-            clear = min(max(high[x] + share * (next_high[x] - high[x]), zero), one)
-            sensed = gain[x] * exposure
-            dark = base[x] - sensed * sky
-            to[x] = max(dark + (to[x] - dark) * clear + sensed * light[x], zero)
+    """As `WideEarth.cover`, with the Earth's numbers, and those of the light."""
+    distance, behind, brightness, step_rad = body
+    full_e, saturated_e = brightness * light[1], light[2]
+    rows, width = mean.shape
+    points = grid.shape[2]
+    reach = min(max(math.log(max(full_e, 1e-9) / _LEAST_E), 1.0), GLOW_HEIGHTS)
+    limits = (full_e, saturated_e, reach, full_e * (distance**2 - 1.0) * step_rad**2 / 4.0)
+    full, sky = np.float32(full_e), np.float32(light[0] * light[1])
+    shades, emergents = np.empty((2, points), dtype=np.float32), np.empty((2, points), dtype=np.float32)
+    lines = np.empty((7, points * GLARE_STEP), dtype=np.float32)
+    height, sorts = np.empty(points, dtype=np.float32), np.empty(points, dtype=np.int32)
+    _shades(grid[0, 0], grid[1, 0], shades[0], emergents[0], distance, behind)
+    for band in range((rows + GLARE_STEP - 1) // GLARE_STEP):
+        up, low = band % 2, 1 - band % 2
+        upper = (grid[0, band], grid[1, band], grid[2, band])
+        lower = (grid[0, band + 1], grid[1, band + 1], grid[2, band + 1])
+        _shades(lower[0], lower[1], shades[low], emergents[low], distance, behind)
+        pairs = (shades[up], shades[low]), (emergents[up], emergents[low])
+        _sort_cells(sorts, (upper[2], lower[2]), pairs[0], pairs[1], limits)
+        last = 0
+        while last < points - 1:
+            first, sort = last, sorts[last]
+            while sorts[last] == sort:
+                last += 1
+            if sort == _CLEAR:
+                continue
+            run = slice(first * GLARE_STEP, min(last * GLARE_STEP, width))
+            for k in range(3 if sort == _DETAILED else 1):
+                expand(upper[k] if sort == _DETAILED else shades[up], lines[2 * k], first, last)
+                expand(lower[k] if sort == _DETAILED else shades[low], lines[2 * k + 1], first, last)
+            a, b, c, d = lines[0, run], lines[1, run], lines[2, run], lines[3, run]
+            planes = (a, b, c, d, lines[4, run], lines[5, run], lines[6, run])
+            for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, rows)):
+                share = np.float32(y % GLARE_STEP) / np.float32(GLARE_STEP)
+                to, base, gain = mean[y, run], still[y, run], sensitivity[y, run]
+                if sort == _BRIGHT:
+                    _draw_bright(to, gain, (a, b), share, full_e)
+                elif sort == _SMOOTH:
+                    _draw_smooth(to, base, gain, (a, b), share, (full, sky))
+                else:
+                    height[:] = upper[2] + share * (lower[2] - upper[2])
+                    _glow(height, lines[6], first, last)
+                    _draw_detailed(
+                        to, base, gain, planes, share, (np.float32(distance), np.float32(behind), full), sky
+                    )

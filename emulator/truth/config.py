@@ -15,13 +15,7 @@ from starhil.emulator.truth.feed import Socket
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth.orbit import (
-    LARGEST_ECCENTRICITY,
-    KeplerOrbit,
-    Orbit,
-    OrbitState,
-    TleOrbit,
-)
+from starhil.emulator.truth.orbit import LARGEST_ECCENTRICITY, KeplerOrbit, Orbit, OrbitState, TleOrbit
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 from starhil.hil_tests.conformance.can_probe import (
@@ -14,7 +15,15 @@ from starhil.hil_tests.conformance.can_probe import (
     identifier_of,
     segments,
 )
-from starhil.hil_tests.conformance.case import Case, CaseArea, CaseSkipped, check, check_equal, rule
+from starhil.hil_tests.conformance.case import (
+    Case,
+    CaseArea,
+    CaseFailed,
+    CaseSkipped,
+    check,
+    check_equal,
+    rule,
+)
 from starhil.hil_tests.conformance.link_probe import LONG_PAUSE_S
 from starhil.hil_tests.conformance.row_cases import bad_values
 from starhil.hil_tests.conformance.wire_tables import Exchange, FlagRow, add_exchange_cases, add_flag_cases
@@ -205,15 +214,12 @@ def all_rows(probe: CanWire) -> None:
     for row in probe.icd.telemetry.values():
         probe.post_as(probe.host, row.id)
         frame = probe.next_frame()
-        check(frame is not None, f"an answer to {row.id}", "nothing")
-        if frame is not None:
-            check_equal(
-                frame.id >> 24,
-                5 if row.size <= 8 else 8,
-                f"type of the answer to {row.id} ({row.size} bytes)",
-            )
-            for _ in range(0 if row.size <= 8 else frame.data[-1] if frame.data else 0):
-                probe.next_frame()
+        if frame is None:
+            raise CaseFailed(f"an answer to {row.id}", "nothing")
+        kind = 5 if row.size <= 8 else 8
+        check_equal(frame.id >> 24, kind, f"type of the answer to {row.id} ({row.size} bytes)")
+        for _ in range(frame.data[-1] if kind == 8 and frame.data else 0):
+            probe.next_frame()
 
 
 @UNSOLICITED.case("segments", "a long row comes unsolicited as first, body and last, counters down to 0")
@@ -289,18 +295,16 @@ FAULTY: Final = (
 """Name, title, and the order in which the five segments of a message are sent; one without a counter if none."""
 
 
-def _add_faulty_case(name: str, title: str, order: tuple[int, ...]) -> None:
-    @SEGMENTS.case(name, title)
-    def run(probe: CanWire) -> None:
-        frames = _unknown_frames(probe, LONG)
-        _send(probe, [frames[place] for place in order] or [CanFrame(frames[0].id)])
-        probe.expect_silence(title)
-        _send(probe, frames)
-        _expect_one_refusal(probe)
+def _faulty_message(title: str, order: tuple[int, ...], probe: CanWire) -> None:
+    frames = _unknown_frames(probe, LONG)
+    _send(probe, [frames[place] for place in order] or [CanFrame(frames[0].id)])
+    probe.expect_silence(title)
+    _send(probe, frames)
+    _expect_one_refusal(probe)
 
 
-for _faulty in FAULTY:
-    _add_faulty_case(*_faulty)
+for _name, _title, _order in FAULTY:
+    SEGMENTS.case(_name, _title)(partial(_faulty_message, _title, _order))
 
 
 @SEGMENTS.case("half", "an incomplete message is dropped after a time-out", rule(2))

@@ -52,6 +52,3 @@ def attitude(probe: CanopenProbe) -> None:
         send_sync(probe)
         heads = {probe.expect(identifier, "TPDO")[:2] for identifier in chosen}
         check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
-
-
-CASES: Final = (*DESIGN.cases,)

@@ -188,6 +188,3 @@ def stored(probe: CanopenProbe) -> None:
         if name != "FileInfo":
             check(served.has_section(name), f"section {name} in 1021h", "none")
             check_equal(dict(served.items(name)), dict(parser.items(name)), f"section {name}")
-
-
-CASES: Final = (*EDS.cases,)

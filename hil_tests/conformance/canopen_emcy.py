@@ -175,6 +175,3 @@ def emcy_stopped(probe: CanopenProbe) -> None:
     probe.expect_silence(error.emergency, "EMCY in STOPPED", 0.3)
     probe.command(PRE_OPERATIONAL)
     check(probe.number(0x1001) & 0x10, "communication error in 1001h", probe.number(0x1001))
-
-
-CASES: Final = (*EMCY.cases,)

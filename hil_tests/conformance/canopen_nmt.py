@@ -272,9 +272,3 @@ def consumer_off(probe: CanopenProbe) -> None:
     data = probe.wait_for(emergency, 0.4)
     if data is not None:
         raise CaseFailed("no EMCY", data.hex(" "))
-
-
-CASES: Final = (
-    *NMT.cases,
-    *ERROR_CONTROL.cases,
-)

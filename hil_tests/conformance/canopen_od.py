@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.hil_tests.conformance.canopen_probe import (
-    Abort,
-    CanopenProbe,
-    is_integer,
-    multiplexer,
-    size_of,
-)
+from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, is_integer, multiplexer, size_of
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
 OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
@@ -20,7 +15,8 @@ NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
 """Aborts by which a node says that an object exists and has no value now."""
 
 
-def _readable(probe: CanopenProbe, indices: range) -> None:
+def _readable(indices: range, probe: CanopenProbe) -> None:
+    """Read every object in a range, each with the length of its type."""
     for item in probe.variables():
         if item.index not in indices or not item.readable or item.data_type == datatypes.DOMAIN:
             continue
@@ -32,24 +28,14 @@ def _readable(probe: CanopenProbe, indices: range) -> None:
             check_equal(len(seen), size_of(item), f"bytes of {where} ({item.qualname})")
 
 
-@OD.case(
-    "communication", "every object of the communication profile can be read", "CiA 301 7.5.2", intrusive=False
-)
-def communication(probe: CanopenProbe) -> None:
-    """1000h to 1FFFh, each with the length of its type."""
-    _readable(probe, range(0x1000, 0x2000))
-
-
-@OD.case("manufacturer", "every object of the manufacturer can be read", "CiA 301 7.4.1", intrusive=False)
-def manufacturer(probe: CanopenProbe) -> None:
-    """2000h to 5FFFh, each with the length of its type."""
-    _readable(probe, range(0x2000, 0x6000))
-
-
-@OD.case("profile", "every object of the device profile area can be read", "CiA 301 7.4.1", intrusive=False)
-def profile(probe: CanopenProbe) -> None:
-    """6000h to 9FFFh, each with the length of its type."""
-    _readable(probe, range(0x6000, 0xA000))
+for _name, _what, _clause, _indices in (
+    ("communication", "communication profile", "CiA 301 7.5.2", range(0x1000, 0x2000)),
+    ("manufacturer", "manufacturer", "CiA 301 7.4.1", range(0x2000, 0x6000)),
+    ("profile", "device profile area", "CiA 301 7.4.1", range(0x6000, 0xA000)),
+):
+    OD.case(_name, f"every object of the {_what} can be read", _clause, intrusive=False)(
+        partial(_readable, _indices)
+    )
 
 
 @OD.case("defaults", "after a reset the defaults are those of the EDS", "CiA 301 7.5.2")
@@ -171,26 +157,26 @@ def _bounded(probe: CanopenProbe) -> list[ODVariable]:
     ]
 
 
-@OD.case("value-high", "values above the limit are refused")
-def value_high(probe: CanopenProbe) -> None:
+def _expect_refusal_beyond(probe: CanopenProbe, step: int, code: Abort) -> None:
+    """Write the value above (1) or below (-1) the limit of each object, if its type holds it."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
-        highest = (1 << 8 * size - signed) - 1
-        if item.max is not None and item.max < highest:
-            data = (int(item.max) + 1).to_bytes(size, "little", signed=signed)
-            probe.expect_refusal(item.index, item.subindex, data, size, Abort.VALUE_HIGH, Abort.VALUE)
+        limit = item.max if step > 0 else item.min
+        lowest, highest = (-(1 << 8 * size - 1) if signed else 0), (1 << 8 * size - signed) - 1
+        if limit is not None and lowest <= int(limit) + step <= highest:
+            data = (int(limit) + step).to_bytes(size, "little", signed=signed)
+            probe.expect_refusal(item.index, item.subindex, data, size, code, Abort.VALUE)
+
+
+@OD.case("value-high", "values above the limit are refused")
+def value_high(probe: CanopenProbe) -> None:
+    _expect_refusal_beyond(probe, 1, Abort.VALUE_HIGH)
 
 
 @OD.case("value-low", "values below the limit are refused")
 def value_low(probe: CanopenProbe) -> None:
-    for item in _bounded(probe):
-        size = size_of(item) or 4
-        signed = item.data_type in datatypes.SIGNED_TYPES
-        lowest = -(1 << 8 * size - 1) if signed else 0
-        if item.min is not None and item.min > lowest:
-            data = (int(item.min) - 1).to_bytes(size, "little", signed=signed)
-            probe.expect_refusal(item.index, item.subindex, data, size, Abort.VALUE_LOW, Abort.VALUE)
+    _expect_refusal_beyond(probe, -1, Abort.VALUE_LOW)
 
 
 @OD.case("write-back", "what is written is read back", "CiA 301 7.2.4.3")
@@ -218,6 +204,3 @@ def write_back(probe: CanopenProbe) -> None:
         probe.set(item.index, item.subindex, before)
     if not found:
         raise CaseSkipped("the EDS has no object that takes its limits")
-
-
-CASES: Final = (*OD.cases,)

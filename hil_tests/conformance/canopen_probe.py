@@ -24,6 +24,8 @@ PRE_OPERATIONAL: Final = 128
 RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
+ANSWER_S: Final = 0.5
+"""Longest time for an answer."""
 BOOT_S: Final = 3.0
 """Longest time from a reset of the communication to the boot-up message."""
 FIRST_OWN_OBJECT: Final = 0x2000
@@ -90,18 +92,13 @@ class CanopenProbe:
         Its object dictionary, from its EDS.
     eds
         Text of the EDS; empty if there is none.
-    timeout_s
-        Longest time for an answer.
     """
 
-    def __init__(
-        self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "", timeout_s: float = 0.5
-    ) -> None:
+    def __init__(self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "") -> None:
         self.port = port
         self.node = node
         self.od = od
         self.eds = eds
-        self.timeout_s = timeout_s
         self.log: list[str] = []
         self._boots = True
         self._multiplexer = bytes(3)
@@ -121,10 +118,7 @@ class CanopenProbe:
         mine = {base + self.node for base in (0x080, 0x580, 0x700)}
         for _ in range(3):
             self.send_request(bytes([0x40]) + multiplexer(0x1000, 0))
-            if (
-                self.wait_for(mine, max(self.timeout_s, BOOT_S / 3) if booting else self.timeout_s)
-                is not None
-            ):
+            if self.wait_for(mine, max(ANSWER_S, BOOT_S / 3) if booting else ANSWER_S) is not None:
                 return None
         return "nothing"
 
@@ -205,7 +199,7 @@ class CanopenProbe:
     ) -> bytes | None:
         """Return the data of the next accepted frame with one of the CAN IDs, else None."""
         wanted = {identifiers} if isinstance(identifiers, int) else identifiers
-        end = self.port.now() + (self.timeout_s if timeout_s is None else timeout_s)
+        end = self.port.now() + (ANSWER_S if timeout_s is None else timeout_s)
         while (left := end - self.port.now()) >= 0:
             frame = self.receive(left)
             if frame is None:
@@ -273,14 +267,12 @@ class CanopenProbe:
             raise CaseFailed(f"SDO answer {answer}", seen.hex(" "))
         return seen
 
-    def expect_abort(self, request: str | bytes, *codes: int, multiplexer: str | None = None) -> None:
+    def expect_abort(self, request: str | bytes, *codes: int) -> None:
         """Fail unless an SDO request is aborted with one of the codes, and for its own object."""
         data = bytes.fromhex(request) if isinstance(request, str) else request
-        self.check_abort(
-            self.ask(data), *codes, multiplexer=data[1:4].hex() if multiplexer is None else multiplexer
-        )
+        self.check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
 
-    def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str) -> None:
+    def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
         """Fail unless an SDO answer is an abort with one of the codes.
 
         An empty multiplexer stands for any.

@@ -147,6 +147,3 @@ def rpdo_refused(probe: CanopenProbe) -> None:
         "mappable read-only object", lambda item: item.pdo_mappable and item.access_type == "ro"
     )
     probe.expect_refusal(index + 0x200, 1, entry(constant_), 4, Abort.NOT_MAPPABLE)
-
-
-CASES: Final = (*RPDO.cases,)

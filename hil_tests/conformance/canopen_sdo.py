@@ -47,9 +47,14 @@ def writable_number(probe: CanopenProbe) -> ODVariable:
     )
 
 
+def transfer(command: int, item: ODVariable, data: bytes = b"") -> bytes:
+    """Return the request that begins a transfer of an object."""
+    return bytes([command]) + multiplexer(item.index, item.subindex) + data
+
+
 def upload(item: ODVariable) -> bytes:
     """Return the request that begins to read an object."""
-    return b"\x40" + multiplexer(item.index, item.subindex)
+    return transfer(0x40, item)
 
 
 def mux(item: ODVariable) -> str:
@@ -59,7 +64,7 @@ def mux(item: ODVariable) -> str:
 
 def expect_no_transfer(probe: CanopenProbe) -> None:
     """Fail unless a segment request finds no transfer under way."""
-    probe.check_abort(probe.ask("60"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("60"), Abort.COMMAND)
 
 
 @SDO.case("expedited-upload", "expedited upload states its size", "CiA 301 7.2.4.3.6")
@@ -77,18 +82,14 @@ def expedited_upload(probe: CanopenProbe) -> None:
 @SDO.case("expedited-download", "expedited download is confirmed", "CiA 301 7.2.4.3.3", intrusive=True)
 def expedited_download(probe: CanopenProbe) -> None:
     item = writable_number(probe)
-    probe.expect_answer(
-        b"\x2b" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
-    )
+    probe.expect_answer(transfer(0x2B, item, b"\x39\x30"), f"60 {mux(item)} 00000000")
     check_equal(probe.number(item.index, item.subindex), 12345, "value")
 
 
 @SDO.case("no-size", "expedited download without a size", "CiA 301 7.2.4.3.3", intrusive=True)
 def no_size(probe: CanopenProbe) -> None:
     item = writable_number(probe)
-    probe.expect_answer(
-        b"\x22" + multiplexer(item.index, item.subindex) + b"\x39\x30", f"60 {mux(item)} 00000000"
-    )
+    probe.expect_answer(transfer(0x22, item, b"\x39\x30"), f"60 {mux(item)} 00000000")
     check_equal(probe.number(item.index, item.subindex), 12345, "value")
 
 
@@ -124,7 +125,7 @@ def upload_toggle(probe: CanopenProbe) -> None:
 def segmented_download(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     for command, size, value in ((0x21, 2, b"\x39\x30"), (0x20, 0, b"\x38\x30")):
-        request = bytes([command]) + multiplexer(item.index, item.subindex) + size.to_bytes(4, "little")
+        request = transfer(command, item, size.to_bytes(4, "little"))
         probe.expect_answer(request, f"60 {mux(item)} 00000000")
         probe.expect_answer(bytes([5 << 1 | 1]) + value, "20 00000000000000")
         check_equal(probe.read(item.index, item.subindex), value, "value")
@@ -135,7 +136,7 @@ def download_in_parts(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
     value = bytes([before[0] ^ 0x55, before[1] ^ 0x01])
-    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.ask(transfer(0x21, item, b"\x02\0\0\0"))
     probe.expect_answer(bytes([6 << 1]) + value[:1], "20 00000000000000")
     probe.expect_answer(bytes([0x10 | 6 << 1 | 1]) + value[1:], "30 00000000000000")
     check_equal(probe.read(item.index, item.subindex), value, "value")
@@ -145,10 +146,10 @@ def download_in_parts(probe: CanopenProbe) -> None:
 def download_toggle(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
-    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.ask(transfer(0x21, item, b"\x02\0\0\0"))
     probe.check_abort(probe.ask(bytes([0x10 | 5 << 1 | 1, 0x11, 0x11])), Abort.TOGGLE, multiplexer=mux(item))
-    probe.check_abort(probe.ask("01"), Abort.COMMAND, multiplexer="")
-    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.check_abort(probe.ask("01"), Abort.COMMAND)
+    probe.ask(transfer(0x21, item, b"\x02\0\0\0"))
     probe.ask(bytes([6 << 1, 0x11]))
     probe.check_abort(probe.ask(bytes([6 << 1 | 1, 0x11])), Abort.TOGGLE, multiplexer=mux(item))
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
@@ -157,7 +158,7 @@ def download_toggle(probe: CanopenProbe) -> None:
 @SDO.case("announced-high", "announced size above the object's", intrusive=True)
 def announced_high(probe: CanopenProbe) -> None:
     item = writable_number(probe)
-    answer = probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x03\0\0\0")
+    answer = probe.ask(transfer(0x21, item, b"\x03\0\0\0"))
     if answer is not None and answer[0] == 0x60:
         answer = probe.ask(bytes([4 << 1 | 1, 1, 1, 1]))
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
@@ -166,7 +167,7 @@ def announced_high(probe: CanopenProbe) -> None:
 @SDO.case("sent-high", "more bytes sent than the object takes", intrusive=True)
 def sent_high(probe: CanopenProbe) -> None:
     item = writable_number(probe)
-    probe.ask(b"\x20" + multiplexer(item.index, item.subindex))
+    probe.ask(transfer(0x20, item))
     answer = probe.ask(bytes([4 << 1 | 1, 1, 1, 1]))
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
@@ -175,7 +176,7 @@ def sent_high(probe: CanopenProbe) -> None:
 def sent_low(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
-    probe.ask(b"\x20" + multiplexer(item.index, item.subindex))
+    probe.ask(transfer(0x20, item))
     answer = probe.ask(bytes([6 << 1 | 1, before[0] ^ 1]))
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_LOW, multiplexer=mux(item))
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
@@ -184,27 +185,27 @@ def sent_low(probe: CanopenProbe) -> None:
 @SDO.case("announced-differs", "fewer bytes sent than announced", intrusive=True)
 def announced_differs(probe: CanopenProbe) -> None:
     item = writable_number(probe)
-    probe.ask(b"\x21" + multiplexer(item.index, item.subindex) + b"\x02\0\0\0")
+    probe.ask(transfer(0x21, item, b"\x02\0\0\0"))
     answer = probe.ask(bytes([6 << 1 | 1, 1]))
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, Abort.LENGTH_LOW, multiplexer=mux(item))
 
 
 @SDO.case("unknown-command", "unknown command specifier")
 def unknown_command(probe: CanopenProbe) -> None:
-    probe.check_abort(probe.ask("e0 00 10 00"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("e0 00 10 00"), Abort.COMMAND)
 
 
 @SDO.case("no-transfer", "segments without a transfer")
 def no_transfer(probe: CanopenProbe) -> None:
     for request in ("60", "70", "00", "01", "a1", "a2 01 7f", "a3", "c1"):
-        probe.check_abort(probe.ask(request), Abort.COMMAND, multiplexer="")
+        probe.check_abort(probe.ask(request), Abort.COMMAND)
 
 
 @SDO.case("wrong-segment", "download segment within an upload")
 def wrong_segment(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     probe.ask(upload(item))
-    probe.check_abort(probe.ask("00"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("00"), Abort.COMMAND)
     expect_no_transfer(probe)
 
 
@@ -212,9 +213,7 @@ def wrong_segment(probe: CanopenProbe) -> None:
 def client_abort(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     probe.ask(upload(item))
-    probe.send(
-        0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes.fromhex("00000405")
-    )
+    probe.send(0x600 + probe.node, transfer(0x80, item, bytes.fromhex("00000405")))
     probe.expect_silence(0x580 + probe.node, "answer to an abort")
     expect_no_transfer(probe)
 
@@ -277,6 +276,3 @@ def server_parameter(probe: CanopenProbe) -> None:
     probe.require(0x1200)
     check_equal(probe.number(0x1200, 1), 0x600 + probe.node, "1200h:01h")
     check_equal(probe.number(0x1200, 2), 0x580 + probe.node, "1200h:02h")
-
-
-CASES: Final = (*SDO.cases,)

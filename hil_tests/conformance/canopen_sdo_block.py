@@ -7,16 +7,13 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.hil_tests.conformance.canopen_probe import (
-    Abort,
-    CanopenProbe,
-    multiplexer,
-)
+from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, multiplexer
 from starhil.hil_tests.conformance.canopen_sdo import (
     LONGEST_TIMEOUT_S,
     expect_no_transfer,
     long_text,
     mux,
+    transfer,
     writable_number,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
@@ -34,7 +31,7 @@ def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
             datatypes.VISIBLE_STRING,
             datatypes.OCTET_STRING,
         }:
-            begun = probe.ask(b"\x40" + multiplexer(item.index, item.subindex))
+            begun = probe.ask(transfer(0x40, item))
             probe.abandon_transfer()
             if begun is None or begun[0] != 0x41:
                 continue
@@ -51,7 +48,7 @@ def _begin(
     probe: CanopenProbe, item: ODVariable, size: int = 127, *, crc: bool = True, threshold: int = 0
 ) -> bytes:
     command = 0xA4 if crc else 0xA0
-    answer = probe.ask(bytes([command]) + multiplexer(item.index, item.subindex) + bytes([size, threshold]))
+    answer = probe.ask(transfer(command, item, bytes([size, threshold])))
     if answer is None:
         raise CaseFailed("an answer to the block upload", "nothing")
     return answer
@@ -162,10 +159,10 @@ def upload_order(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     for request in ("a2 01 01", "a1", "60"):
         _begin(probe, item, 1)
-        probe.check_abort(probe.ask(request), Abort.COMMAND, multiplexer="")
+        probe.check_abort(probe.ask(request), Abort.COMMAND)
     _begin(probe, item, 1)
     _segments(probe, b"\xa3", 1)
-    probe.check_abort(probe.ask("a1"), Abort.COMMAND, multiplexer="")
+    probe.check_abort(probe.ask("a1"), Abort.COMMAND)
 
 
 @SDO_BLOCK.case("threshold", "protocol switch threshold", "CiA 301 7.2.4.3.13")
@@ -183,7 +180,7 @@ def threshold(probe: CanopenProbe) -> None:
 def upload_refused(probe: CanopenProbe) -> None:
     probe.expect_abort("a4 05 00 00 7f 00", Abort.NO_OBJECT)
     item = probe.find("write-only object", lambda item: item.access_type == "wo")
-    probe.expect_abort(b"\xa4" + multiplexer(item.index, item.subindex) + b"\x7f\0", Abort.WRITE_ONLY)
+    probe.expect_abort(transfer(0xA4, item, b"\x7f\0"), Abort.WRITE_ONLY)
 
 
 @SDO_BLOCK.case("upload-time-out", "a block upload whose client stops sending times out")
@@ -199,8 +196,7 @@ def upload_time_out(probe: CanopenProbe) -> None:
 def _begin_download(probe: CanopenProbe, item: ODVariable, size: int | None, *, crc: bool = True) -> int:
     """Begin a block download; return the block size that the node wants."""
     command = 0xC0 | (0x04 if crc else 0) | (0 if size is None else 0x02)
-    request = bytes([command]) + multiplexer(item.index, item.subindex) + (size or 0).to_bytes(4, "little")
-    answer = probe.ask(request)
+    answer = probe.ask(transfer(command, item, (size or 0).to_bytes(4, "little")))
     if answer is None or answer[0] & 0xFB != 0xA0:
         raise CaseFailed("answer A0h or A4h", "nothing" if answer is None else answer.hex(" "))
     check_equal(answer[1:4], multiplexer(item.index, item.subindex), "multiplexer")
@@ -276,7 +272,7 @@ def download_length(probe: CanopenProbe) -> None:
 @SDO_BLOCK.case("download-announced", "announced size that differs from the object's", intrusive=True)
 def download_announced(probe: CanopenProbe) -> None:
     item = writable_number(probe)
-    answer = probe.ask(b"\xc2" + multiplexer(item.index, item.subindex) + b"\x03\0\0\0")
+    answer = probe.ask(transfer(0xC2, item, b"\x03\0\0\0"))
     if answer is not None and answer[0] != 0x80:
         probe.ask(b"\x81\x39\x30\x01")
         answer = _end(probe, 4, 0)
@@ -288,9 +284,7 @@ def download_abort(probe: CanopenProbe) -> None:
     """80h is not a segment."""
     item = writable_number(probe)
     _begin_download(probe, item, 2)
-    probe.send(
-        0x600 + probe.node, b"\x80" + multiplexer(item.index, item.subindex) + bytes.fromhex("00000405")
-    )
+    probe.send(0x600 + probe.node, transfer(0x80, item, bytes.fromhex("00000405")))
     probe.expect_silence(0x580 + probe.node, "answer to an abort")
     expect_no_transfer(probe)
 
@@ -299,6 +293,3 @@ def download_abort(probe: CanopenProbe) -> None:
 def download_refused(probe: CanopenProbe) -> None:
     probe.expect_abort("c2 00 10 00 04 00 00 00", Abort.READ_ONLY)
     probe.expect_abort("c2 05 00 00 04 00 00 00", Abort.NO_OBJECT)
-
-
-CASES: Final = (*SDO_BLOCK.cases,)

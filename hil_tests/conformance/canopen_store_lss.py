@@ -300,9 +300,3 @@ def states(probe: CanopenProbe) -> None:
         probe.send(LSS_TO_SLAVE, b"\x04\x01" + bytes(6))
         check_equal(_lss(probe, "5e"), bytes([0x5E, probe.node]) + bytes(6), "answer")
         _wait(probe)
-
-
-CASES: Final = (
-    *STORE.cases,
-    *LSS.cases,
-)

@@ -19,22 +19,24 @@ from starhil.hil_tests.conformance import (
 )
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
-from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.case import Case, cases_of
 from starhil.hil_tests.conformance.suites import is_cubestar
 from starhil.protocol.icd import InterfaceDefinition
 
-CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
-    *canopen_eds.CASES,
-    *canopen_nmt.CASES,
-    *canopen_sdo.CASES,
-    *canopen_sdo_block.CASES,
-    *canopen_od.CASES,
-    *canopen_sync_time.CASES,
-    *canopen_emcy.CASES,
-    *canopen_tpdo.CASES,
-    *canopen_rpdo.CASES,
-    *canopen_store_lss.CASES,
-    *canopen_design.CASES,
+CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
+    cases_of(
+        canopen_eds,
+        canopen_nmt,
+        canopen_sdo,
+        canopen_sdo_block,
+        canopen_od,
+        canopen_sync_time,
+        canopen_emcy,
+        canopen_tpdo,
+        canopen_rpdo,
+        canopen_store_lss,
+        canopen_design,
+    )
 )
 """Those of CiA 301, whatever the unit."""
 

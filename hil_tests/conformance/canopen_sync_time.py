@@ -106,9 +106,3 @@ def time_malformed(probe: CanopenProbe) -> None:
     for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
         probe.send(0x100, data)
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
-
-
-CASES: Final = (
-    *SYNC.cases,
-    *TIME.cases,
-)

@@ -266,6 +266,3 @@ def mapping_length(probe: CanopenProbe) -> None:
     probe.expect_refusal(index + 0x200, 0, 3, 1, Abort.PDO_LENGTH)
     probe.expect_refusal(index + 0x200, 0, 65, 1, Abort.PDO_LENGTH, *VALUE_ABORTS)
     probe.set(index + 0x200, 0, 2, 1)
-
-
-CASES: Final = (*TPDO.cases,)

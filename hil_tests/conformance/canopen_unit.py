@@ -24,7 +24,7 @@ from starhil.hil_tests.conformance.unit_cases import ATTITUDE_S, CLOCK_S, QUATER
 from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedMember, PlacedObject, read_layout
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import Value
+from starhil.protocol.values import SCALAR_SIZES, Value
 
 PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
 """CAN IDs of the first four RPDOs and TPDOs, to which the node-ID is added (CiA 301 7.3.5)."""
@@ -115,20 +115,14 @@ def _entry(
 
 
 def _bytes_of(type_: str) -> int:
-    return 1 if type_ in ("bool", "enum8") else int(type_[1:]) // 8
+    return SCALAR_SIZES.get(type_, 1)
 
 
 def canopen_unit_cases(icd: InterfaceDefinition) -> list[Case[CanopenProbe]]:
     """Make the cases of a unit with CANopen."""
     layout = read_layout(icd)
     found = list(entries(icd, layout))
-    return [
-        *_rows(icd, found),
-        *_commands(found),
-        *_records(found),
-        *_limits(found),
-        *_pdos(layout, found),
-    ]
+    return [*_rows(icd, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
 
 
 def _case(
@@ -256,16 +250,15 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         if command.action == "reset":
             title = f"{command.name} restarts the node"
             mode = next((item for item in found if item.row is not None and _reports(item, "mode")), None)
-            yield _case(
-                "commands", command.name, title, _restarts(entry, command, mode), clause_of_row(command)
-            )
+            run = _restarts(entry, command, mode)
         elif entry.row is not None and entry.slot is not None:
             title = f"{entry.name}h reports each value of {command.name} that was written"
-            yield _case("commands", command.name, title, _reported(entry, command), clause_of_row(command))
+            run = _reported(entry, command)
         elif command.action in (None, "nothing"):
-            title = f"{command.name} is accepted"
-            run = _accepted(entry, command)
-            yield _case("commands", command.name, title, run, clause_of_row(command))
+            title, run = f"{command.name} is accepted", _accepted(entry, command)
+        else:
+            continue
+        yield _case("commands", command.name, title, run, clause_of_row(command))
 
 
 def _accepted(entry: Entry, command: Row) -> Run:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from types import ModuleType
+from typing import Any, Generic, TypeVar
 
 ProbeType = TypeVar("ProbeType")
 
@@ -94,6 +95,12 @@ class CaseArea(Generic[ProbeType]):
             return run
 
         return register
+
+
+def cases_of(*modules: ModuleType) -> list[Case[Any]]:
+    """Return the cases of the areas that some modules define, in their order."""
+    areas = (item for module in modules for item in vars(module).values() if isinstance(item, CaseArea))
+    return [case for area in areas for case in area.cases]
 
 
 def rule(number: int) -> str:

@@ -27,7 +27,7 @@ from starhil.hil_tests.conformance.unit_probe import SerialUnitProbe
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.results import FAILED
 from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
@@ -227,7 +227,9 @@ def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"
     if needs_bus:
-        channel = stack.enter_context(PrivateCanBus()) if request.can in (None, "auto") else str(request.can)
+        channel = (
+            stack.enter_context(private_can_bus()) if request.can in (None, "auto") else str(request.can)
+        )
     extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
     if request.speed != 1.0:
         extra += ["--clock", f"scaled:{request.speed:g}"]

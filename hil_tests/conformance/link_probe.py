@@ -34,6 +34,9 @@ LONG_PAUSE_S: Final = 0.8
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, for time-outs of the device to pass."""
 
+SHOWN_BYTES: Final = 48
+"""Bytes on a serial line that a line of the log shows."""
+
 LIVELY: Final = ("identification", "device_status", "acknowledge")
 """Rows of which a unit answers one at least."""
 
@@ -152,6 +155,21 @@ class PortProbe(ABC):
         self.sleep(RECOVERY_S)
 
 
+class SerialWire(PortProbe):
+    """Sends bytes on a serial line, and logs what passes both ways."""
+
+    link = "serial"
+
+    def send(self, data: bytes) -> None:
+        """Send raw bytes."""
+        self._note("->", data)
+        self.port.send(data)
+
+    def _note(self, way: str, data: bytes) -> None:
+        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
+        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
+
+
 class LinkProbe(PortProbe):
     """Talks to one CubeStar over one link."""
 
@@ -197,10 +215,12 @@ class LinkProbe(PortProbe):
     def telemetry(self, name: str) -> dict[str, Value]:
         """Read a row by name; anything but its telemetry fails the case."""
         row = self.icd.telemetry[name]
-        answer = self.ask(row.id)
-        if answer.kind != "telemetry" or len(answer.data) != row.size:
-            raise CaseFailed(f"telemetry {row.id} ({name}) of {row.size} bytes", str(answer))
-        return row.decode(answer.data)
+        return row.decode(self.data_of(row))
+
+    def data_of(self, row: Row) -> bytes:
+        """Read the bytes of a row; anything but its telemetry fails the case."""
+        self.post(row.id)
+        return self.expect_telemetry(row.id)
 
     def command(self, name: str, **values: Value) -> None:
         """Send a telecommand by name; anything but its acknowledge fails the case."""
@@ -219,6 +239,11 @@ class LinkProbe(PortProbe):
         if answer.kind != "nack" or answer.code != code:
             raise CaseFailed(f"refusal of {self._name(identifier)} with code {code}", str(answer))
 
+    def expect_refused(self, name: str, code: int, **values: Value) -> None:
+        """Send a telecommand by name, which must be refused with a code."""
+        row = self.icd.telecommands[name]
+        self.expect_refusal(row.id, row.encode(values), code)
+
     def expect_telemetry(self, identifier: int, timeout_s: float | None = None) -> bytes:
         """Take the next answer, which must be the telemetry of a row, and return its data."""
         row = self.icd.telemetry_by_id[identifier]
@@ -236,8 +261,7 @@ class LinkProbe(PortProbe):
 
     def expect_alive(self) -> None:
         """Fail the case unless the next good request is answered."""
-        self.post(self.icd.telemetry["identification"].id)
-        self.expect_telemetry(self.icd.telemetry["identification"].id)
+        self.telemetry("identification")
 
     def _name(self, identifier: int) -> str:
         row = self.icd.row_by_id(identifier)
@@ -252,8 +276,8 @@ class LinkProbe(PortProbe):
         """
         end = self.now() + within_s
         while True:
-            answer = self.ask(self.icd.telemetry[name].id)
             row = self.icd.telemetry[name]
+            answer = self.ask(row.id)
             seen: object = answer
             if answer.kind == "telemetry" and len(answer.data) == row.size:
                 values = row.decode(answer.data)
@@ -282,6 +306,10 @@ class LinkProbe(PortProbe):
         self.command("select_parameter", parameter=self.icd.parameters[name].id)
         return self.telemetry("parameter")
 
+    def value_of(self, name: str) -> float:
+        """Read a parameter's value."""
+        return float(self.parameter(name)["value"])
+
     def set_parameter(self, name: str, number: float) -> None:
         """Set a parameter, which must be accepted."""
         self.command("set_parameter", parameter=self.icd.parameters[name].id, value=number)
@@ -289,7 +317,7 @@ class LinkProbe(PortProbe):
     @contextmanager
     def parameters_kept(self, *names: str) -> Iterator[None]:
         """Restore the values of parameters afterwards."""
-        before = {name: float(self.parameter(name)["value"]) for name in names}
+        before = {name: self.value_of(name) for name in names}
         try:
             yield
         finally:

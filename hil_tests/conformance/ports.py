@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import queue
 import time
-from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
@@ -86,9 +85,7 @@ class LivePort(Generic[Item]):
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._loop.run(self._end())
         self._loop.close()
 

@@ -88,8 +88,7 @@ def telemetry_with_data(probe: LinkProbe) -> None:
 def _telemetry_case(row: Row) -> Case[LinkProbe]:
     def run(probe: LinkProbe) -> None:
         for _ in range(2):
-            probe.post(row.id)
-            checked_values(row, probe.expect_telemetry(row.id))
+            checked_values(row, probe.data_of(row))
 
     title = f"{row.name} has {row.size} bytes and values within their limits"
     return Case(f"telemetry.{row.name}", "telemetry", title, clause_of(row), run)
@@ -137,7 +136,7 @@ def bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
         return bytes(good[: field.offset] + raw + good[field.offset + field.size :])
 
     if field.kind == "float":
-        form = ("<" if field.slot.order == "little" else ">") + ("f" if field.type == "f32" else "d")
+        form = field.slot.format
         yield "nan", with_raw(struct.pack(form, math.nan))
         yield "infinite", with_raw(struct.pack(form, math.inf))
         low, high = field.physical_limits
@@ -190,26 +189,23 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
         )
 
     def refusals(probe: LinkProbe) -> None:
-        before = float(probe.parameter(parameter.name)["value"])
+        before = probe.value_of(parameter.name)
         row = probe.icd.telecommands["set_parameter"]
         for bad in _outside(parameter):
             data = row.encode({"parameter": parameter.id, "value": bad}, check=False)
             answer = probe.ask(row.id, data)
             if answer.kind == "ack":
                 probe.set_parameter(parameter.name, before)
-            check(
-                answer.kind == "nack" and answer.code == INVALID_PARAMETER,
-                f"{bad:g} refused with code 3",
-                answer,
-            )
-            check_equal(float(probe.parameter(parameter.name)["value"]), before, "unchanged value")
+            refused = answer.kind == "nack" and answer.code == INVALID_PARAMETER
+            check(refused, f"{bad:g} refused with code 3", answer)
+            check_equal(probe.value_of(parameter.name), before, "unchanged value")
 
     def values(probe: LinkProbe) -> None:
         partner, room = PARTNERS.get(parameter.name, (parameter.name, None))
         with probe.parameters_kept(parameter.name, partner):
             if room is not None:
                 probe.set_parameter(partner, room)
-            for good in _inside(parameter, float(probe.parameter(parameter.name)["value"])):
+            for good in _inside(parameter, probe.value_of(parameter.name)):
                 probe.set_parameter(parameter.name, good)
                 seen = float(probe.telemetry("parameter")["value"])
                 same = abs(seen - good) <= F32_ROUNDING * max(abs(good), 1e-30)
@@ -240,10 +236,8 @@ def _outside(parameter: Parameter) -> list[float]:
     if _whole(parameter):
         bad.append(parameter.minimum + 0.5)
     if parameter.enum is not None:
-        gaps = set(range(int(parameter.minimum), int(parameter.maximum))) - set(
-            parameter.enum.values.values()
-        )
-        bad += [float(gap) for gap in sorted(gaps)]
+        numbers = range(int(parameter.minimum), int(parameter.maximum))
+        bad += [float(gap) for gap in sorted(set(numbers) - set(parameter.enum.values.values()))]
     return bad
 
 

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from starhil.hil_tests.conformance.case import (
-    CaseArea,
-    CaseFailed,
-    CaseSkipped,
-    check,
-    check_equal,
-    rule,
-)
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -185,11 +178,3 @@ def pace(probe: SerialProbe) -> None:
     seconds = probe.now() - begin
     if seconds < least - CLOCK_GRAIN_S:
         raise CaseFailed(f"at least {least * 1e3:.2f} ms at {probe.baud} baud", f"{seconds * 1e3:.2f} ms")
-
-
-CASES: Final = (
-    *FRAMING.cases,
-    *STUFFING.cases,
-    *ERRORS.cases,
-    *TIMING.cases,
-)

@@ -5,11 +5,17 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.hil_tests.conformance.case import CaseFailed
-from starhil.hil_tests.conformance.link_probe import BURST_ID, FIRST_TELEMETRY, Answer, LinkProbe, ProbeTimes
+from starhil.hil_tests.conformance.link_probe import (
+    BURST_ID,
+    FIRST_TELEMETRY,
+    Answer,
+    LinkProbe,
+    ProbeTimes,
+    SerialWire,
+)
 from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.icd import InterfaceDefinition
 
-SHOWN_BYTES: Final = 48
 BURST_BODY: Final = 23
 """Identifier, packet number and 20 bytes of data."""
 
@@ -21,7 +27,7 @@ def framed(identifier: int, data: bytes = b"") -> bytes:
     return b"\x1f\x7f" + (bytes([identifier]) + data).replace(b"\x1f", b"\x1f\x1f") + b"\x1f\xff"
 
 
-class SerialProbe(LinkProbe):
+class SerialProbe(SerialWire, LinkProbe):
     """Talks over a serial port.
 
     Parameters
@@ -35,8 +41,6 @@ class SerialProbe(LinkProbe):
     baud
         Bit rate of the line, None if unknown; for the cases on its pace.
     """
-
-    link = "serial"
 
     def __init__(
         self,
@@ -66,18 +70,9 @@ class SerialProbe(LinkProbe):
         """Take the next answer, which must be the telemetry of the row with that number."""
         self.expect_telemetry(int(answer))
 
-    def send(self, data: bytes) -> None:
-        """Send raw bytes."""
-        self._note("->", data)
-        self.port.send(data)
-
     def send_text(self, text: str) -> None:
         """Send bytes written in hexadecimal."""
         self.send(bytes.fromhex(text))
-
-    def _note(self, way: str, data: bytes) -> None:
-        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
-        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
 
     def _receive(self, timeout_s: float) -> bool:
         data = self.port.receive(timeout_s)

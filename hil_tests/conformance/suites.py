@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from starhil.hil_tests.conformance import behaviour_cases, image_cases, serial_cases, traffic_cases
 from starhil.hil_tests.conformance.can_cases import can_cases
-from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.case import Case, cases_of
 from starhil.hil_tests.conformance.row_cases import row_cases
 from starhil.hil_tests.conformance.unit_cases import unit_cases, unit_row_cases
 from starhil.hil_tests.errors import BenchError
@@ -35,7 +35,9 @@ def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
     """
     if icd.link.serial is None:
         raise BenchError(f"unit {icd.name}: has no serial link")
-    return _named("serial", *((serial_cases.CASES, _common(icd)) if is_cubestar(icd) else (unit_cases(icd),)))
+    if is_cubestar(icd):
+        return _named("serial", cases_of(serial_cases), _common(icd))
+    return _named("serial", unit_cases(icd))
 
 
 def can_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
@@ -54,7 +56,7 @@ def can_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
 
 
 def _common(icd: InterfaceDefinition) -> list[Case[Any]]:
-    return [*row_cases(icd), *behaviour_cases.CASES, *image_cases.CASES, *traffic_cases.CASES]
+    return [*row_cases(icd), *cases_of(behaviour_cases, image_cases, traffic_cases)]
 
 
 def _named(link: str, *tables: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:

@@ -79,8 +79,7 @@ def unsolicited_long(probe: LinkProbe) -> None:
     "refused", "unsolicited telemetry of a row that does not exist is refused", "published error codes"
 )
 def unsolicited_refused(probe: LinkProbe) -> None:
-    row = probe.icd.telecommands["set_unsolicited"]
-    probe.expect_refusal(row.id, row.encode({"telemetry": 200, "rate": 1.0}), INVALID_PARAMETER)
+    probe.expect_refused("set_unsolicited", INVALID_PARAMETER, telemetry=200, rate=1.0)
 
 
 # --- recovery ---
@@ -112,10 +111,3 @@ def flood(probe: LinkProbe) -> None:
     for _ in range(100):
         for row in rows:
             probe.expect_telemetry(row.id, 2.0)
-
-
-CASES: Final = (
-    *TIMING.cases,
-    *UNSOLICITED.cases,
-    *RECOVERY.cases,
-)

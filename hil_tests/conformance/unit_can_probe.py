@@ -26,9 +26,9 @@ class CanUnitProbe(CanWire, UnitProbe):
         """Send a request without waiting."""
         self.post_as(self.host, request.id, request.data)
 
-    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+    def next_reply(self) -> Reply | LinkFault | None:
         """Return the next reply, None if none comes in time."""
-        answer = self.next_answer(timeout_s)
+        answer = self.next_answer()
         if answer.kind == "none":
             return None
         if answer.kind == "malformed":

@@ -78,8 +78,7 @@ def marks(icd: InterfaceDefinition) -> bytes:
     link = icd.link.serial
     match link.framing if link is not None else None:
         case SlipFraming() as framing:
-            pair = framing.substitutes or (0xDC, 0xDD)
-            return bytes((framing.end, framing.escape, *pair))
+            return bytes((framing.end, framing.escape, *framing.escaped))
         case EscapedFraming() as framing:
             return bytes((framing.escape, framing.start, framing.end))
         case DelimitedFraming() as framing:
@@ -249,14 +248,9 @@ def _silent_header(
 
 def _identifiers(icd: InterfaceDefinition, stack: object, clause: str) -> Iterator[Case[UnitProbe]]:
     for klass in [item.name for item in icd.classes if item.code is not None] or [""]:
-        yield _case(
-            "identifiers",
-            klass or "unknown",
-            f"unknown identifiers{f' of class {klass}' if klass else ''} are refused",
-            _unknown(icd, stack, klass),
-            clause,
-            intrusive=True,
-        )
+        title = f"unknown identifiers{f' of class {klass}' if klass else ''} are refused"
+        run = _unknown(icd, stack, klass)
+        yield _case("identifiers", klass or "unknown", title, run, clause, intrusive=True)
 
 
 def _unknown(icd: InterfaceDefinition, stack: object, klass: str) -> Run:
@@ -328,26 +322,18 @@ def _lengths(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
         for why, data in (("long", whole + b"\0"), ("short", whole[:-1])):
             if data != whole:
                 title = f"{row.name} with {len(data)} bytes of data ({why}) is refused for its length"
-                run = _refused(row, data, ErrorCode.INVALID_LENGTH)
-                yield _case(
-                    "lengths",
-                    f"{row.name}.{why}",
-                    title,
-                    run,
-                    clause_of_row(row),
-                    intrusive=row.kind == "telecommand",
-                )
+                run, name = _refused(row, data, ErrorCode.INVALID_LENGTH), f"{row.name}.{why}"
+                intrusive = row.kind == "telecommand"
+                yield _case("lengths", name, title, run, clause_of_row(row), intrusive=intrusive)
 
 
 def _limits(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
     for row in icd.telecommands.values():
         for name, field in row.named_fields.items():
             for why, data in bad_values(row, field):
+                run, full = _refused(row, data, ErrorCode.INVALID_PARAMETER), f"{row.name}.{name}.{why}"
                 title = f"{row.name} with {name} {why} is refused"
-                run = _refused(row, data, ErrorCode.INVALID_PARAMETER)
-                yield _case(
-                    "limits", f"{row.name}.{name}.{why}", title, run, clause_of_row(row), intrusive=True
-                )
+                yield _case("limits", full, title, run, clause_of_row(row), intrusive=True)
 
 
 def _refused(row: Row, data: bytes, code: ErrorCode) -> Run:
@@ -391,7 +377,9 @@ def _read_back(command: Row, row: Row, used: bytes) -> Run:
 
 def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
     """Return a value within the limits: of bytes that the framing uses, if it may have them, or random."""
-    pattern = (used * 8)[turn : turn + field.size] if turn < 2 and used else rng.randbytes(field.size)
+    pattern = (
+        (used * (turn + field.size))[turn:][: field.size] if turn < 2 and used else rng.randbytes(field.size)
+    )
     match field.kind:
         case "bytes":
             return pattern
@@ -402,8 +390,7 @@ def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
         case "enum":
             return rng.choice(list(field.enum.values)) if field.enum is not None else 0
         case "float":
-            order = "<" if field.slot.order == "little" else ">"
-            (value,) = struct.unpack(order + ("f" if field.type == "f32" else "d"), pattern)
+            (value,) = struct.unpack(field.slot.format, pattern)
             low, high = field.physical_limits
             return float(min(max(value, low), high)) if abs(value) < 1e30 else 0.0
         case _:
@@ -419,9 +406,8 @@ def _echoes(icd: InterfaceDefinition) -> Iterator[Case[SerialUnitProbe]]:
     for row in icd.rows:
         if "echo" in row.answers:
             title = f"{row.name} is echoed byte for byte before anything else"
-            yield _case(
-                "echo", row.name, title, _echoed(row), clause_of_row(row), intrusive=row.kind == "telecommand"
-            )
+            intrusive = row.kind == "telecommand"
+            yield _case("echo", row.name, title, _echoed(row), clause_of_row(row), intrusive=intrusive)
 
 
 def _echoed(row: Row) -> Callable[[SerialUnitProbe], None]:

@@ -8,7 +8,13 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
-from starhil.hil_tests.conformance.link_probe import PortProbe, ProbeTimes, checked_values
+from starhil.hil_tests.conformance.link_probe import (
+    SHOWN_BYTES,
+    PortProbe,
+    ProbeTimes,
+    SerialWire,
+    checked_values,
+)
 from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
@@ -18,7 +24,6 @@ from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.values import Value
 
-SHOWN_BYTES: Final = 48
 PAUSE: Final = 1.6
 """Silence after which a message has surely timed out, in time-outs."""
 
@@ -44,7 +49,7 @@ class UnitProbe(PortProbe):
         """Send a request without waiting; `answered` unless no answer is expected."""
 
     @abstractmethod
-    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+    def next_reply(self) -> Reply | LinkFault | None:
         """Return the next reply, None if none comes in time."""
 
     @abstractmethod
@@ -151,7 +156,7 @@ class UnitProbe(PortProbe):
             self.command(command, data)
 
 
-class SerialUnitProbe(UnitProbe):
+class SerialUnitProbe(SerialWire, UnitProbe):
     """Talks over a serial port.
 
     Parameters
@@ -163,8 +168,6 @@ class SerialUnitProbe(UnitProbe):
     style
         Dialect of the replies, of a unit that has dialects.
     """
-
-    link = "serial"
 
     def __init__(
         self,
@@ -187,11 +190,6 @@ class SerialUnitProbe(UnitProbe):
         """Let a message that has begun time out."""
         self.sleep(PAUSE * self.timeout_s)
 
-    def send(self, data: bytes) -> None:
-        """Send raw bytes."""
-        self._note("->", data)
-        self.port.send(data)
-
     def drain(self) -> None:
         """Discard everything received and expected."""
         super().drain()
@@ -202,10 +200,6 @@ class SerialUnitProbe(UnitProbe):
         self._expected: deque[tuple[Request, int]] = deque()
         self._replies: deque[Reply | LinkFault] = deque()
         self._unsolicited: list[Reply] = []
-
-    def _note(self, way: str, data: bytes) -> None:
-        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
-        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
 
     def _receive(self, timeout_s: float) -> bool:
         data = self.port.receive(timeout_s)
@@ -248,9 +242,9 @@ class SerialUnitProbe(UnitProbe):
             self.expecting(request)
         self.send(self.stack.encode_request(request))
 
-    def next_reply(self, timeout_s: float | None = None) -> Reply | LinkFault | None:
+    def next_reply(self) -> Reply | LinkFault | None:
         """Return the next reply, None if none comes in time; one with data in several parts as one."""
-        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        end = self.now() + self.times.answer_s
         while not self._replies and (left := end - self.now()) > 0:
             self._receive(left)
         return self._replies.popleft() if self._replies else None

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, TypeVar
 
 from starhil.hil_tests.conformance.can_probe import CanWire
 from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
+from starhil.protocol.values import Value
 
 ProbeType = TypeVar("ProbeType", bound=LinkProbe)
 WireType = TypeVar("WireType", bound=LinkProbe | CanWire)
@@ -52,21 +54,19 @@ def add_exchange_cases(
 ) -> None:
     """Add one case per row."""
     for row in rows:
-        _add_exchange_case(area, row, intrusive)
+        area.case(row.id, row.title, row.clause, intrusive=intrusive)(partial(_exchange, row))
 
 
-def _add_exchange_case(area: CaseArea[WireType], row: Exchange, intrusive: bool) -> None:
-    @area.case(row.id, row.title, row.clause, intrusive=intrusive)
-    def run(probe: WireType) -> None:
-        probe.expecting(*row.answers)
-        for text in row.sent:
-            probe.send_text(text)
-            probe.sleep(row.pause_s)
-        for answer in row.answers:
-            probe.expect_exactly(answer)
-        probe.expect_silence("no more was asked for")
-        # a message that was left open ends at the start of the next one
-        probe.expect_alive()
+def _exchange(row: Exchange, probe: LinkProbe | CanWire) -> None:
+    probe.expecting(*row.answers)
+    for text in row.sent:
+        probe.send_text(text)
+        probe.sleep(row.pause_s)
+    for answer in row.answers:
+        probe.expect_exactly(answer)
+    probe.expect_silence("no more was asked for")
+    # a message that was left open ends at the start of the next one
+    probe.expect_alive()
 
 
 @dataclass(frozen=True)
@@ -92,34 +92,31 @@ class FlagRow:
     pause_s: float | None = 0.0
 
 
-def check_flags(probe: LinkProbe, expected: frozenset[str]) -> None:
-    """Read `communication_status`; fail the case unless exactly these flags are set."""
+def check_flags(probe: LinkProbe, expected: frozenset[str]) -> dict[str, Value]:
+    """Read `communication_status` and return it; fail the case unless exactly these flags are set."""
     status = probe.telemetry("communication_status")
     seen = {flag for flag in FLAG_NAMES if status[flag]}
     check(seen == expected, f"flags {_names(expected)}", _names(seen))
+    return status
 
 
 def add_flag_cases(area: CaseArea[ProbeType], rows: Iterable[FlagRow]) -> None:
     """Add one case per row."""
     for row in rows:
-        _add_flag_case(area, row)
+        area.case(row.id, f"{row.title} sets its flag and counts as nothing")(partial(_flags, row))
 
 
-def _add_flag_case(area: CaseArea[ProbeType], row: FlagRow) -> None:
-    @area.case(row.id, f"{row.title} sets its flag and counts as nothing")
-    def run(probe: ProbeType) -> None:
-        probe.command("clear_counters")
-        for text in row.sent:
-            probe.send_text(text)
-        if row.pause_s is not None:
-            probe.expect_silence("no request was made", max(row.pause_s, probe.times.quiet_s))
-        status = probe.telemetry("communication_status")
-        seen = {flag for flag in FLAG_NAMES if status[flag]}
-        check(seen == row.flags, f"flags {_names(row.flags)}", _names(seen))
-        counts = (status["telecommand_count"], status["telemetry_count"])
-        check_equal(counts, (0, 1), "counts of telecommands and telemetry")
-        probe.command("clear_counters")
-        check_flags(probe, frozenset())
+def _flags(row: FlagRow, probe: LinkProbe) -> None:
+    probe.command("clear_counters")
+    for text in row.sent:
+        probe.send_text(text)
+    if row.pause_s is not None:
+        probe.expect_silence("no request was made", max(row.pause_s, probe.times.quiet_s))
+    status = check_flags(probe, row.flags)
+    counts = (status["telecommand_count"], status["telemetry_count"])
+    check_equal(counts, (0, 1), "counts of telecommands and telemetry")
+    probe.command("clear_counters")
+    check_flags(probe, frozenset())
 
 
 def _names(flags: Iterable[str]) -> str:

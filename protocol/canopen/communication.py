@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.cob import BIT_30, EMERGENCY, INVALID, SDO_RECEIVE, SDO_TRANSMIT, SYNC, TIME
+from starhil.protocol.canopen.layout import CanopenModel, PdoModel
 from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING
 
 U8: Final = datatypes.UNSIGNED8
@@ -17,56 +17,17 @@ U32: Final = datatypes.UNSIGNED32
 TEXT: Final = datatypes.VISIBLE_STRING
 DOMAIN: Final = datatypes.DOMAIN
 
+VERSION: Final = "1"
+"""Hardware and software version of the node."""
+SERIAL_NUMBER: Final = 1
 HISTORY_LENGTH: Final = 8
 CONSUMERS: Final = 4
 HEARTBEAT_MS: Final = 1000
 RPDO_CAN_IDS: Final = (0x200, 0x300, 0x400, 0x500)
 TPDO_CAN_IDS: Final = (0x180, 0x280, 0x380, 0x480)
-EVENT_DRIVEN: Final = 255
 
-
-@dataclass(frozen=True)
-class Identity:
-    """Identity of the node: objects 1000h, 1008h to 100Ah and 1018h."""
-
-    device_type: int = 0
-    device_name: str = "star sensor"
-    hardware_version: str = "1"
-    software_version: str = "1"
-    vendor_name: str = ""
-    vendor_id: int = 0
-    product_code: int = 0
-    revision: int = 0
-    serial_number: int = 0
-    bit_rates: tuple[int, ...] = (1_000_000,)
-
-
-@dataclass(frozen=True)
-class PdoDefault:
-    """Default configuration of a PDO.
-
-    Attributes
-    ----------
-    enabled
-        Whether the PDO exists.
-    can_id
-        CAN ID, to which the node-ID is added; None for the predefined one, which the first four PDOs have.
-    transmission_type
-        0 to 240 synchronous, 254 or 255 by event.
-    inhibit, event_ms
-        Inhibit time in 100 µs, event timer in ms.
-    mapping
-        Mapping entries: index, sub-index, bits.
-    """
-
-    name: str
-    enabled: bool = False
-    can_id: int | None = None
-    relative: bool = True
-    transmission_type: int = EVENT_DRIVEN
-    inhibit: int = 0
-    event_ms: int = 0
-    mapping: tuple[int, ...] = ()
+MappedPdo = tuple[PdoModel, Sequence[int]]
+"""Default configuration of a PDO, and its mapping entries: index, sub-index, bits."""
 
 
 def variable(
@@ -123,7 +84,7 @@ def add_record(
 
 
 def add_communication(
-    od: ObjectDictionary, identity: Identity, rpdos: Sequence[PdoDefault], tpdos: Sequence[PdoDefault]
+    od: ObjectDictionary, layout: CanopenModel, rpdos: Sequence[MappedPdo], tpdos: Sequence[MappedPdo]
 ) -> None:
     """Add the whole communication profile.
 
@@ -131,17 +92,17 @@ def add_communication(
     ----------
     od
         Object dictionary to which the objects are added.
-    identity
-        Identity of the node.
+    layout
+        Identity of the node, and its bit rates.
     rpdos, tpdos
         The PDOs, numbered from 1.
     """
     information = od.device_information
-    information.vendor_name = identity.vendor_name
-    information.vendor_number = identity.vendor_id
-    information.product_name = identity.device_name
-    information.product_number = identity.product_code
-    information.revision_number = identity.revision
+    information.vendor_name = layout.vendor_name
+    information.vendor_number = layout.vendor_id
+    information.product_name = layout.device_name
+    information.product_number = layout.product_code
+    information.revision_number = layout.revision
     information.order_code = ""
     information.simple_boot_up_master = False
     information.simple_boot_up_slave = True
@@ -151,23 +112,22 @@ def add_communication(
     information.nr_of_RXPDO = len(rpdos)  # type: ignore[assignment]
     information.nr_of_TXPDO = len(tpdos)  # type: ignore[assignment]
     information.LSS_supported = True
-    information.allowed_baudrates = set(identity.bit_rates)
-    _add_general(od, identity)
+    information.allowed_baudrates = set(layout.bit_rates)
+    _add_general(od, layout)
     _add_messages(od)
-    _add_services(od, identity)
-    for number, default in enumerate(rpdos):
-        _add_rpdo(od, number, default)
-    for number, default in enumerate(tpdos):
-        _add_tpdo(od, number, default)
+    _add_services(od, layout)
+    for kind, pdos in (("RPDO", rpdos), ("TPDO", tpdos)):
+        for number, (model, mapping) in enumerate(pdos):
+            _add_pdo(od, kind, number, model, mapping)
 
 
-def _add_general(od: ObjectDictionary, identity: Identity) -> None:
+def _add_general(od: ObjectDictionary, layout: CanopenModel) -> None:
     for item in (
-        variable("Device type", 0x1000, 0, U32, "ro", identity.device_type),
+        variable("Device type", 0x1000, 0, U32, "ro", layout.device_type),
         variable("Error register", 0x1001, 0, U8, "ro", 0, mappable=True),
-        variable("Manufacturer device name", 0x1008, 0, TEXT, "const", identity.device_name),
-        variable("Manufacturer hardware version", 0x1009, 0, TEXT, "const", identity.hardware_version),
-        variable("Manufacturer software version", 0x100A, 0, TEXT, "const", identity.software_version),
+        variable("Manufacturer device name", 0x1008, 0, TEXT, "const", layout.device_name),
+        variable("Manufacturer hardware version", 0x1009, 0, TEXT, "const", VERSION),
+        variable("Manufacturer software version", 0x100A, 0, TEXT, "const", VERSION),
     ):
         od.add_object(item)
     errors = [
@@ -209,8 +169,8 @@ def _add_messages(od: ObjectDictionary) -> None:
     add_record(od, "Error behaviour", [behaviour], array=True)
 
 
-def _add_services(od: ObjectDictionary, identity: Identity) -> None:
-    numbers = (identity.vendor_id, identity.product_code, identity.revision, identity.serial_number)
+def _add_services(od: ObjectDictionary, layout: CanopenModel) -> None:
+    numbers = (layout.vendor_id, layout.product_code, layout.revision, SERIAL_NUMBER)
     names = ("Vendor-ID", "Product code", "Revision number", "Serial number")
     members = [
         variable(name, 0x1018, subindex, U32, "ro", number)
@@ -229,56 +189,27 @@ def _add_services(od: ObjectDictionary, identity: Identity) -> None:
     )
 
 
-def _can_id(predefined: Sequence[int], number: int, default: PdoDefault) -> int:
-    """Return a PDO's CAN ID without the node-ID, 0 for none."""
-    if default.can_id is not None:
-        return default.can_id
-    return predefined[number] if number < len(predefined) else 0
-
-
-def _add_rpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
-    index = 0x1400 + number
-    can_id = _can_id(RPDO_CAN_IDS, number, default)
-    cob_id = can_id | (0 if default.enabled else INVALID)
-    add_record(
-        od,
-        f"RPDO {number + 1} communication parameter: {default.name}",
-        [
-            variable(
-                "COB-ID used by RPDO", index, 1, U32, "rw", cob_id, relative=default.relative and bool(can_id)
-            ),
-            variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
-            variable("Event timer", index, 5, U16, "rw", default.event_ms),
-        ],
-    )
-    _add_mapping(od, 0x1600 + number, f"RPDO {number + 1}", default)
-
-
-def _add_tpdo(od: ObjectDictionary, number: int, default: PdoDefault) -> None:
-    index = 0x1800 + number
-    can_id = _can_id(TPDO_CAN_IDS, number, default)
-    cob_id = BIT_30 | can_id | (0 if default.enabled else INVALID)
-    add_record(
-        od,
-        f"TPDO {number + 1} communication parameter: {default.name}",
-        [
-            variable(
-                "COB-ID used by TPDO", index, 1, U32, "rw", cob_id, relative=default.relative and bool(can_id)
-            ),
-            variable("Transmission type", index, 2, U8, "rw", default.transmission_type),
-            variable("Inhibit time", index, 3, U16, "rw", default.inhibit),
-            variable("Event timer", index, 5, U16, "rw", default.event_ms),
-            variable("SYNC start value", index, 6, U8, "rw", 0),
-        ],
-    )
-    _add_mapping(od, 0x1A00 + number, f"TPDO {number + 1}", default)
-
-
-def _add_mapping(od: ObjectDictionary, index: int, name: str, default: PdoDefault) -> None:
-    slots = default.mapping + (0,) * (LARGEST_MAPPING - len(default.mapping))
+def _add_pdo(od: ObjectDictionary, kind: str, number: int, model: PdoModel, mapping: Sequence[int]) -> None:
+    """Add the communication and the mapping parameter of an RPDO or a TPDO."""
+    transmits = kind == "TPDO"
+    first, predefined = (0x1800, TPDO_CAN_IDS) if transmits else (0x1400, RPDO_CAN_IDS)
+    index, name = first + number, f"{kind} {number + 1}"
+    can_id = model.can_id or (predefined[number] if number < len(predefined) else 0)
+    cob_id = can_id | (BIT_30 if transmits else 0) | (0 if model.enabled else INVALID)
+    relative = model.relative and bool(can_id)
+    settings = [
+        variable(f"COB-ID used by {kind}", index, 1, U32, "rw", cob_id, relative=relative),
+        variable("Transmission type", index, 2, U8, "rw", model.transmission_type),
+        variable("Event timer", index, 5, U16, "rw", model.event_ms),
+    ]
+    if transmits:
+        settings.insert(2, variable("Inhibit time", index, 3, U16, "rw", round(model.inhibit_ms * 10)))
+        settings.append(variable("SYNC start value", index, 6, U8, "rw", 0))
+    add_record(od, f"{name} communication parameter: {model.name}", settings)
+    index += 0x200
     members = [
         variable(f"Mapped object {subindex}", index, subindex, U32, "rw", value)
-        for subindex, value in enumerate(slots, 1)
+        for subindex, value in enumerate((*mapping, *[0] * (LARGEST_MAPPING - len(mapping))), 1)
     ]
-    count = ("Number of mapped objects", len(default.mapping))
-    add_record(od, f"{name} mapping parameter: {default.name}", members, count=count)
+    count = ("Number of mapped objects", len(mapping))
+    add_record(od, f"{name} mapping parameter: {model.name}", members, count=count)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -12,8 +11,7 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, abort_of
 from starhil.protocol.canopen.communication import (
-    Identity,
-    PdoDefault,
+    MappedPdo,
     add_communication,
     add_record,
     set_limits,
@@ -65,8 +63,6 @@ class DeviceDictionary(Dictionary):
         The interface definition.
     layout
         Indices of its rows, fields and parameters.
-    identity
-        Identity of the node; default: the layout's.
 
     Attributes
     ----------
@@ -76,12 +72,7 @@ class DeviceDictionary(Dictionary):
         Parameter → key of its entry.
     """
 
-    def __init__(
-        self,
-        icd: InterfaceDefinition,
-        layout: CanopenModel,
-        identity: Identity | None = None,
-    ) -> None:
+    def __init__(self, icd: InterfaceDefinition, layout: CanopenModel) -> None:
         self.icd = icd
         self.layout = layout
         self.application: Application = StandInApplication(icd)
@@ -98,10 +89,9 @@ class DeviceDictionary(Dictionary):
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
         for placed in layout.object:
             self._add_object(objects, placed)
-        rpdos = [self._pdo_default(objects, model) for model in layout.rpdo]
-        tpdos = [self._pdo_default(objects, model) for model in layout.tpdo]
-        self.identity = identity or identity_of(layout)
-        add_communication(objects, self.identity, rpdos, tpdos)
+        rpdos = [self._mapped(objects, model) for model in layout.rpdo]
+        tpdos = [self._mapped(objects, model) for model in layout.tpdo]
+        add_communication(objects, layout, rpdos, tpdos)
         super().__init__(objects)
         for key, reader in self._readers.items():
             self.entries[key].reader = reader
@@ -267,12 +257,11 @@ class DeviceDictionary(Dictionary):
         if parameter.enum is not None:
             member.value_descriptions = dict(parameter.enum.names)
         self.parameters[parameter.name] = key
-        self._readers[key] = partial(self._read_parameter, parameter, data_type)
+        self._readers[key] = lambda: encode(
+            data_type, parameter.to_number(self.application.parameter(parameter.name))
+        )
         self._writers[key] = partial(self._write_parameter, parameter, data_type)
         return member
-
-    def _read_parameter(self, parameter: Parameter, data_type: int) -> bytes:
-        return encode(data_type, parameter.to_number(self.application.parameter(parameter.name)))
 
     def _write_parameter(self, parameter: Parameter, data_type: int, data: bytes) -> None:
         try:
@@ -335,12 +324,12 @@ class DeviceDictionary(Dictionary):
             self._writers[key] = partial(self._execute, row)
         elif row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
-            self._writers[key] = partial(self._execute_without_data, row)
+            self._writers[key] = lambda _data: self._execute(row, b"")
         elif scalar:
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
             _describe(member, fields)
-            self._writers[key] = partial(self._execute_scalar, row)
+            self._writers[key] = lambda data: self._execute(row, in_order(slot, data))
         else:
             member = variable(name, *key, datatypes.OCTET_STRING, "wo")
             self._sizes[key] = row.size
@@ -356,12 +345,6 @@ class DeviceDictionary(Dictionary):
         except MessageError as error:
             raise abort_of(error) from None
         return self.application.telecommand(row, payload)
-
-    def _execute_scalar(self, row: Row, payload: bytes) -> Deferred | None:
-        return self._execute(row, in_order(row.slots[0], payload))
-
-    def _execute_without_data(self, row: Row, _data: bytes) -> Deferred | None:
-        return self._execute(row, b"")
 
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
         return in_order(slot, self.row_bytes(row)[span_of(slot)])
@@ -379,23 +362,14 @@ class DeviceDictionary(Dictionary):
         slot = row.named_fields[field_name].slot
         return row, slot, [field for field in row.named_fields.values() if field.slot.index == slot.index]
 
-    def _pdo_default(self, objects: ObjectDictionary, model: PdoModel) -> PdoDefault:
+    def _mapped(self, objects: ObjectDictionary, model: PdoModel) -> MappedPdo:
         mapping = []
         for name in model.objects:
             index, subindex = self.key_of(name)
             item = objects[index]
             member = item if isinstance(item, ODVariable) else item[subindex]
             mapping.append(index << 16 | subindex << 8 | (type_size(member.data_type) or 0) * 8)
-        return PdoDefault(
-            name=model.name,
-            enabled=model.enabled,
-            can_id=model.can_id,
-            relative=model.relative,
-            transmission_type=model.transmission_type,
-            inhibit=round(model.inhibit_ms * 10),
-            event_ms=model.event_ms,
-            mapping=tuple(mapping),
-        )
+        return model, mapping
 
 
 class _Packer:
@@ -436,30 +410,9 @@ class _Packer:
         return enum.values[value]
 
 
-def identity_of(layout: CanopenModel) -> Identity:
-    """Return the identity in the layout."""
-    return Identity(
-        device_type=layout.device_type,
-        device_name=layout.device_name,
-        vendor_name=layout.vendor_name,
-        vendor_id=layout.vendor_id,
-        product_code=layout.product_code,
-        revision=layout.revision,
-        bit_rates=tuple(layout.bit_rates),
-    )
-
-
-def build_dictionary(
-    icd: InterfaceDefinition,
-    layout: CanopenModel | None = None,
-    *,
-    serial_number: int = 1,
-    software_version: str = "1",
-) -> DeviceDictionary:
-    """Build the object dictionary of the device that serves a definition, by default with the definition's layout."""
-    layout = read_layout(icd) if layout is None else layout
-    identity = replace(identity_of(layout), serial_number=serial_number, software_version=software_version)
-    return DeviceDictionary(icd, layout, identity)
+def build_dictionary(icd: InterfaceDefinition) -> DeviceDictionary:
+    """Build the object dictionary of the device that serves a definition, with the definition's layout."""
+    return DeviceDictionary(icd, read_layout(icd))
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

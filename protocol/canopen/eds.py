@@ -22,23 +22,15 @@ DOMAIN: Final = 0x2
 ARRAY: Final = 0x8
 RECORD: Final = 0x9
 EDS_DATE: Final = dt.date(2026, 1, 1)
-"""Default date of the EDS: the same dictionary always yields the same text."""
+"""Date of the EDS: the same dictionary always yields the same text."""
 
 Section = list[tuple[str, str]]
 
 
-def build_eds(dictionary: Dictionary, *, file_name: str = "star-sensor.eds", date: dt.date = EDS_DATE) -> str:
-    """Return the text of the EDS.
-
-    Parameters
-    ----------
-    dictionary
-        Object dictionary to describe.
-    file_name, date
-        File name and date in the header of the EDS.
-    """
+def build_eds(dictionary: Dictionary) -> str:
+    """Return the text of the EDS that describes an object dictionary."""
     sections: list[tuple[str, Section, str]] = [
-        ("FileInfo", _file_info(dictionary, file_name, date), ""),
+        ("FileInfo", _file_info(dictionary), ""),
         ("DeviceInfo", _device_info(dictionary), ""),
         (
             "DummyUsage",
@@ -80,10 +72,10 @@ def _plain(text: str) -> str:
     return text.encode("ascii", errors="replace").decode("ascii")
 
 
-def _file_info(dictionary: Dictionary, file_name: str, date: dt.date) -> Section:
-    day = date.strftime("%m-%d-%Y")
+def _file_info(dictionary: Dictionary) -> Section:
+    day = EDS_DATE.strftime("%m-%d-%Y")
     return [
-        ("FileName", file_name),
+        ("FileName", "star-sensor.eds"),
         ("FileVersion", "1"),
         ("FileRevision", "0"),
         ("EDSVersion", "4.0"),

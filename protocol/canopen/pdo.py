@@ -153,13 +153,9 @@ class TransmitPdo:
         self._restart_timer()
         self._event = not self._synchronous
 
-    def concerns(self, keys: frozenset[tuple[int, int]]) -> bool:
-        """Return whether one of these objects is mapped."""
-        return not self._keys.isdisjoint(keys)
-
-    def trigger(self) -> None:
-        """Mark an event; `tick` sends an event-driven PDO as soon as the inhibit time allows."""
-        if self.active:
+    def trigger(self, keys: frozenset[tuple[int, int]]) -> None:
+        """Mark an event of one of these objects; `tick` sends an event-driven PDO as soon as the inhibit time allows."""
+        if self.active and not self._keys.isdisjoint(keys):
             self._event = True
 
     def synchronise(self, counter: int) -> None:
@@ -257,8 +253,7 @@ class PdoService:
         """Trigger the TPDOs that map one of these objects."""
         changed = frozenset(keys)
         for pdo in self.transmitting:
-            if pdo.concerns(changed):
-                pdo.trigger()
+            pdo.trigger(changed)
 
     def synchronise(self, counter: int) -> None:
         """Act on a SYNC: first send samples of this instant, then apply received messages."""

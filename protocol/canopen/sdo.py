@@ -48,16 +48,11 @@ class SdoServer:
         Object dictionary to read and write.
     timeout_s
         Silence of the client after which a transfer is aborted.
-    result_timeout_s
-        Time after which a download without a result of the device is aborted.
     """
 
-    def __init__(
-        self, dictionary: Dictionary, timeout_s: float = 1.0, result_timeout_s: float = RESULT_TIMEOUT_S
-    ) -> None:
+    def __init__(self, dictionary: Dictionary, timeout_s: float = 1.0) -> None:
         self._dictionary = dictionary
         self._timeout_s = timeout_s
-        self._result_timeout_s = result_timeout_s
         self._transfer: Transfer | None = None
         self._waiting: _Waiting | None = None
         self.deadline: float | None = None
@@ -127,7 +122,7 @@ class SdoServer:
         self.deadline = now + self._timeout_s if self.busy else None
         if self._waiting is not None:
             self._waiting.answers, answers = answers, []
-            self.deadline = now + self._result_timeout_s
+            self.deadline = now + RESULT_TIMEOUT_S
         return answers
 
     def _streaming(self) -> bool:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, Protocol
 
+from starhil.protocol.durable_file import replace_durably
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.user_file import read_user_file
 
@@ -66,8 +65,8 @@ class FileStorage:
     Parameters
     ----------
     path
-        The file; the first save creates its folder. One process at a time may use it (the emulator locks its state
-        folder): the temporary file has a fixed name, so that an interrupted save leaves at most one.
+        The file; the first save creates its folder. One process at a time may use it: the emulator locks its state
+        folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,29 +119,12 @@ class FileStorage:
 
     def _write(self, groups: Mapping[str, Mapping[str, str]]) -> None:
         text = json.dumps({"crc32": _checksum(groups), "groups": groups}, indent=1)
-        temporary = self._path.with_name(f"{self._path.name}.new")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("w", encoding="ascii") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self._path)
-            _sync_folder(self._path.parent)
+            replace_durably(self._path, text.encode("ascii"))
         except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
             raise StorageError(f"{self._path}: cannot be written ({error})") from None
 
 
 def _checksum(groups: Mapping[str, Mapping[str, str]]) -> int:
     return zlib.crc32(json.dumps(groups, sort_keys=True).encode("ascii"))
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush the renaming to the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

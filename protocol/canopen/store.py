@@ -105,22 +105,17 @@ class ParameterStore:
         return deferred
 
     def _save(self, group: str) -> None:
+        """Save the group's values that are not their defaults; a default relative to the node-ID stays relative."""
         values = {
             f"{entry.key[0]:04X}:{entry.key[1]:02X}": entry.value
             for entry in self._context.dictionary
-            if self._belongs(entry, group) and self._differs(entry)
+            if self._belongs(entry, group)
+            and entry.value != default_bytes(entry.variable, self._context.node_id)
         }
         try:
             self._storage.save(group, values)
         except StorageError as error:
             self._abort_on_storage_error(error)
-
-    def _differs(self, entry: Entry) -> bool:
-        """Return whether a value differs from its default.
-
-        A default relative to the node-ID stays relative.
-        """
-        return entry.value != default_bytes(entry.variable, self._context.node_id)
 
     def _restore(self, subindex: int, data: bytes) -> Deferred | None:
         if data != LOAD:

@@ -24,7 +24,9 @@ class SyncService:
         find = context.dictionary.find
         self._cob_id, self._period, self._overflow = find(*COB_ID), find(*PERIOD), find(*OVERFLOW)
         self._cob_id.writer = self._check_cob_id
-        self._period.writer = self._period_changed
+        self._period.writer = lambda data: self._schedule(
+            self._cob_id.number(), int.from_bytes(data, "little")
+        )
         self._overflow.writer = self._check_overflow
         self._counter = 0
         self.next_deadline: float | None = None
@@ -82,9 +84,6 @@ class SyncService:
         check_replacement(old, new, lives_before=bool(old & BIT_30), lives_after=bool(new & BIT_30))
         self._counter = 0
         self._schedule(new, self._period.number())
-
-    def _period_changed(self, data: bytes) -> None:
-        self._schedule(self._cob_id.number(), int.from_bytes(data, "little"))
 
     def _check_overflow(self, data: bytes) -> None:
         if data[0] == 1 or data[0] > LARGEST_OVERFLOW:

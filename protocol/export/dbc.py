@@ -62,16 +62,14 @@ def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
                 yield f'CM_ SG_ {message.can_id | EXTENDED} {signal.name} "{_text(signal.doc)}";'
     yield 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";'
     yield 'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";'
-    for message in messages:
-        for signal in message.signals:
-            if signal.enum is not None:
-                values = " ".join(f'{value} "{name}"' for name, value in signal.enum.values.items())
-                yield f"VAL_ {message.can_id | EXTENDED} {signal.name} {values} ;"
-    for message in messages:
-        for signal in message.signals:
-            if signal.kind == "float":
-                precision = 1 if signal.type == "f32" else 2
-                yield f"SIG_VALTYPE_ {message.can_id | EXTENDED} {signal.name} : {precision};"
+    signals = [(message.can_id | EXTENDED, signal) for message in messages for signal in message.signals]
+    for can_id, signal in signals:
+        if signal.enum is not None:
+            values = " ".join(f'{value} "{name}"' for name, value in signal.enum.values.items())
+            yield f"VAL_ {can_id} {signal.name} {values} ;"
+    for can_id, signal in signals:
+        if signal.kind == "float":
+            yield f"SIG_VALTYPE_ {can_id} {signal.name} : {1 if signal.type == 'f32' else 2};"
 
 
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:

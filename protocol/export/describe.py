@@ -7,7 +7,7 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import EnumDefinition, Parameter
+from starhil.protocol.values import EnumDefinition, Parameter, Section
 
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
 PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
@@ -120,6 +120,14 @@ def parameter_cells(parameter: Parameter) -> tuple[str, ...]:
 def enum_text(enum: EnumDefinition) -> str:
     """Members of an enumeration in one line."""
     return ", ".join(f"{value} {name}" for name, value in enum.values.items())
+
+
+def reference(icd: InterfaceDefinition) -> Iterator[Section]:
+    """The parameters and the enumerations."""
+    parameters = tuple(parameter_cells(parameter) for parameter in icd.parameters.values())
+    yield Section("Parameters", (), PARAMETER_COLUMNS, parameters)
+    enums = tuple((enum.name, enum_text(enum), enum.doc) for enum in icd.enums.values())
+    yield Section("Enumerations", (), ("Name", "Numbers", "Meaning"), enums)
 
 
 def sections(icd: InterfaceDefinition) -> Iterator[tuple[str, list[Row]]]:

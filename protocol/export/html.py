@@ -33,14 +33,13 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     yield f"<title>{escape(heading)}</title><style>{_STYLE}</style></head><body>"
     yield f"<h1>{escape(heading)}</h1><p>{escape(icd.doc)}</p>"
     yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.introduction(icd))
-    yield (
-        "<nav>"
-        + "".join(_link(section) for section in icd.sections)
-        + '<a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>'
-        '<a href="#parameters">Parameters</a><a href="#enumerations">Enumerations</a>'
-        + "".join(_link(section) for section in wire.sections(icd))
-        + "</nav>"
-    )
+    after = (*describe.reference(icd), *wire.sections(icd))
+    links = [_link(section) for section in icd.sections]
+    links += [
+        '<a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>',
+        *map(_link, after),
+    ]
+    yield f"<nav>{''.join(links)}</nav>"
     for section in icd.sections:
         yield from _section(section)
     for title, rows in describe.sections(icd):
@@ -60,17 +59,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
                     describe.FIELD_COLUMNS,
                     ((field.provenance, describe.field_cells(row, field)) for field in row.fields),
                 )
-    yield '<h2 id="parameters">Parameters</h2>'
-    yield from _table(
-        describe.PARAMETER_COLUMNS,
-        (("confirmed", describe.parameter_cells(parameter)) for parameter in icd.parameters.values()),
-    )
-    yield '<h2 id="enumerations">Enumerations</h2>'
-    yield from _table(
-        ("Name", "Numbers", "Meaning"),
-        (("confirmed", (enum.name, describe.enum_text(enum), enum.doc)) for enum in icd.enums.values()),
-    )
-    for section in wire.sections(icd):
+    for section in after:
         yield from _section(section)
     yield "</body></html>"
 

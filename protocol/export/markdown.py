@@ -39,17 +39,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
                 yield from _table(
                     describe.FIELD_COLUMNS, (describe.field_cells(row, field) for field in row.fields)
                 )
-    yield from ("", "## Parameters", "")
-    yield from _table(
-        describe.PARAMETER_COLUMNS,
-        (describe.parameter_cells(parameter) for parameter in icd.parameters.values()),
-    )
-    yield from ("", "## Enumerations", "")
-    yield from _table(
-        ("Name", "Numbers", "Meaning"),
-        ((enum.name, describe.enum_text(enum), enum.doc) for enum in icd.enums.values()),
-    )
-    for section in wire.sections(icd):
+    for section in (*describe.reference(icd), *wire.sections(icd)):
         yield from _section(section)
 
 

@@ -5,6 +5,7 @@ A packet is the row's identifier followed by its data; in a unit with classes th
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -24,9 +25,8 @@ _ORDERS: Final = {"little": "leastSignificantByteFirst", "big": "mostSignificant
 
 def render(icd: InterfaceDefinition) -> str:
     """Return the XML text. Raises IcdError for bits across bytes, which XTCE cannot express."""
-    system = ET.Element(
-        "SpaceSystem", {"name": _identifier(icd.name), "xmlns": NAMESPACE, "shortDescription": icd.doc}
-    )
+    name = re.sub("[.:/ ]", "_", icd.name)  # as XTCE has names
+    system = ET.Element("SpaceSystem", {"name": name, "xmlns": NAMESPACE, "shortDescription": icd.doc})
     ET.SubElement(
         system, "Header", {"version": icd.version, "date": "2026-01-01", "validationStatus": "Working"}
     )
@@ -100,7 +100,7 @@ def _commands(parent: ET.Element, icd: InterfaceDefinition) -> None:
                     _type(types, "Argument", name, field)
                     about = {"name": field.name, "argumentTypeRef": f"{name}_type"}
                     if field.default is not None:
-                        about["initialValue"] = _initial(field)
+                        about["initialValue"] = str(field.default)
                     ET.SubElement(listed, "Argument", about | _short(meaning(row, field)))
         container = ET.SubElement(command, "CommandContainer", {"name": f"{row.name}_packet"})
         entries = ET.SubElement(container, "EntryList")
@@ -207,10 +207,6 @@ def _unit(kind: ET.Element, field: Field) -> None:
         ET.SubElement(units, "Unit").text = field.unit
 
 
-def _initial(field: Field) -> str:
-    return str(field.default)
-
-
 def _bits(field: Field) -> int:
     return field.width or 8 * field.size
 
@@ -226,8 +222,3 @@ def _short(doc: str) -> dict[str, str]:
 def _name(row: Row, field: Field, index: int) -> str:
     """Return a name for a field that is unique in the definition."""
     return f"{row.name}_{field.name or f'unused_{index}'}"
-
-
-def _identifier(text: str) -> str:
-    """Return text as an XTCE name, without dots, slashes, colons and spaces."""
-    return "".join("_" if character in ".:/ " else character for character in text)

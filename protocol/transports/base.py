@@ -14,6 +14,10 @@ from starhil.protocol.errors import ProtocolError, reason
 
 _LOGGER: Final = logging.getLogger("starhil.transport")
 
+FIRST_PAUSE_S: Final = 0.05
+LAST_PAUSE_S: Final = 1.0
+"""Pauses between attempts to reconnect double from the first to the last."""
+
 Item = TypeVar("Item")
 
 Receive = Callable[[Item], None]
@@ -131,10 +135,10 @@ class ReconnectingTransport(Transport[Item]):
             )
 
     async def _reconnect(self) -> None:
-        pause = Backoff()
-        reported = ""
+        pause_s, reported = FIRST_PAUSE_S, ""
         while True:
-            await asyncio.sleep(pause.next())
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, LAST_PAUSE_S)
             try:
                 await self._connect()
             except ProtocolError:
@@ -160,16 +164,3 @@ class ReconnectingTransport(Transport[Item]):
                 await self._reconnection
             self._reconnection = None
         self._disconnect_safely()
-
-
-class Backoff:
-    """Pauses between attempts: doubling from the first to the last."""
-
-    def __init__(self, first_s: float = 0.05, last_s: float = 1.0) -> None:
-        self._last_s = last_s
-        self._next_s = first_s
-
-    def next(self) -> float:
-        """Return the next pause (s)."""
-        wait, self._next_s = self._next_s, min(2 * self._next_s, self._last_s)
-        return wait

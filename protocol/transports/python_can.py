@@ -86,10 +86,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         else:
             self._stop = threading.Event()
             self._thread = threading.Thread(
-                target=self._read_in_thread,
-                args=(bus, self._stop, loop),
-                name="can-reader",
-                daemon=True,
+                target=self._read_in_thread, args=(bus, self._stop, loop), name="can-reader", daemon=True
             )
             self._thread.start()
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.classic.pairs import chord_between
 from starid.errors import StaridError
 from starid.jit import compiled_ieee, inner
@@ -21,14 +21,7 @@ LEAST_GROUP: Final = 3
 
 
 @inner
-def compatible(
-    directions: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    pairs: NDArray[np.int64],
-    a: int,
-    b: int,
-    tolerance: float,
-) -> bool:
+def compatible(directions: Array, vectors: Array, pairs: Indices, a: int, b: int, tolerance: float) -> bool:
     """Whether two matches name different stars, seen as far apart as the catalogue has them."""
     if pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]:
         return False
@@ -38,12 +31,7 @@ def compatible(
 
 @inner
 def group_around(
-    directions: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    pairs: NDArray[np.int64],
-    seed: int,
-    tolerance: float,
-    members: NDArray[np.int64],
+    directions: Array, vectors: Array, pairs: Indices, seed: int, tolerance: float, members: Indices
 ) -> int:
     """Collect matches that agree with one of them, and with all that were collected before; return how many.
 
@@ -76,12 +64,7 @@ def group_around(
 
 
 @compiled_ieee
-def _largest_group(
-    directions: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    pairs: NDArray[np.int64],
-    tolerance: float,
-) -> NDArray[np.int64]:
+def _largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance: float) -> Indices:
     """Rows of the largest group over all seeds; the first of those equally large."""
     members, best = np.empty(pairs.shape[0], dtype=np.int64), np.empty(0, dtype=np.int64)
     for seed in range(pairs.shape[0]):
@@ -91,12 +74,7 @@ def _largest_group(
     return best
 
 
-def largest_group(
-    directions: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    pairs: NDArray[np.int64],
-    tolerance: float,
-) -> NDArray[np.int64]:
+def largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance: float) -> Indices:
     """Matches that agree with each other in every distance, as many as can be found from each of them.
 
     Parameters
@@ -125,12 +103,7 @@ def largest_group(
     return group[np.argsort(group[:, 0])]
 
 
-def _same_hand(
-    directions: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    group: NDArray[np.int64],
-    tolerance: float,
-) -> bool:
+def _same_hand(directions: Array, vectors: Array, group: Indices, tolerance: float) -> bool:
     """Whether a turn brings the stars of the group onto the observed ones; distances alone fit the mirror image too."""
     seen, stars = directions[group[:, 0]], vectors[group[:, 1]]
     try:

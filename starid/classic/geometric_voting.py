@@ -19,8 +19,8 @@ from __future__ import annotations
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
@@ -30,7 +30,7 @@ KEPT_SHARE: Final = 0.5
 
 
 @compiled_ieee
-def votes_of(table: PairTable, stars: int, seen: NDArray[np.float64], tolerance: float) -> NDArray[np.int32]:
+def votes_of(table: PairTable, stars: int, seen: Array, tolerance: float) -> Indices32:
     """Votes (n, stars) of all pairs of observed stars for the catalogue stars of both ends."""
     n = seen.shape[0]
     votes = np.zeros((n, stars), dtype=np.int32)
@@ -48,9 +48,7 @@ def votes_of(table: PairTable, stars: int, seen: NDArray[np.float64], tolerance:
 
 
 @compiled_ieee
-def _second_vote(
-    vectors: NDArray[np.float64], seen: NDArray[np.float64], matched: NDArray[np.int64], tolerance: float
-) -> NDArray[np.int64]:
+def _second_vote(vectors: Array, seen: Array, matched: Indices, tolerance: float) -> Indices:
     """Number of other matches that each match agrees with in its distance."""
     n = seen.shape[0]
     votes = np.zeros(n, dtype=np.int64)
@@ -75,7 +73,7 @@ class GeometricVotingIdentifier(ClassicIdentifier):
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
         return tuple(self.pairs)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         votes = votes_of(self.pairs, len(self.guide), observed.directions, observed.tolerance)
         matched = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), -1)
         support = _second_vote(self.guide.vectors, observed.directions, matched, observed.tolerance)

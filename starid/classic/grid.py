@@ -20,6 +20,7 @@ from typing import ClassVar, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import (
     MOST_TIED,
     add_winners,
@@ -32,7 +33,7 @@ from starid.classic.neighbours import (
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
-Table: TypeAlias = tuple[NDArray[np.int32], NDArray[np.uint16]]
+Table: TypeAlias = tuple[Indices32, NDArray[np.uint16]]
 """First entry of each cell in the second array, and the guide stars whose pattern has it."""
 
 GRID: Final = 40
@@ -49,9 +50,7 @@ MOST_NEIGHBOURS: Final = 400
 
 
 @inner
-def place_on_grid(
-    polar: NDArray[np.float64], i: int, reference: float, radius: float, cells: int
-) -> tuple[float, float]:
+def place_on_grid(polar: Array, i: int, reference: float, radius: float, cells: int) -> tuple[float, float]:
     """Position of a neighbour in units of cells, the grid turned to a reference azimuth."""
     angle = turned(polar[i, 1], reference)
     half = 0.5 * cells
@@ -61,14 +60,7 @@ def place_on_grid(
 
 
 @inner
-def occupied_cells(
-    polar: NDArray[np.float64],
-    count: int,
-    aligned: int,
-    radius: float,
-    cells: int,
-    out: NDArray[np.int64],
-) -> int:
+def occupied_cells(polar: Array, count: int, aligned: int, radius: float, cells: int, out: Indices) -> int:
     """Fill in the cells that hold a star, each once, the grid turned to a neighbour; return how many."""
     filled = 0
     for i in range(count):
@@ -84,9 +76,7 @@ def occupied_cells(
 
 
 @compiled_ieee
-def look_up_table(
-    vectors: NDArray[np.float64], magnitude: NDArray[np.float64], radius: float, buffer: float
-) -> Table:
+def look_up_table(vectors: Array, magnitude: Array, radius: float, buffer: float) -> Table:
     """First entry of each cell, and the stars whose pattern has it.
 
     Each pattern is aligned with its nearest star beyond the buffer in the brighter half (`bright_neighbour`).
@@ -109,13 +99,7 @@ def look_up_table(
 
 @inner
 def count_votes(
-    table: Table,
-    polar: NDArray[np.float64],
-    count: int,
-    aligned: int,
-    radius: float,
-    found: NDArray[np.int64],
-    votes: NDArray[np.int32],
+    table: Table, polar: Array, count: int, aligned: int, radius: float, found: Indices, votes: Indices32
 ) -> int:
     """Add a vote for each star whose pattern has a cell of the observed one; return the cells of that."""
     start, owner = table
@@ -127,9 +111,7 @@ def count_votes(
 
 
 @compiled_ieee
-def _vote(
-    table: Table, stars: int, seen: NDArray[np.float64], radius: float, buffer: float
-) -> NDArray[np.int64]:
+def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -> Indices:
     """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -159,5 +141,5 @@ class GridIdentifier(ClassicIdentifier):
         self.table = look_up_table(self.guide.vectors, alike, self._radius, self._buffer)
         return self.table
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         return _vote(self.table, len(self.guide), observed.directions, self._radius, self._buffer)

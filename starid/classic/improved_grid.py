@@ -24,8 +24,8 @@ import math
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.classic.grid import (
     BUFFER_SHARE,
     GRID,
@@ -51,13 +51,8 @@ HIT_RATE: Final = 0.5
 
 @compiled_ieee
 def _look_up(
-    table: Table,
-    stars: int,
-    seen: tuple[NDArray[np.float64], NDArray[np.float64]],
-    radius: float,
-    buffer: float,
-    fill: float,
-) -> NDArray[np.int64]:
+    table: Table, stars: int, seen: tuple[Array, Array], radius: float, buffer: float, fill: float
+) -> Indices:
     """Matches (m, 2) whose votes pass the Bayesian threshold, the best two of each pivot and alignment."""
     directions, magnitude = seen
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -98,6 +93,6 @@ class ImprovedGridIdentifier(ClassicIdentifier):
         self._fill = min(self.table[1].size / (len(guide) * inside), HIT_RATE / 2.0)
         return self.table
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         seen = (observed.directions, observed.magnitude)
         return _look_up(self.table, len(self.guide), seen, self._radius, self._buffer, self._fill)

@@ -17,8 +17,8 @@ from __future__ import annotations
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32, Mask
 from starid.classic.geometric_voting import votes_of
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -30,9 +30,7 @@ ROUNDS: Final = 4
 
 
 @compiled_ieee
-def _vote_of_candidates(
-    table: PairTable, candidate: NDArray[np.bool_], seen: NDArray[np.float64], tolerance: float
-) -> NDArray[np.int32]:
+def _vote_of_candidates(table: PairTable, candidate: Mask, seen: Array, tolerance: float) -> Indices32:
     """Votes (n, N) of pairs whose two stars are candidates of the two observed ones, either way round."""
     n = seen.shape[0]
     votes = np.zeros(candidate.shape, dtype=np.int32)
@@ -63,7 +61,7 @@ class IterativeIdentifier(ClassicIdentifier):
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
         return tuple(self.pairs)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         seen, tolerance = observed.directions, observed.tolerance
         votes = votes_of(self.pairs, len(self.guide), seen, tolerance)
         share = FIRST_SHARE
@@ -77,6 +75,6 @@ class IterativeIdentifier(ClassicIdentifier):
         return np.argwhere(candidate)
 
 
-def _above(votes: NDArray[np.int32], share: float) -> NDArray[np.bool_]:
+def _above(votes: Indices32, share: float) -> Mask:
     """Candidates (n, N) with at least a share of the highest votes of their star."""
     return np.asarray((votes > 0) & (votes >= share * votes.max(axis=1, keepdims=True)))

@@ -22,6 +22,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import MOST_TIED, add_winners, grouped, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
@@ -40,12 +41,7 @@ MOST_NEIGHBOURS: Final = SECTORS
 
 @inner
 def log_polar_string(
-    vectors: NDArray[np.float64],
-    star: int,
-    radius: float,
-    polar: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    code: NDArray[np.uint8],
+    vectors: Array, star: int, radius: float, polar: Array, rows: Indices, code: NDArray[np.uint8]
 ) -> None:
     """Fill in the string of a star: 1 + radial bin of the nearest neighbour in each sector, 0 where there is none."""
     code[:] = 0
@@ -60,7 +56,7 @@ def log_polar_string(
 
 
 @compiled_ieee
-def _strings(vectors: NDArray[np.float64], radius: float) -> NDArray[np.uint8]:
+def _strings(vectors: Array, radius: float) -> NDArray[np.uint8]:
     """Strings (n, `SECTORS`) of all stars."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     codes = np.empty((vectors.shape[0], SECTORS), dtype=np.uint8)
@@ -70,9 +66,7 @@ def _strings(vectors: NDArray[np.float64], radius: float) -> NDArray[np.uint8]:
 
 
 @compiled_ieee
-def _ring_index(
-    codes: NDArray[np.uint8],
-) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.uint8]]:
+def _ring_index(codes: NDArray[np.uint8]) -> tuple[Indices32, NDArray[np.uint16], NDArray[np.uint8]]:
     """Entries of all strings by ring: first entry of each ring, star and sector of each entry."""
     count = np.count_nonzero(codes)
     rings, stars = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.uint16)
@@ -88,7 +82,7 @@ def _ring_index(
 
 
 @inner
-def _most_agreeing(shifts: NDArray[np.int16], agreeing: NDArray[np.int32]) -> None:
+def _most_agreeing(shifts: NDArray[np.int16], agreeing: Indices32) -> None:
     """Fill in, for each star, the most sectors that agree at any shift, a sector more or less allowed."""
     for star in range(shifts.shape[0]):
         agreeing[star] = 0
@@ -99,11 +93,8 @@ def _most_agreeing(shifts: NDArray[np.int16], agreeing: NDArray[np.int32]) -> No
 
 @compiled_ieee
 def _compare(
-    index: tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.uint8]],
-    stars: int,
-    seen: NDArray[np.float64],
-    radius: float,
-) -> NDArray[np.int64]:
+    index: tuple[Indices32, NDArray[np.uint16], NDArray[np.uint8]], stars: int, seen: Array, radius: float
+) -> Indices:
     """Matches (m, 2) of each observed star with the guide stars most like it."""
     start, owner, sectors = index
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -135,5 +126,5 @@ class LogPolarIdentifier(ClassicIdentifier):
         self.index = _ring_index(_strings(self.guide.vectors, self._radius))
         return self.index
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         return _compare(self.index, len(self.guide), observed.directions, self._radius)

@@ -16,8 +16,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.agreement import group_around
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -36,12 +36,12 @@ GROUPS: Final = 5
 @inner
 def match_groups(
     table: PairTable,
-    guide: tuple[NDArray[np.float64], NDArray[np.float64]],
-    seen: tuple[NDArray[np.float64], NDArray[np.float64]],
+    guide: tuple[Array, Array],
+    seen: tuple[Array, Array],
     pole: int,
     tolerance: float,
-    partner: NDArray[np.int32],
-    size: NDArray[np.int64],
+    partner: Indices32,
+    size: Indices,
 ) -> None:
     """Fill in the match groups of a pole: partner (N, n) of each candidate for each neighbour, −1 without; size (N,)."""
     vectors, magnitudes = guide
@@ -71,7 +71,7 @@ def match_groups(
 
 
 @inner
-def group_pairs(partner: NDArray[np.int32], pole: int, candidate: int) -> NDArray[np.int64]:
+def group_pairs(partner: Indices32, pole: int, candidate: int) -> Indices:
     """Matches (m, 2) of a match group, the pole's first."""
     n = partner.shape[1]
     pairs = np.empty((n, 2), dtype=np.int64)
@@ -86,11 +86,8 @@ def group_pairs(partner: NDArray[np.int32], pole: int, candidate: int) -> NDArra
 
 @compiled_ieee
 def _largest_match_group(
-    table: PairTable,
-    guide: tuple[NDArray[np.float64], NDArray[np.float64]],
-    seen: tuple[NDArray[np.float64], NDArray[np.float64]],
-    tolerance: float,
-) -> NDArray[np.int64]:
+    table: PairTable, guide: tuple[Array, Array], seen: tuple[Array, Array], tolerance: float
+) -> Indices:
     """Matches (m, 2) of the largest group whose members keep all distances."""
     vectors, directions = guide[0], seen[0]
     n = directions.shape[0]
@@ -121,7 +118,7 @@ class MatchGroupIdentifier(ClassicIdentifier):
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
         return (*self.pairs, self.guide.magnitude)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         guide = (self.guide.vectors, self.guide.magnitude)
         seen = (observed.directions, observed.magnitude)
         return _largest_match_group(self.pairs, guide, seen, observed.tolerance)

@@ -23,6 +23,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.classic.grid import BUFFER_SHARE, GRID, MOST_NEIGHBOURS, RADIUS_SHARE, place_on_grid
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -36,7 +37,7 @@ LEAST_NEIGHBOURS: Final = 4
 
 
 @compiled_ieee
-def _grey_patterns(vectors: NDArray[np.float64], radius: float, buffer: float) -> NDArray[np.uint8]:
+def _grey_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np.uint8]:
     """Grey grids (n, `GRID`²) of all stars; empty for one that has no neighbour to be aligned with."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     grey = np.zeros((vectors.shape[0], GRID * GRID), dtype=np.uint8)
@@ -58,12 +59,8 @@ def _grey_patterns(vectors: NDArray[np.float64], radius: float, buffer: float) -
 
 @compiled_ieee
 def _least_cost(
-    grey: NDArray[np.uint8],
-    seen: NDArray[np.float64],
-    magnitude: NDArray[np.float64],
-    radius: float,
-    buffer: float,
-) -> NDArray[np.int64]:
+    grey: NDArray[np.uint8], seen: Array, magnitude: Array, radius: float, buffer: float
+) -> Indices:
     """Guide star of each observed star, −1 without a clear winner."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     cells, weights = np.empty(MOST_NEIGHBOURS, dtype=np.int64), np.empty(MOST_NEIGHBOURS)
@@ -105,7 +102,7 @@ class ModifiedGridIdentifier(ClassicIdentifier):
         self.grey = _grey_patterns(self.guide.vectors, self._radius, self._buffer)
         return (self.grey,)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         matched = _least_cost(self.grey, observed.directions, observed.magnitude, self._radius, self._buffer)
         rows = np.flatnonzero(matched >= 0)
         return np.column_stack([rows, matched[rows]])

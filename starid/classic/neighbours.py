@@ -13,8 +13,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.jit import compiled_ieee, inner
 
 MOST_TIED: Final = 4
@@ -22,13 +22,7 @@ MOST_TIED: Final = 4
 
 
 @inner
-def neighbours_of(
-    vectors: NDArray[np.float64],
-    pivot: int,
-    radius: float,
-    polar: NDArray[np.float64],
-    rows: NDArray[np.int64],
-) -> int:
+def neighbours_of(vectors: Array, pivot: int, radius: float, polar: Array, rows: Indices) -> int:
     """List the neighbours of a star by rising distance.
 
     Parameters
@@ -90,7 +84,7 @@ def turned(azimuth: float, reference: float) -> float:
 
 
 @inner
-def nearest_beyond(polar: NDArray[np.float64], count: int, buffer: float) -> int:
+def nearest_beyond(polar: Array, count: int, buffer: float) -> int:
     """First of the neighbours, by rising distance, that is farther than a buffer; −1 if there is none."""
     for i in range(count):
         if polar[i, 0] > buffer:
@@ -100,12 +94,7 @@ def nearest_beyond(polar: NDArray[np.float64], count: int, buffer: float) -> int
 
 @inner
 def bright_neighbour(
-    polar: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    count: int,
-    magnitude: NDArray[np.float64],
-    buffer: float,
-    rank: int,
+    polar: Array, rows: Indices, count: int, magnitude: Array, buffer: float, rank: int
 ) -> int:
     """Place of the neighbour beyond a buffer of given rank, by distance, in the brighter half; −1 if there is none.
 
@@ -124,9 +113,7 @@ def bright_neighbour(
 
 
 @compiled_ieee
-def neighbour_list(
-    vectors: NDArray[np.float64], pivot: int, radius: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def neighbour_list(vectors: Array, pivot: int, radius: float) -> tuple[Array, Indices]:
     """Chords and azimuths (m, 2) of a star's neighbours by rising distance, and their rows (m,)."""
     polar = np.empty((vectors.shape[0], 2))
     rows = np.empty(vectors.shape[0], dtype=np.int64)
@@ -135,7 +122,7 @@ def neighbour_list(
 
 
 @inner
-def grouped(keys: NDArray[np.int64], groups: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def grouped(keys: Indices, groups: int) -> tuple[Indices32, Indices]:
     """Sort rows by key: first row of each group (groups + 1,), and the rows (n,) in that order."""
     start = np.zeros(groups + 1, dtype=np.int32)
     for key in keys:
@@ -151,9 +138,7 @@ def grouped(keys: NDArray[np.int64], groups: int) -> tuple[NDArray[np.int32], ND
 
 
 @inner
-def add_winners(
-    votes: NDArray[np.int32], least: int, pivot: int, matches: NDArray[np.int64], filled: int
-) -> int:
+def add_winners(votes: Indices32, least: int, pivot: int, matches: Indices, filled: int) -> int:
     """Append the guide stars with most votes, if they are enough and not too many are tied; return the new number of matches.
 
     `matches` (n·`MOST_TIED`, 2) receives the pivot and the guide star.

@@ -23,6 +23,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
@@ -35,7 +36,7 @@ MARGIN: Final = 1.3
 
 
 @compiled_ieee
-def _triangle_rows(vectors: NDArray[np.float64], radius: float, buffer: float) -> NDArray[np.int64]:
+def _triangle_rows(vectors: Array, radius: float, buffer: float) -> Indices:
     """Corners (m, 3) of the triangles of every star with two of its nearest neighbours, in no order, some twice."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
@@ -54,9 +55,7 @@ def _triangle_rows(vectors: NDArray[np.float64], radius: float, buffer: float) -
     return found[:filled]
 
 
-def oriented_triangles(
-    vectors: NDArray[np.float64], corners: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8]]:
+def oriented_triangles(vectors: Array, corners: Indices) -> tuple[Indices, Array, NDArray[np.int8]]:
     """Triangles in the fixed order, each once: corners (m, 3), second and third singular value (m, 2), orientation (m,) of ±1."""
     corners = np.unique(np.sort(corners, axis=1), axis=0).reshape(-1, 3)
     places = vectors[corners]
@@ -64,7 +63,7 @@ def oriented_triangles(
     order = np.argsort(-opposite, axis=1, kind="stable")
     corners = np.take_along_axis(corners, order, axis=1)
     places = np.take_along_axis(places, order[:, :, None], axis=1)
-    values: NDArray[np.float64] = np.empty((0, 2))
+    values: Array = np.empty((0, 2))
     if len(corners):
         values = np.asarray(np.linalg.svd(places, compute_uv=False)[:, 1:], dtype=np.float64)
     volume = np.einsum("ij,ij->i", np.cross(places[:, 0], places[:, 1]), places[:, 2])
@@ -73,9 +72,9 @@ def oriented_triangles(
 
 @compiled_ieee
 def _vote(
-    database: tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.int8]],
-    triangles: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8]],
-    votes: NDArray[np.int32],
+    database: tuple[NDArray[np.uint16], Array, NDArray[np.int8]],
+    triangles: tuple[Indices, Array, NDArray[np.int8]],
+    votes: Indices32,
     reach: float,
 ) -> None:
     """Let every guide triangle that fits an observed one vote for its corners; votes (n, N)."""
@@ -108,7 +107,7 @@ class OrientedSvdIdentifier(ClassicIdentifier):
         self.triangles = (corners[order].astype(np.uint16), values[order], hand[order])
         return self.triangles
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         rows = _triangle_rows(observed.directions, self._radius, self._buffer)
         triangles = oriented_triangles(observed.directions, rows)
         votes = np.zeros((len(observed.row), len(self.guide)), dtype=np.int32)

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Array32, Indices32
 from starid.errors import StaridError
 from starid.jit import compiled_ieee, inner
 
@@ -35,11 +36,11 @@ class PairTable(NamedTuple):
         ``lowest`` and ``step``.
     """
 
-    chord: NDArray[np.float32]
+    chord: Array32
     first: NDArray[np.uint16]
     second: NDArray[np.uint16]
-    below: NDArray[np.int32]
-    line: NDArray[np.float64]
+    below: Indices32
+    line: Array
 
     @property
     def nbytes(self) -> int:
@@ -48,16 +49,14 @@ class PairTable(NamedTuple):
 
 
 @inner
-def chord_between(ones: NDArray[np.float64], i: int, others: NDArray[np.float64], j: int) -> float:
+def chord_between(ones: Array, i: int, others: Array, j: int) -> float:
     """Distance of two unit vectors, rows of two tables."""
     x, y, z = ones[i, 0] - others[j, 0], ones[i, 1] - others[j, 1], ones[i, 2] - others[j, 2]
     return math.sqrt(x * x + y * y + z * z)
 
 
 @compiled_ieee
-def _close_pairs(
-    vectors: NDArray[np.float64], longest: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.uint16]]:
+def _close_pairs(vectors: Array, longest: float) -> tuple[Array32, NDArray[np.uint16], NDArray[np.uint16]]:
     """All pairs at most so far apart; the stars are sorted by rising z."""
     n = vectors.shape[0]
     count = 0
@@ -80,7 +79,7 @@ def _close_pairs(
     return chord, first, second
 
 
-def pair_table(vectors: NDArray[np.float64], longest: float) -> PairTable:
+def pair_table(vectors: Array, longest: float) -> PairTable:
     """All pairs of unit vectors (n, 3) that are at most a chord apart.
 
     Raises

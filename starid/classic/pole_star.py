@@ -19,6 +19,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import neighbours_of
 from starid.classic.rings import MOST_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -30,8 +31,8 @@ CANDIDATES: Final = 8
 
 @compiled_ieee
 def _candidates(
-    table: tuple[NDArray[np.int32], NDArray[np.uint16]], stars: int, seen: NDArray[np.float64], radius: float
-) -> NDArray[np.int64]:
+    table: tuple[Indices32, NDArray[np.uint16]], stars: int, seen: Array, radius: float
+) -> Indices:
     """Candidates (m, 2): row of an observed star, guide star with as many rings in common."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(stars, dtype=np.int32)
@@ -60,5 +61,5 @@ class PoleStarIdentifier(ClassicIdentifier):
         self.table = ring_table(self.guide.vectors, self._radius)
         return self.table
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         return _candidates(self.table, len(self.guide), observed.directions, self._radius)

@@ -19,15 +19,15 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
 
 @inner
-def _hand(ones: NDArray[np.float64], i: int, j: int, k: int) -> float:
+def _hand(ones: Array, i: int, j: int, k: int) -> float:
     """Triple product of three rows: its sign says which way round a triangle runs."""
     x = ones[i, 1] * ones[j, 2] - ones[i, 2] * ones[j, 1]
     y = ones[i, 2] * ones[j, 0] - ones[i, 0] * ones[j, 2]
@@ -37,7 +37,7 @@ def _hand(ones: NDArray[np.float64], i: int, j: int, k: int) -> float:
 
 @inner
 def _link_partners(
-    table: PairTable, low: float, high: float, head: NDArray[np.int64], link: NDArray[np.int64]
+    table: PairTable, low: float, high: float, head: Indices, link: Indices
 ) -> tuple[int, int]:
     """Chain the pairs of a range at each of their stars; link 2·e is that of the first star of pair e, 2·e + 1 of the second."""
     start, end = pair_range(table, low, high)
@@ -52,11 +52,11 @@ def _link_partners(
 @inner
 def _unique_triangle(
     table: PairTable,
-    vectors: NDArray[np.float64],
-    seen: NDArray[np.float64],
+    vectors: Array,
+    seen: Array,
     triad: tuple[int, int, int],
     tolerance: float,
-    work: tuple[NDArray[np.int64], NDArray[np.int64]],
+    work: tuple[Indices, Indices],
 ) -> tuple[int, int, int, int]:
     """Catalogue stars of a triad and the number of triangles that fit it, counted up to two."""
     i, j, k = triad
@@ -97,8 +97,8 @@ def _unique_triangle(
 
 @inner
 def _fourth_star(
-    vectors: NDArray[np.float64],
-    seen: NDArray[np.float64],
+    vectors: Array,
+    seen: Array,
     triad: tuple[int, int, int],
     stars: tuple[int, int, int],
     r: int,
@@ -126,12 +126,12 @@ def _fourth_star(
 
 @inner
 def _complete(
-    vectors: NDArray[np.float64],
-    seen: NDArray[np.float64],
+    vectors: Array,
+    seen: Array,
     triad: tuple[int, int, int],
     stars: tuple[int, int, int],
     tolerance: float,
-    matched: NDArray[np.int64],
+    matched: Indices,
 ) -> int:
     """Fill in the star of every observed star that fits the triangle; return how many fit beside its own three."""
     matched[:] = -1
@@ -146,9 +146,7 @@ def _complete(
 
 
 @compiled_ieee
-def _pyramid(
-    table: PairTable, vectors: NDArray[np.float64], seen: NDArray[np.float64], tolerance: float
-) -> NDArray[np.int64]:
+def _pyramid(table: PairTable, vectors: Array, seen: Array, tolerance: float) -> Indices:
     """Guide star of every observed star, −1 where it has none: the first triad that is unique and confirmed."""
     n = seen.shape[0]
     matched = np.full(n, -1, dtype=np.int64)
@@ -176,7 +174,7 @@ class PyramidIdentifier(ClassicIdentifier):
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
         return tuple(self.pairs)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         matched = _pyramid(self.pairs, self.guide.vectors, observed.directions, observed.tolerance)
         rows = np.flatnonzero(matched >= 0)
         return np.column_stack([rows, matched[rows]])

@@ -19,6 +19,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import neighbours_of, turned
 from starid.classic.rings import MOST_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_of, ring_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -30,7 +31,7 @@ CANDIDATES: Final = 10
 
 
 @inner
-def cyclic_word(polar: NDArray[np.float64], count: int, radius: float) -> int:
+def cyclic_word(polar: Array, count: int, radius: float) -> int:
     """Bits of the sectors that hold a neighbour, counted from the axis that the azimuths have."""
     word = 0
     for i in range(count):
@@ -68,7 +69,7 @@ def common_sectors(seen: int, other: int) -> int:
 
 
 @compiled_ieee
-def _cyclic_words(vectors: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
+def _cyclic_words(vectors: Array, radius: float) -> Indices:
     """Cyclic words (n,) of all stars."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     words = np.empty(vectors.shape[0], dtype=np.int64)
@@ -79,11 +80,8 @@ def _cyclic_words(vectors: NDArray[np.float64], radius: float) -> NDArray[np.int
 
 @compiled_ieee
 def _identify(
-    table: tuple[NDArray[np.int32], NDArray[np.uint16]],
-    words: NDArray[np.int64],
-    seen: NDArray[np.float64],
-    radius: float,
-) -> NDArray[np.int64]:
+    table: tuple[Indices32, NDArray[np.uint16]], words: Indices, seen: Array, radius: float
+) -> Indices:
     """Guide star of each observed star, −1 without a clear winner."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(words.shape[0], dtype=np.int32)
@@ -120,7 +118,7 @@ class RadialCyclicIdentifier(ClassicIdentifier):
         self.words = _cyclic_words(self.guide.vectors, self._radius)
         return (*self.table, self.words)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         matched = _identify(self.table, self.words, observed.directions, self._radius)
         rows = np.flatnonzero(matched >= 0)
         return np.column_stack([rows, matched[rows]])

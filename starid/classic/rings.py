@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices32
 from starid.classic.neighbours import grouped, neighbours_of
 from starid.jit import compiled_ieee, inner
 
@@ -34,7 +35,7 @@ def ring_of(chord: float, radius: float) -> int:
 
 
 @compiled_ieee
-def ring_table(vectors: NDArray[np.float64], radius: float) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
+def ring_table(vectors: Array, radius: float) -> tuple[Indices32, NDArray[np.uint16]]:
     """Look-up table: first entry of each ring, and the stars that have a neighbour in it, each once."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     rings, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
@@ -53,11 +54,7 @@ def ring_table(vectors: NDArray[np.float64], radius: float) -> tuple[NDArray[np.
 
 @inner
 def radial_votes(
-    table: tuple[NDArray[np.int32], NDArray[np.uint16]],
-    polar: NDArray[np.float64],
-    count: int,
-    radius: float,
-    votes: NDArray[np.int32],
+    table: tuple[Indices32, NDArray[np.uint16]], polar: Array, count: int, radius: float, votes: Indices32
 ) -> None:
     """Count the rings that an observed star, given its neighbours, shares with each guide star."""
     start, owner = table

@@ -25,22 +25,22 @@ from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.catalog import StarCatalog, load_catalog
+from starid.catalog import StarCatalog
 from starid.classic.agreement import LEAST_GROUP, largest_group
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.index_choice import pixels_per_radian
 from starid.geometric.pattern_index import field_solid_angle, seen_stars
 from starid.geometric.verified import VerifiedIdentifier
+from starid.single_camera import Measured
 from starid.solution import Reason, Solution
-from starid.solver_input import checked_detections
 from starid.wahba import covariance, solve_wahba
 
-Array = NDArray[np.float64]
 Database = tuple[NDArray[np.generic], ...]
 
 BLEND_PX: Final = 2.0
@@ -69,7 +69,7 @@ class ClassicOptions:
         Largest difference of two distances, pixels, where no position errors are given; by default the algorithm's own.
     verify : bool
         Hold the answer to what the geometric identifier demands of its own (True), or return the algorithm's raw
-        answer, right or wrong.
+        answer, right or wrong: valid then means no more than that there is one, and aberration is not corrected.
     cache : bool
         Keep the index of the verification in the cache folder. (Databases are made in memory: each takes less
         than ten seconds.)
@@ -105,7 +105,7 @@ class GuideStars:
 
     vectors: Array
     magnitude: Array
-    row: NDArray[np.int64]
+    row: Indices
 
     def __len__(self) -> int:
         return len(self.row)
@@ -129,7 +129,7 @@ class Observed:
 
     directions: Array
     magnitude: Array
-    row: NDArray[np.int64]
+    row: Indices
     tolerance: float
 
 
@@ -176,8 +176,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         **changes: Any,
     ) -> None:
         self.options = dataclasses.replace(options or ClassicOptions(), **changes)
-        self._camera = camera
-        self._catalog = load_catalog() if catalog is None else catalog
+        super().__init__(camera, catalog)
         self._px_per_rad = pixels_per_radian(camera)
         self._area_sr = field_solid_angle(camera)
         per_field = self.options.stars_per_field or self.stars_per_field
@@ -192,18 +191,8 @@ class ClassicIdentifier(VerifiedIdentifier):
         """Return the arrays that the search reads, made from the guide stars."""
 
     @abstractmethod
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         """Return proposed matches (m, 2): row of an observed star, row of a guide star."""
-
-    @property
-    def camera(self) -> Camera:
-        """The camera that the positions belong to."""
-        return self._camera
-
-    @property
-    def catalog(self) -> StarCatalog:
-        """The catalogue that `Solution.catalog_index` counts in."""
-        return self._catalog
 
     @property
     def database_bytes(self) -> int:
@@ -244,52 +233,18 @@ class ClassicIdentifier(VerifiedIdentifier):
         row = self._catalog.index_of(stars.hip).astype(np.int64)
         return GuideStars(np.ascontiguousarray(stars.vectors), stars.v.copy(), row)
 
-    def identify(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Lost in space: attitude without any knowledge of it.
-
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            As in `starid.interface.StarIdentifier.identify`.
-
-        Returns
-        -------
-        Solution
-            With ``verify=False`` valid means no more than that the algorithm has an answer, and aberration is not
-            corrected.
-
-        Raises
-        ------
-        StaridError
-            The arrays do not fit each other, or hold values that are not finite.
-        """
-        begin = time.perf_counter()
-        xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
-        observed = self._observed(xy, brightness, None if xy_sigma_px is None else sigmas)
+    def _identify(self, measured: Measured) -> Solution:
+        observed = self._observed(measured.xy, measured.flux, measured.given_sigmas)
         if len(observed.row) < self.least_stars:
-            return Solution.invalid(Reason.TOO_FEW_STARS, elapsed=time.perf_counter() - begin)
+            return Solution.invalid(Reason.TOO_FEW_STARS)
         proposed = self._match(observed)
         pairs = largest_group(observed.directions, self.guide.vectors, proposed, observed.tolerance)
         if len(pairs) < self.least_group:
-            return Solution.invalid(Reason.NO_MATCH, elapsed=time.perf_counter() - begin)
-        solution = self._raw(xy, observed, pairs)
+            return Solution.invalid(Reason.NO_MATCH)
+        solution = self._raw(measured.xy, observed, pairs)
         if self.options.verify:
-            solution = self.verifier.verify(
-                xy,
-                brightness,
-                solution.attitude,
-                xy_sigma_px,
-                window_px=_VERIFY_WINDOW_PX,
-                observer_velocity=observer_velocity,
-            )
-        return dataclasses.replace(solution, mode="lost_in_space", elapsed=time.perf_counter() - begin)
+            solution = self.verify(measured, solution.attitude, _VERIFY_WINDOW_PX)
+        return dataclasses.replace(solution, mode="lost_in_space")
 
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""
@@ -320,7 +275,7 @@ class ClassicIdentifier(VerifiedIdentifier):
             np.ascontiguousarray(directions[rows]), magnitude[:count], rows, tolerance_px / self._px_per_rad
         )
 
-    def _raw(self, xy: Array, observed: Observed, pairs: NDArray[np.int64]) -> Solution:
+    def _raw(self, xy: Array, observed: Observed, pairs: Indices) -> Solution:
         """Attitude by least squares of the matched stars, unverified."""
         seen, stars = observed.directions[pairs[:, 0]], self.guide.vectors[pairs[:, 1]]
         attitude = solve_wahba(seen, stars)

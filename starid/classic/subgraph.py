@@ -21,8 +21,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.classic.agreement import group_around
 from starid.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -62,11 +62,11 @@ def simplest_size(stars: int, width_rad: float, tolerance: float) -> int:
 @inner
 def _groups(
     table: PairTable,
-    seen: NDArray[np.float64],
+    seen: Array,
     pole: int,
     tolerance: float,
     partners: list[tuple[int, int, int]],
-    size: NDArray[np.int64],
+    size: Indices,
 ) -> None:
     """List (candidate, neighbour, its star) of the catalogue pairs that fit the pole's, and count each candidate's neighbours."""
     partners.clear()
@@ -88,13 +88,7 @@ def _groups(
 
 
 @compiled_ieee
-def _subgraphs(
-    table: PairTable,
-    vectors: NDArray[np.float64],
-    seen: NDArray[np.float64],
-    tolerance: float,
-    least: int,
-) -> list[NDArray[np.int64]]:
+def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, least: int) -> list[Indices]:
     """Subgraphs (m, 2) of at least so many stars that agree in all distances, as the poles give them."""
     found = [np.empty((0, 2), dtype=np.int64)]
     partners = [(0, 0, 0)]
@@ -127,7 +121,7 @@ class SubgraphIdentifier(ClassicIdentifier):
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
         return tuple(self.pairs)
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         least = simplest_size(len(self.guide), self.width_rad, observed.tolerance)
         subgraphs = _subgraphs(self.pairs, self.guide.vectors, observed.directions, observed.tolerance, least)
         for subgraph in sorted(subgraphs, key=len, reverse=True):
@@ -136,7 +130,7 @@ class SubgraphIdentifier(ClassicIdentifier):
                 return pairs
         return subgraphs[0]
 
-    def _reprojected(self, observed: Observed, subgraph: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _reprojected(self, observed: Observed, subgraph: Indices) -> Indices:
         """All matches that the attitude of a subgraph makes; none where they are too few."""
         none = np.empty((0, 2), dtype=np.int64)
         if len(subgraph) == 0:

@@ -21,8 +21,8 @@ import math
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
@@ -37,7 +37,7 @@ CONFIRMED: Final = 4
 
 
 @compiled_ieee
-def _pattern_rows(vectors: NDArray[np.float64], radius: float, buffer: float) -> NDArray[np.int64]:
+def _pattern_rows(vectors: Array, radius: float, buffer: float) -> Indices:
     """Rows (n, `PATTERN`) of each star and its nearest neighbours beyond a buffer; −1 where it has too few."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
@@ -51,12 +51,12 @@ def _pattern_rows(vectors: NDArray[np.float64], radius: float, buffer: float) ->
     return found
 
 
-def singular_attitude(seen: NDArray[np.float64], stars: NDArray[np.float64]) -> NDArray[np.float64]:
+def singular_attitude(seen: Array, stars: Array) -> Array:
     """Matrix (3, 3) ICRS→sensor from the singular vectors of observed and catalogue directions, (3, m) each."""
     u, _, q_seen = np.linalg.svd(seen, full_matrices=False)
     p, _, q_star = np.linalg.svd(stars, full_matrices=False)
     signs = np.where(np.sum(q_seen * q_star, axis=1) < 0.0, -1.0, 1.0)
-    attitude: NDArray[np.float64] = (u * signs) @ p.T
+    attitude: Array = (u * signs) @ p.T
     return attitude
 
 
@@ -76,9 +76,9 @@ class SvdIdentifier(ClassicIdentifier):
         self.rows, self.keys = rows[order].astype(np.uint16), values[order]
         return self.rows, self.keys
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         patterns = _pattern_rows(observed.directions, self._radius, self._buffer)
-        found: list[NDArray[np.int64]] = []
+        found: list[Indices] = []
         for pattern in patterns[patterns[:, 0] >= 0]:
             stars = self._confirmed(observed, pattern)
             if stars is not None:
@@ -87,7 +87,7 @@ class SvdIdentifier(ClassicIdentifier):
                 break
         return np.concatenate(found) if found else np.empty((0, 2), dtype=np.int64)
 
-    def _confirmed(self, observed: Observed, pattern: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    def _confirmed(self, observed: Observed, pattern: Indices) -> Indices | None:
         """Guide stars of an observed pattern: those of the one key whose attitude brings all stars to their places."""
         seen = observed.directions[pattern].T
         key = np.linalg.svd(seen, compute_uv=False)[1:]

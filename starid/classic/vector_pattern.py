@@ -21,6 +21,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Array32, Indices, Indices32
 from starid.classic.grid import BUFFER_SHARE, MOST_NEIGHBOURS, RADIUS_SHARE
 from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
@@ -34,16 +35,14 @@ LEAST_VOTES: Final = 4
 
 
 @inner
-def _element(polar: NDArray[np.float64], i: int, reference: float, radius: float) -> int:
+def _element(polar: Array, i: int, reference: float, radius: float) -> int:
     """Element of the vector that a neighbour's x' falls into."""
     x = polar[i, 0] / radius * math.cos(turned(polar[i, 1], reference))
     return min(max(int(0.5 * (1.0 + x) * ELEMENTS), 0), ELEMENTS - 1)
 
 
 @compiled_ieee
-def _patterns(
-    vectors: NDArray[np.float64], radius: float, buffer: float
-) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]]:
+def _patterns(vectors: Array, radius: float, buffer: float) -> tuple[Indices32, NDArray[np.uint16], Array32]:
     """Index: first entry of each element, the stars that have a neighbour there, and its angle."""
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
     elements, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
@@ -65,12 +64,12 @@ def _patterns(
 
 @compiled_ieee
 def _vote(
-    index: tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]],
+    index: tuple[Indices32, NDArray[np.uint16], Array32],
     stars: int,
-    seen: NDArray[np.float64],
+    seen: Array,
     radius: float,
     buffer: float,
-) -> NDArray[np.int64]:
+) -> Indices:
     """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
     start, owner, angles = index
     polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
@@ -110,5 +109,5 @@ class VectorPatternIdentifier(ClassicIdentifier):
         self.index = _patterns(self.guide.vectors, self._radius, self._buffer)
         return self.index
 
-    def _match(self, observed: Observed) -> NDArray[np.int64]:
+    def _match(self, observed: Observed) -> Indices:
         return _vote(self.index, len(self.guide), observed.directions, self._radius, self._buffer)

@@ -6,8 +6,8 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.geometric.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
 from starid.geometric.pattern_index import IndexArrays
 from starid.geometric.refinement import (
@@ -56,10 +56,10 @@ class Answer(NamedTuple):
     """
 
     status: int
-    quaternion: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    pairs: NDArray[np.int64]
-    numbers: NDArray[np.float64]
+    quaternion: Array
+    covariance: Array
+    pairs: Indices
+    numbers: Array
 
 
 class Candidate(NamedTuple):
@@ -74,10 +74,10 @@ class Candidate(NamedTuple):
     numbers : ndarray (`NUMBERS`,)
     """
 
-    frames: NDArray[np.float64]
-    stars: NDArray[np.int64]
-    normal: NDArray[np.float64]
-    numbers: NDArray[np.float64]
+    frames: Array
+    stars: Indices
+    normal: Array
+    numbers: Array
 
 
 @inner
@@ -92,9 +92,9 @@ def test_and_refine(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: NDArray[np.float64],
+    settings: Array,
     candidate: Candidate,
-    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    tests: tuple[Array, Indices],
     used: tuple[int, int, int],
     least_matched: int,
     prior: tuple[float, float],
@@ -153,7 +153,7 @@ def test_and_refine(
 
 
 @inner
-def quaternion_of(m: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+def quaternion_of(m: Array, q: Array) -> None:
     """Fill in the scalar-last quaternion, scalar ≥ 0, of a rotation matrix (Shepperd 1978)."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     if trace > 0.0:
@@ -182,7 +182,7 @@ def make_answer(
     status: int,
     observed: Table,
     candidate: Candidate,
-    settings: NDArray[np.float64],
+    settings: Array,
     bound: float,
     triangles: int,
     candidates: int,

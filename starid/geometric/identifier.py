@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from starid.aberration import checked_beta
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.catalog import StarCatalog, load_catalog
+from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.geometric.answer import LEAST_MATCHED, Answer
 from starid.geometric.index_choice import (
@@ -52,8 +52,8 @@ from starid.geometric.settings import (
 )
 from starid.geometric.tracking import LEAST_TRACKED, LEAST_TRACKED_KNOWN, track_kernel
 from starid.geometric.verification import WHOLE_SKY
+from starid.single_camera import Measured, SingleCameraIdentifier, near
 from starid.solution import Mode, Reason, Solution
-from starid.solver_input import checked_detections
 
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
@@ -108,7 +108,7 @@ class Effort:
             elif not 0.0 < value < math.inf:
                 raise StaridError(f"identifier {field.name}: must be a positive number, not {value}")
 
-    def numbers(self, camera: Camera, px_per_rad: float) -> NDArray[np.float64]:
+    def numbers(self, camera: Camera, px_per_rad: float) -> Array:
         """Settings of the kernels (`starid.geometric.settings`) for a camera of known focal length."""
         numbers = np.zeros(SETTING_COUNT)
         numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
@@ -125,7 +125,7 @@ class Effort:
         return numbers
 
 
-class Identifier:
+class Identifier(SingleCameraIdentifier):
     """Star identification for one camera and one catalogue.
 
     Parameters
@@ -170,7 +170,7 @@ class Identifier:
             raise StaridError(
                 f"identifier fov_tolerance: must be 0…{WIDEST_TOLERANCE:g}, not {fov_tolerance}"
             )
-        self._catalog = load_catalog() if catalog is None else catalog
+        super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
         effort = effort or Effort()
@@ -194,16 +194,6 @@ class Identifier:
         self._numbers_with_errors[SIGMAS_KNOWN] = 1.0
 
     @property
-    def camera(self) -> Camera:
-        """The camera that the positions belong to."""
-        return self._camera
-
-    @property
-    def catalog(self) -> StarCatalog:
-        """The catalogue whose rows `Solution.catalog_index` refers to."""
-        return self._catalog
-
-    @property
     def stars(self) -> StarCatalog:
         """The stars of the index as the camera resolves them: doubles merged, brightest first."""
         return self._stars
@@ -213,53 +203,28 @@ class Identifier:
         """Size of the index, bytes."""
         return sum(part.nbytes for part in self._index)
 
-    def identify(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Find the attitude without any prior knowledge (lost in space).
-
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            As in `starid.interface.StarIdentifier.identify`.
-
-        Raises
-        ------
-        StaridError
-            The shapes of the arrays disagree, or a value is not finite.
-        """
-        begin = time.perf_counter()
-        xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
-        numbers = self._numbers_for(xy_sigma_px, observer_velocity)
+    def _identify(self, measured: Measured) -> Solution:
         if self._fov_tolerance > 0.0:
-            return self._identify_any_scale(xy, brightness, sigmas, numbers, begin)
-        answer = identify_kernel(self._index, self._camera.params, xy, brightness, sigmas, numbers)
-        return self._solution(answer, "lost_in_space", begin)
+            return self._identify_any_scale(measured)
+        return self._solution(
+            self._search(self._camera, measured, self._numbers_for(measured)), "lost_in_space"
+        )
 
-    def _numbers_for(
-        self, xy_sigma_px: ArrayLike | None, observer_velocity: ArrayLike | None
-    ) -> NDArray[np.float64]:
+    def _search(self, camera: Camera, measured: Measured, numbers: Array) -> Answer:
+        """Search the whole sky with a camera and settings of the kernels."""
+        detections = measured.xy, measured.flux, measured.sigmas
+        return identify_kernel(self._index, camera.params, *detections, numbers)
+
+    def _numbers_for(self, measured: Measured) -> Array:
         """Settings of the kernels for one call."""
-        numbers = self._numbers if xy_sigma_px is None else self._numbers_with_errors
-        if observer_velocity is None:
+        numbers = self._numbers_with_errors if measured.sigmas_known else self._numbers
+        if measured.observer_velocity is None:
             return numbers
         numbers = numbers.copy()
-        numbers[BETA_X : BETA_Z + 1] = checked_beta(observer_velocity)
+        numbers[BETA_X : BETA_Z + 1] = checked_beta(measured.observer_velocity)
         return numbers
 
-    def _identify_any_scale(
-        self,
-        xy: NDArray[np.float64],
-        brightness: NDArray[np.float64],
-        sigmas: NDArray[np.float64],
-        numbers: NDArray[np.float64],
-        begin: float,
-    ) -> Solution:
+    def _identify_any_scale(self, measured: Measured) -> Solution:
         """Try focal lengths from the nominal one outward, each with its share of the tolerance.
 
         A short search at every focal length comes before the full one. Each search bounds its own probability of a
@@ -267,7 +232,7 @@ class Identifier:
         """
         steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
         share = self._fov_tolerance / (2 * steps - 1)
-        numbers = numbers.copy()
+        numbers = self._numbers_for(measured).copy()
         numbers[SCALE_TOLERANCE] = share
         cameras = [
             scaled_camera(self._camera, 1.0 + 2.0 * share * step)
@@ -281,43 +246,13 @@ class Identifier:
         ):
             numbers[MAX_TRIANGLES], numbers[PART_STARS] = triangles, part_stars
             for camera in cameras:
-                answer = identify_kernel(self._index, camera.params, xy, brightness, sigmas, numbers)
-                solution = self._solution(answer, "lost_in_space", begin)
+                answer = self._search(camera, measured, numbers)
+                solution = self._solution(answer, "lost_in_space")
                 if solution.valid:
                     found = scaled_camera(camera, 1.0 / float(answer.numbers[3]))
                     false = min(solution.probability_false * len(cameras), 1.0)
                     return dataclasses.replace(solution, camera=found, probability_false=false)
         return solution
-
-    def track(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        predicted: Attitude | ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        window_px: float | None = None,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
-
-        Three stars can be enough, and two if their errors are given. Whether they are depends on the window: the narrower,
-        the less can agree by chance.
-
-        Parameters
-        ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
-            As in `starid.interface.StarIdentifier.track`; the window is `TRACKING_WINDOW_PX` by default.
-
-        Raises
-        ------
-        StaridError
-            As in `identify`, or the window is not positive.
-        """
-        window = TRACKING_WINDOW_PX if window_px is None else window_px
-        return self._identify_near(
-            xy_px, flux, predicted, xy_sigma_px, window, observer_velocity, anywhere=False
-        )
 
     def verify(
         self,
@@ -341,38 +276,30 @@ class Identifier:
         StaridError
             As in `track`.
         """
-        return self._identify_near(
-            xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, anywhere=True
-        )
+        return near(xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, self._verify)
 
-    def _identify_near(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        predicted: Attitude | ArrayLike,
-        xy_sigma_px: ArrayLike | None,
-        window_px: float,
-        observer_velocity: ArrayLike | None,
-        *,
-        anywhere: bool,
+    def _track(
+        self, measured: Measured, predicted: Attitude, window_px: float | None, *, anywhere: bool = False
     ) -> Solution:
-        """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`)."""
-        begin = time.perf_counter()
-        xy, brightness, sigmas = checked_detections(xy_px, flux, xy_sigma_px)
-        if not 0.0 < window_px < math.inf:
-            raise StaridError(f"tracking window_px: must be a positive number of pixels, not {window_px}")
-        attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
-        numbers = self._numbers_for(xy_sigma_px, observer_velocity)
-        window = window_px / self._px_per_rad
-        prior, least = self._prior(window), LEAST_TRACKED if xy_sigma_px is None else LEAST_TRACKED_KNOWN
+        """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`).
+
+        Three stars can be enough, and two if their errors are given. Whether they are depends on the window, by default
+        `TRACKING_WINDOW_PX`: the narrower, the less can agree by chance.
+        """
+        numbers = self._numbers_for(measured)
+        window = (TRACKING_WINDOW_PX if window_px is None else window_px) / self._px_per_rad
+        prior, least = self._prior(window), LEAST_TRACKED_KNOWN if measured.sigmas_known else LEAST_TRACKED
         if anywhere:
             prior, least, numbers = WHOLE_SKY, LEAST_MATCHED, numbers.copy()
             numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
         answer = track_kernel(
-            self._index, self._camera.params, xy, brightness, sigmas, numbers,
-            attitude.matrix, window, least, prior,
+            self._index, self._camera.params, measured.xy, measured.flux, measured.sigmas, numbers,
+            predicted.matrix, window, least, prior,
         )  # fmt: skip
-        return self._solution(answer, "tracking", begin)
+        return self._solution(answer, "tracking")
+
+    def _verify(self, measured: Measured, candidate: Attitude, window_px: float | None) -> Solution:
+        return self._track(measured, candidate, window_px, anywhere=True)
 
     def _prior(self, window_rad: float) -> tuple[float, float]:
         """Volume of the rotations that keep every star of the field within a window, rad³, and the window's solid angle."""
@@ -412,11 +339,11 @@ class Identifier:
         return other
 
     @property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Array:
         """Unit vectors (m, 3) of `stars`, as the index holds them."""
         return self._index.stars[:, :3]
 
-    def with_direction(self, row: int, direction: NDArray[np.float64]) -> Identifier:
+    def with_direction(self, row: int, direction: Array) -> Identifier:
         """Identifier whose index holds another direction (3,), not necessarily of unit length, for a row of `stars`."""
         stars = self._index.stars.copy()
         stars[row, :3] = direction
@@ -426,12 +353,12 @@ class Identifier:
         other._index = self._index._replace(stars=stars)
         return other
 
-    def _solution(self, answer: Answer, mode: Mode, begin: float) -> Solution:
+    def _solution(self, answer: Answer, mode: Mode) -> Solution:
         if answer.status != ACCEPTED:
             reason = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST
             if answer.status == TOO_FEW:
                 reason = Reason.TOO_FEW_STARS
-            return Solution.invalid(reason, mode=mode, elapsed=time.perf_counter() - begin)
+            return Solution.invalid(reason, mode=mode)
         rms, sigma, log_false, _, _, _ = answer.numbers.tolist()
         return Solution(
             valid=True,
@@ -445,7 +372,6 @@ class Identifier:
             sigma_px=sigma,
             probability_false=math.exp(log_false),
             mode=mode,
-            elapsed=time.perf_counter() - begin,
         )
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Indices
 from starid.geometric.pattern_index import SIDE_BINS, SIDE_STEP, SIDE_STEPS, IndexArrays, pattern_row
 from starid.jit import inner
 
@@ -30,7 +31,7 @@ def find_triangles(
     hand: int,
     tolerance: float,
     spread: float,
-    found: NDArray[np.int64],
+    found: Indices,
 ) -> int:
     """Find the triangles of the index with three sides, longest first, within a tolerance; return their number.
 

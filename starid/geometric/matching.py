@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.geometric.observation import (
     MAGNITUDE,
     SIGMA_U,
@@ -36,7 +36,7 @@ BY_NOISE: Final = 0.0
 
 
 @inner
-def to_sky(rotation: NDArray[np.float64], seen: Table, i: int) -> tuple[float, float, float]:
+def to_sky(rotation: Array, seen: Table, i: int) -> tuple[float, float, float]:
     """Direction of detection i expressed in ICRS, by the ICRS→sensor matrix."""
     x, y, z = seen[i, X], seen[i, Y], seen[i, Z]
     return (
@@ -48,7 +48,7 @@ def to_sky(rotation: NDArray[np.float64], seen: Table, i: int) -> tuple[float, f
 
 @inner
 def residual(
-    star_table: NDArray[np.float64], seen: Table, rotation: NDArray[np.float64], i: int, star: int
+    star_table: Array, seen: Table, rotation: Array, i: int, star: int
 ) -> tuple[float, float, float, float, float]:
     """Residual of detection i against a star (columns, rows; pixels), and the star's direction in the sensor."""
     a, b, c = star_table[star, 0], star_table[star, 1], star_table[star, 2]
@@ -66,7 +66,7 @@ def residual(
 
 
 @inner
-def middle_value(values: NDArray[np.float64], count: int) -> float:
+def middle_value(values: Array, count: int) -> float:
     """Median (the lower one of an even number) of the first `count` values, reordered in place (quickselect)."""
     low, high, middle = 0, count - 1, (count - 1) // 2
     while low < high:
@@ -94,7 +94,7 @@ def middle_value(values: NDArray[np.float64], count: int) -> float:
 def _best_star(
     index: IndexArrays,
     seen: Table,
-    rotation: NDArray[np.float64],
+    rotation: Array,
     i: int,
     windows: tuple[float, float, float, float],
     zero_point: float,
@@ -133,14 +133,14 @@ def _best_star(
 def match_detections(
     index: IndexArrays,
     seen: Table,
-    rotation: NDArray[np.float64],
-    excluded: NDArray[np.bool_],
+    rotation: Array,
+    excluded: Mask,
     windows: tuple[float, float, float, float],
     zero_point: float,
     scatter: float,
-    stars: NDArray[np.int64],
-    costs: NDArray[np.float64],
-    owners: NDArray[np.int64],
+    stars: Indices,
+    costs: Array,
+    owners: Indices,
 ) -> int:
     """Match each detection to the likeliest star in its window; return the number of matches.
 

@@ -6,8 +6,8 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import inner
 from starid.projection import (
     CX,
@@ -27,7 +27,7 @@ from starid.projection import (
     undistort,
 )
 
-Table = NDArray[np.float64]
+Table = Array
 
 X: Final = 0
 Y: Final = 1
@@ -63,14 +63,14 @@ FAINTEST: Final = 99.0
 class Raw(NamedTuple):
     """Input of the caller: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
 
-    params: NDArray[np.float64]
-    xy: NDArray[np.float64]
-    flux: NDArray[np.float64]
-    sigmas: NDArray[np.float64]
+    params: Array
+    xy: Array
+    flux: Array
+    sigmas: Array
 
 
 @inner
-def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
+def by_falling_flux(flux: Array) -> Indices:
     """Rows by falling flux (Shell sort, gaps of Ciura); the order of equal ones is undefined."""
     n = flux.shape[0]
     order = np.empty(n, dtype=np.int64)
@@ -88,9 +88,7 @@ def by_falling_flux(flux: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @inner
-def fill_direction(
-    params: NDArray[np.float64], scale: float, column: float, row: float, table: Table, n: int
-) -> bool:
+def fill_direction(params: Array, scale: float, column: float, row: float, table: Table, n: int) -> bool:
     """Fill in direction and gradients of a position, the focal length divided by `scale`; False outside the image circle."""
     fx, fy, model = params[FX] / scale, params[FY] / scale, params[MODEL]
     a, b = (column - params[CX]) / fx, (row - params[CY]) / fy
@@ -171,7 +169,7 @@ def at_rest(
 
 @inner
 def remove_aberration(
-    observed: Table, beta: tuple[float, float, float], rotation: NDArray[np.float64], seen: Table
+    observed: Table, beta: tuple[float, float, float], rotation: Array, seen: Table
 ) -> None:
     """Set the directions of `seen` to those of `observed` for an observer at rest, under an ICRS→sensor matrix."""
     bx = rotation[0, 0] * beta[0] + rotation[0, 1] * beta[1] + rotation[0, 2] * beta[2]

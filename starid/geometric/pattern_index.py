@@ -20,6 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32, Mask
 from starid.camera import Camera
 from starid.catalog import StarCatalog, companions, merge_close_stars
 from starid.errors import StaridError
@@ -67,15 +68,15 @@ class IndexArrays(NamedTuple):
         shortest and longest side of the deep triangles (chords).
     """
 
-    stars: NDArray[np.float64]
-    grid_start: NDArray[np.int32]
-    grid_stars: NDArray[np.int32]
-    counts: NDArray[np.int32]
-    row_start: NDArray[np.int32]
+    stars: Array
+    grid_start: Indices32
+    grid_stars: Indices32
+    counts: Indices32
+    row_start: Indices32
     sides: NDArray[np.uint16]
     corners: NDArray[np.uint16]
-    pattern_stars: NDArray[np.int32]
-    numbers: NDArray[np.float64]
+    pattern_stars: Indices32
+    numbers: Array
 
 
 STAR_MAGNITUDE: Final = 3
@@ -148,9 +149,7 @@ def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float
     )
 
 
-def _adjacency(
-    vectors: NDArray[np.float64], radius_rad: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _adjacency(vectors: Array, radius_rad: float) -> tuple[Indices, Indices]:
     """All pairs within a radius, as compressed rows: (start (m + 1,), neighbours), both ways, ascending."""
     from scipy.spatial import cKDTree
 
@@ -178,7 +177,7 @@ def sorted_triangle(
 
 
 @inner
-def chord(vectors: NDArray[np.float64], i: int, j: int) -> float:
+def chord(vectors: Array, i: int, j: int) -> float:
     """Chord between two unit vectors, the first three columns of rows i and j."""
     x = vectors[i, 0] - vectors[j, 0]
     y = vectors[i, 1] - vectors[j, 1]
@@ -187,7 +186,7 @@ def chord(vectors: NDArray[np.float64], i: int, j: int) -> float:
 
 
 @inner
-def handedness(vectors: NDArray[np.float64], i: int, j: int, k: int) -> int:
+def handedness(vectors: Array, i: int, j: int, k: int) -> int:
     """1 where the triple product of rows i, j, k is positive, else 0."""
     product = (
         vectors[i, 0] * (vectors[j, 1] * vectors[k, 2] - vectors[k, 1] * vectors[j, 2])
@@ -205,14 +204,14 @@ def pattern_row(hand: int, longest: int, middle: int, bins: int) -> int:
 
 @compiled_ieee
 def _triangles(
-    vectors: NDArray[np.float64],
-    start: NDArray[np.int64],
-    neighbours: NDArray[np.int64],
-    bright: NDArray[np.bool_],
+    vectors: Array,
+    start: Indices,
+    neighbours: Indices,
+    bright: Mask,
     bright_sides: tuple[float, float],
     deep_sides: tuple[float, float],
     bins: int,
-) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+) -> tuple[NDArray[np.uint16], Indices]:
     """All triangles i < j < k with sides within their limits: sides and corners (p, 6), and rows."""
     longest = bright_sides[1]
     step = longest / SIDE_STEPS
@@ -257,9 +256,7 @@ def _triangles(
 
 
 @compiled_ieee
-def _count_field_stars(
-    vectors: NDArray[np.float64], magnitudes: NDArray[np.float64], cap_cosine: float, bins: int
-) -> NDArray[np.int32]:
+def _count_field_stars(vectors: Array, magnitudes: Array, cap_cosine: float, bins: int) -> Indices32:
     """Cumulative star counts by magnitude in a cap around the centre of each coarse cell."""
     cells = FACES * COUNT_CELLS * COUNT_CELLS
     counts = np.zeros((cells + 1, bins), dtype=np.int32)

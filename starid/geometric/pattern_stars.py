@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.jit import compiled_ieee
 
 _FINEST_CELL: Final = 0.01
@@ -15,7 +15,7 @@ _FINEST_CELL: Final = 0.01
 
 
 @compiled_ieee
-def _pick(vectors: NDArray[np.float64], chord: float, quota: int, finest_cell: float) -> NDArray[np.bool_]:
+def _pick(vectors: Array, chord: float, quota: int, finest_cell: float) -> Mask:
     """Select stars in order while fewer than `quota` selected ones lie within the chord of them.
 
     Selected stars are kept in lists, one for each cell of a cubic grid as wide as the chord.
@@ -47,7 +47,7 @@ def _pick(vectors: NDArray[np.float64], chord: float, quota: int, finest_cell: f
     return taken
 
 
-def pick_pattern_stars(vectors: NDArray[np.float64], cap_area_sr: float, quota: int) -> NDArray[np.int64]:
+def pick_pattern_stars(vectors: Array, cap_area_sr: float, quota: int) -> Indices:
     """Select the rows of the pattern stars.
 
     Parameters

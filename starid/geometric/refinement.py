@@ -13,8 +13,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.geometric.matching import (
     BY_NOISE,
     match_detections,
@@ -88,7 +88,7 @@ NUMBERS: Final = 6
 
 
 @inner
-def rotate_sensor(rotation: NDArray[np.float64], vx: float, vy: float, vz: float) -> None:
+def rotate_sensor(rotation: Array, vx: float, vy: float, vz: float) -> None:
     """Rotate the sensor by +v, in place: ``A ← exp(−[v]×)·A`` (Rodrigues)."""
     angle2 = vx * vx + vy * vy + vz * vz
     angle = math.sqrt(angle2)
@@ -105,9 +105,7 @@ def rotate_sensor(rotation: NDArray[np.float64], vx: float, vy: float, vz: float
 
 
 @inner
-def solve_symmetric(
-    matrix: NDArray[np.float64], right: NDArray[np.float64], size: int, solution: NDArray[np.float64]
-) -> bool:
+def solve_symmetric(matrix: Array, right: Array, size: int, solution: Array) -> bool:
     """Solve a positive definite system of the leading `size` rows by Cholesky; False where it is singular."""
     lower = np.zeros((4, 4))
     for i in range(size):
@@ -135,7 +133,7 @@ def solve_symmetric(
 
 
 @inner
-def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: NDArray[np.float64]) -> None:
+def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: Array) -> None:
     """Fill (2, 4) with the derivatives of the predicted position of detection i by rotation and scale.
 
     A rotation v of the sensor moves it by G (c × v), c = (x, y, z) being the star in the sensor frame; a larger scale,
@@ -150,14 +148,14 @@ def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: NDArray[n
 
 @inner
 def _outlier(
-    star_table: NDArray[np.float64],
+    star_table: Array,
     seen: Table,
-    rotation: NDArray[np.float64],
-    stars: NDArray[np.int64],
-    normal: NDArray[np.float64],
+    rotation: Array,
+    stars: Indices,
+    normal: Array,
     chi2: float,
     freedom: int,
-    settings: NDArray[np.float64],
+    settings: Array,
 ) -> int:
     """The match most inconsistent with the others, if beyond chance; else −1.
 
@@ -204,13 +202,13 @@ def _outlier(
 
 @inner
 def normal_equations(
-    star_table: NDArray[np.float64],
+    star_table: Array,
     seen: Table,
-    rotation: NDArray[np.float64],
-    stars: NDArray[np.int64],
+    rotation: Array,
+    stars: Indices,
     unknowns: int,
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
+    normal: Array,
+    right: Array,
 ) -> float:
     """Fill the normal matrix (4, 4) and right side (4,) over the matches; return Σ (r/σ)².
 
@@ -242,12 +240,7 @@ def normal_equations(
 
 
 @inner
-def photometry(
-    star_table: NDArray[np.float64],
-    seen: Table,
-    stars: NDArray[np.int64],
-    scratch: NDArray[np.float64],
-) -> tuple[float, float]:
+def photometry(star_table: Array, seen: Table, stars: Indices, scratch: Array) -> tuple[float, float]:
     """Zero point (catalogue minus instrumental magnitude) and its scatter, robust, over the matches."""
     m = 0
     for i in range(stars.shape[0]):
@@ -263,11 +256,7 @@ def photometry(
 
 @inner
 def distances(
-    star_table: NDArray[np.float64],
-    seen: Table,
-    rotation: NDArray[np.float64],
-    stars: NDArray[np.int64],
-    scratch: NDArray[np.float64],
+    star_table: Array, seen: Table, rotation: Array, stars: Indices, scratch: Array
 ) -> tuple[float, float]:
     """Noise of a star of unit error from the median distance of the matches (Rayleigh), and their rms, px."""
     m = 0
@@ -282,7 +271,7 @@ def distances(
 
 
 @inner
-def _same(stars: NDArray[np.int64], previous: NDArray[np.int64]) -> bool:
+def _same(stars: Indices, previous: Indices) -> bool:
     """Whether the matches are unchanged; `previous` is updated."""
     same = True
     for i in range(stars.shape[0]):
@@ -293,7 +282,7 @@ def _same(stars: NDArray[np.int64], previous: NDArray[np.int64]) -> bool:
 
 
 @inner
-def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> float:
+def _marginalise(normal: Array, scratch: Array) -> float:
     """Marginalise the scale: the leading block becomes the normal matrix of the rotation alone.
 
     Returns the marginal variance of the logarithm of the scale.
@@ -309,24 +298,19 @@ def _marginalise(normal: NDArray[np.float64], scratch: NDArray[np.float64]) -> f
 
 
 @inner
-def directions_depend_on_solution(settings: NDArray[np.float64]) -> bool:
+def directions_depend_on_solution(settings: Array) -> bool:
     """Whether the directions of the detections change with the solution: with its scale, or by aberration."""
     return bool(settings[SCALE_TOLERANCE] > 0.0) or _observer_moves(settings)
 
 
 @inner
-def _observer_moves(settings: NDArray[np.float64]) -> bool:
+def _observer_moves(settings: Array) -> bool:
     return bool(settings[BETA_X] != 0.0 or settings[BETA_Y] != 0.0 or settings[BETA_Z] != 0.0)
 
 
 @inner
 def _observe_with(
-    raw: Raw,
-    observed: Table,
-    settings: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    scale: float,
-    seen: Table,
+    raw: Raw, observed: Table, settings: Array, rotation: Array, scale: float, seen: Table
 ) -> None:
     """Fill `seen` with the detections under the refined scale and without aberration."""
     if settings[SCALE_TOLERANCE] > 0.0:
@@ -337,7 +321,7 @@ def _observe_with(
 
 
 @inner
-def _rotate_by_aberration(settings: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:
+def _rotate_by_aberration(settings: Array, rotation: Array) -> None:
     """Rotate an attitude derived from aberrated directions by the aberration of its boresight, in place."""
     bx, by, bz = settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
     x, y, _ = at_rest(
@@ -356,13 +340,13 @@ def refine(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: NDArray[np.float64],
+    settings: Array,
     least_matched: int,
     seen: Table,
-    rotation: NDArray[np.float64],
-    stars: NDArray[np.int64],
-    normal: NDArray[np.float64],
-    numbers: NDArray[np.float64],
+    rotation: Array,
+    stars: Indices,
+    normal: Array,
+    numbers: Array,
 ) -> int:
     """Match and solve until the matches no longer change.
 

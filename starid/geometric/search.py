@@ -11,8 +11,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.geometric.answer import (
     LEAST_MATCHED,
     Answer,
@@ -74,9 +74,7 @@ _SEED: Final = 88172645463325252
 
 
 @inner
-def copy_corner(
-    table: NDArray[np.float64], source: int, model: float, scale: float, frame: Table, row: int
-) -> None:
+def copy_corner(table: Array, source: int, model: float, scale: float, frame: Table, row: int) -> None:
     """Copy a unit vector, for a focal length divided by `scale`, to a row of a frame."""
     frame[row, 0], frame[row, 1], frame[row, 2] = scaled(
         model, table[source, X], table[source, Y], table[source, Z], scale
@@ -107,11 +105,7 @@ def make_frame(frame: Table) -> None:
 
 @inner
 def set_sensor_frame(
-    observed: Table,
-    detections: tuple[int, int, int],
-    model: float,
-    scale: float,
-    frames: NDArray[np.float64],
+    observed: Table, detections: tuple[int, int, int], model: float, scale: float, frames: Array
 ) -> None:
     """Fill ``frames[0]`` with the frame of three detections.
 
@@ -126,9 +120,7 @@ def set_sensor_frame(
 
 
 @inner
-def set_rotation(
-    star_table: NDArray[np.float64], stars: tuple[int, int, int], frames: NDArray[np.float64]
-) -> None:
+def set_rotation(star_table: Array, stars: tuple[int, int, int], frames: Array) -> None:
     """Fill ``frames[2]`` with the ICRS→sensor matrix that maps three stars to the detections of ``frames[0]``.
 
     The second and the third should be far apart: they determine the roll. ``frames[1]`` is workspace.
@@ -148,12 +140,12 @@ def _try_patterns(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: NDArray[np.float64],
+    settings: Array,
     candidate: Candidate,
-    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    tests: tuple[Array, Indices],
     corners: tuple[int, int, int],
     longest_side: float,
-    found: NDArray[np.int64],
+    found: Indices,
     count: int,
     gate: float,
 ) -> float:
@@ -220,7 +212,7 @@ def _worth_looking_up(observed: Table, i: int, j: int, k: int, bounds: tuple[flo
 
 
 @inner
-def _detections_in_part(raw: Raw, observed: Table, part: int) -> NDArray[np.int64]:
+def _detections_in_part(raw: Raw, observed: Table, part: int) -> Indices:
     """Detections in one of the `PARTS` of the field, four quadrants and the middle, brightest first."""
     half_width, half_height = 0.25 * raw.params[WIDTH], 0.25 * raw.params[HEIGHT]
     members = np.empty(observed.shape[0], dtype=np.int64)
@@ -249,12 +241,7 @@ def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
 
 @compiled_ieee
 def identify_kernel(
-    index: IndexArrays,
-    params: NDArray[np.float64],
-    xy: NDArray[np.float64],
-    flux: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    settings: NDArray[np.float64],
+    index: IndexArrays, params: Array, xy: Array, flux: Array, sigmas: Array, settings: Array
 ) -> Answer:
     """Find the attitude of a set of detections without prior knowledge.
 

@@ -12,8 +12,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices32
 from starid.jit import compiled_ieee, inner
 
 FACES: Final = 6
@@ -38,7 +38,7 @@ def cell_of(x: float, y: float, z: float, n: int) -> int:
 
 
 @inner
-def _reach(vector: NDArray[np.float64], face: int, n: int, margin: float) -> tuple[int, int, int, int]:
+def _reach(vector: Array, face: int, n: int, margin: float) -> tuple[int, int, int, int]:
     """First and last row and column of the cells of a face that lie within the margin of a star.
 
     The last are −1 where there are none. The bound is generous: |∇u| on the face is at most 1 + u² + v².
@@ -61,7 +61,7 @@ def _reach(vector: NDArray[np.float64], face: int, n: int, margin: float) -> tup
 
 
 @compiled_ieee
-def _fill(vectors: NDArray[np.float64], n: int, margin: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _fill(vectors: Array, n: int, margin: float) -> tuple[Indices32, Indices32]:
     """Count, then list; see `build_sky_grid`."""
     start = np.zeros(FACES * n * n + 1, dtype=np.int32)
     for star in range(vectors.shape[0]):
@@ -85,9 +85,7 @@ def _fill(vectors: NDArray[np.float64], n: int, margin: float) -> tuple[NDArray[
     return start, stars
 
 
-def build_sky_grid(
-    vectors: NDArray[np.float64], cells_per_edge: int, margin_rad: float
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def build_sky_grid(vectors: Array, cells_per_edge: int, margin_rad: float) -> tuple[Indices32, Indices32]:
     """Grid over stars sorted by falling brightness.
 
     Parameters

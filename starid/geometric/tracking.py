@@ -15,8 +15,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.geometric.answer import (
     LEAST_MATCHED,
     Answer,
@@ -69,7 +69,7 @@ LEAST_TRACKED_KNOWN: Final = 2
 
 @inner
 def _stars_near(
-    index: IndexArrays, x: float, y: float, z: float, window_rad: float, found: NDArray[np.int64], row: int
+    index: IndexArrays, x: float, y: float, z: float, window_rad: float, found: Indices, row: int
 ) -> int:
     """Fill a row with the brightest stars within a window around a direction; return their number."""
     stars = index.stars
@@ -94,7 +94,7 @@ def _stars_near(
 
 
 @inner
-def _weigh(candidate: Candidate, bound: float, best: Candidate, bounds: NDArray[np.float64]) -> None:
+def _weigh(candidate: Candidate, bound: float, best: Candidate, bounds: Array) -> None:
     """Keep a candidate in `best` if its bound is the least; ``bounds`` are that of `best` and of its best rival."""
     shared = 0
     for i in range(candidate.stars.shape[0]):
@@ -117,9 +117,9 @@ def _try_pair(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: NDArray[np.float64],
+    settings: Array,
     candidate: Candidate,
-    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    tests: tuple[Array, Indices],
     detections: tuple[int, int],
     stars: tuple[int, int],
     least_matched: int,
@@ -143,17 +143,17 @@ def _try_detections(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: NDArray[np.float64],
+    settings: Array,
     candidate: Candidate,
-    tests: tuple[NDArray[np.float64], NDArray[np.int64]],
+    tests: tuple[Array, Indices],
     detections: tuple[int, int],
-    near: NDArray[np.int64],
-    counts: NDArray[np.int64],
+    near: Indices,
+    counts: Indices,
     least_matched: int,
     prior: tuple[float, float],
     best: Candidate,
-    bounds: NDArray[np.float64],
-    work: NDArray[np.int64],
+    bounds: Array,
+    work: Indices,
 ) -> float:
     """Try all pairs of stars near two detections; return the bound of the first that needs no comparison, or 0.
 
@@ -183,12 +183,12 @@ def _try_detections(
 @compiled_ieee
 def track_kernel(
     index: IndexArrays,
-    params: NDArray[np.float64],
-    xy: NDArray[np.float64],
-    flux: NDArray[np.float64],
-    sigmas: NDArray[np.float64],
-    settings: NDArray[np.float64],
-    predicted: NDArray[np.float64],
+    params: Array,
+    xy: Array,
+    flux: Array,
+    sigmas: Array,
+    settings: Array,
+    predicted: Array,
     window_rad: float,
     least_matched: int,
     prior: tuple[float, float],

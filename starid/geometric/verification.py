@@ -29,8 +29,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.geometric.matching import residual
 from starid.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.geometric.pattern_index import (
@@ -81,7 +81,7 @@ SCATTER_FLOOR: Final = 0.15
 
 
 @inner
-def hit_odds(index: IndexArrays, window_rad: float) -> NDArray[np.float64]:
+def hit_odds(index: IndexArrays, window_rad: float) -> Array:
     """Logarithm of the odds gained by a hit, for each magnitude limit of the lookup (bins)."""
     sky, bins = index.counts.shape[0] - 1, index.counts.shape[1]
     odds = np.empty(bins)
@@ -92,7 +92,7 @@ def hit_odds(index: IndexArrays, window_rad: float) -> NDArray[np.float64]:
 
 
 @inner
-def test_order(count: int) -> NDArray[np.int64]:
+def test_order(count: int) -> Indices:
     """Order in which detections are tested: bright and faint half alternate.
 
     The brightest carry the most information, but false stars are frequent among them. Each pattern starts at a
@@ -110,14 +110,14 @@ def test_order(count: int) -> NDArray[np.int64]:
 @inner
 def worth_refining(
     index: IndexArrays,
-    params: NDArray[np.float64],
+    params: Array,
     observed: Table,
-    rotation: NDArray[np.float64],
+    rotation: Array,
     scale: float,
     faintest_offset: float,
-    settings: NDArray[np.float64],
-    odds: NDArray[np.float64],
-    order: NDArray[np.int64],
+    settings: Array,
+    odds: Array,
+    order: Indices,
     used: tuple[int, int, int],
 ) -> bool:
     """Sequential test of a candidate attitude on detections outside its pattern.
@@ -177,7 +177,7 @@ def worth_refining(
 
 
 @inner
-def _stars_per_magnitude(counts: NDArray[np.int32], cell: int, magnitude: float) -> float:
+def _stars_per_magnitude(counts: Indices32, cell: int, magnitude: float) -> float:
     """Catalogue stars per magnitude in a field, smoothed over one magnitude; at least one."""
     bins = counts.shape[1]
     middle = magnitude_bin(magnitude, bins)
@@ -192,9 +192,9 @@ def _stars_per_magnitude(counts: NDArray[np.int32], cell: int, magnitude: float)
 def _log_detections(
     index: IndexArrays,
     seen: Table,
-    rotation: NDArray[np.float64],
-    stars: NDArray[np.int64],
-    numbers: NDArray[np.float64],
+    rotation: Array,
+    stars: Indices,
+    numbers: Array,
     deviation_of_one: float,
     field_px: float,
 ) -> tuple[float, float]:
@@ -239,7 +239,7 @@ def _log_detections(
 
 
 @inner
-def _noise(numbers: NDArray[np.float64], freedom: int, known: bool) -> tuple[float, float]:
+def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
     """Variance of unit weight that the bound is computed with, and the logarithm of the factor for averaging over it.
 
     Where the caller stated the errors, the prior of the variance is the scaled inverse χ² of `PRIOR_FREEDOM` degrees of
@@ -261,12 +261,12 @@ def _noise(numbers: NDArray[np.float64], freedom: int, known: bool) -> tuple[flo
 def log_false_probability(
     index: IndexArrays,
     seen: Table,
-    rotation: NDArray[np.float64],
-    stars: NDArray[np.int64],
+    rotation: Array,
+    stars: Indices,
     matched: int,
-    normal: NDArray[np.float64],
-    numbers: NDArray[np.float64],
-    settings: NDArray[np.float64],
+    normal: Array,
+    numbers: Array,
+    settings: Array,
     prior: tuple[float, float],
 ) -> float:
     """Logarithm of the bound on the probability that an agreement is chance; see the module.

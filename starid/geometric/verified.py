@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-
-from numpy.typing import ArrayLike
+from abc import abstractmethod
 
 from starid.attitude import Attitude
 from starid.geometric.identifier import Identifier
+from starid.single_camera import Measured, SingleCameraIdentifier
 from starid.solution import Solution
 
 
-class VerifiedIdentifier(ABC):
+class VerifiedIdentifier(SingleCameraIdentifier):
     """An algorithm that is for lost in space only: its answers are verified, and tracking is the verifier's."""
 
     @property
@@ -19,23 +18,23 @@ class VerifiedIdentifier(ABC):
     def verifier(self) -> Identifier:
         """What verifies and tracks."""
 
-    def track(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        predicted: Attitude | ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        window_px: float | None = None,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Attitude near a predicted one, as the verifier finds it.
-
-        Parameters
-        ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
-            As in `starid.interface.StarIdentifier.track`.
-        """
+    def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
         return self.verifier.track(
-            xy_px, flux, predicted, xy_sigma_px, window_px=window_px, observer_velocity=observer_velocity
+            measured.xy,
+            measured.flux,
+            predicted,
+            measured.given_sigmas,
+            window_px=window_px,
+            observer_velocity=measured.observer_velocity,
+        )
+
+    def verify(self, measured: Measured, candidate: Attitude, window_px: float) -> Solution:
+        """Verify an attitude that was found lost in space (`Identifier.verify`)."""
+        return self.verifier.verify(
+            measured.xy,
+            measured.flux,
+            candidate,
+            measured.given_sigmas,
+            window_px=window_px,
+            observer_velocity=measured.observer_velocity,
         )

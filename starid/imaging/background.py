@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array32, GreyImage
 from starid.jit import compiled_ieee, compiled_sums
 
 BLOCK_PX: Final = 32
@@ -44,8 +45,8 @@ class Background:
         Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
     """
 
-    level: npt.NDArray[np.float32]
-    noise: npt.NDArray[np.float32]
+    level: Array32
+    noise: Array32
     block_px: int
 
     @cached_property
@@ -60,13 +61,7 @@ class Background:
 
 
 @compiled_sums
-def _refine(
-    values: npt.NDArray[np.float32],
-    dx: npt.NDArray[np.float32],
-    dy: npt.NDArray[np.float32],
-    start: tuple[float, float],
-    plane: npt.NDArray[np.float32],
-) -> None:
+def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float], plane: Array32) -> None:
     """Plane through the samples of a block without its stars: (level, slopes by dx and dy, noise).
 
     Samples farther than 3.5 sigmas from the plane are left out, half a count more being allowed, so that rounding to
@@ -104,9 +99,7 @@ def _refine(
 
 
 @compiled_ieee
-def _sample_offsets(
-    columns: int, count: int, dx: npt.NDArray[np.float32], dy: npt.NDArray[np.float32]
-) -> None:
+def _sample_offsets(columns: int, count: int, dx: Array32, dy: Array32) -> None:
     """Offsets of the samples of a block from their mean, pixels: every fourth row, all its columns."""
     middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (count // columns - 1)
     for k in range(count):
@@ -115,12 +108,7 @@ def _sample_offsets(
 
 
 @compiled_ieee
-def _block_statistics(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    block: int,
-    level: npt.NDArray[np.float32],
-    noise: npt.NDArray[np.float32],
-) -> None:
+def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array32) -> None:
     """Median and quartiles of a few pixels of every block first, then a plane through every fourth row of it."""
     height, width = image.shape
     first = np.empty(_FIRST_SAMPLES, np.int32)
@@ -165,9 +153,7 @@ def _block_statistics(
             noise[row, column] = plane[3]
 
 
-def estimate_background(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], block_px: int = BLOCK_PX
-) -> Background:
+def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Background:
     """Background and noise of an image (h, w) on a grid of blocks.
 
     A block that lies over the image's edge is moved inside, so that every block is whole; images smaller than a
@@ -193,7 +179,7 @@ def block_position(position: float, block: float, count: int) -> tuple[int, int,
 
 
 @compiled_ieee
-def interpolate_at(grid: npt.NDArray[np.float32], block: float, x: float, y: float) -> float:
+def interpolate_at(grid: Array32, block: float, x: float, y: float) -> float:
     """Value of a grid of blocks at a pixel position, linear between block centres and extrapolated to the edges."""
     i, i2, q = block_position(y, block, grid.shape[0])
     j, j2, p = block_position(x, block, grid.shape[1])

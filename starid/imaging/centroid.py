@@ -11,9 +11,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
+from starid.arrays import Array, Array32
 from starid.imaging.normal_table import normal
 from starid.jit import compiled_ieee, compiled_sums
 
@@ -41,14 +39,7 @@ SHORT_TRAIL_PX: Final = 0.5
 
 
 @compiled_ieee
-def spot_profile(
-    centre: float,
-    sigma: float,
-    first: int,
-    share: npt.NDArray[np.float64],
-    slope: npt.NDArray[np.float64],
-    count: int,
-) -> None:
+def spot_profile(centre: float, sigma: float, first: int, share: Array, slope: Array, count: int) -> None:
     """Shares of a Gaussian at `centre` in `count` pixels from `first` on, and their derivatives by the centre."""
     scale = 1.0 / sigma
     z = (first - 0.5 - centre) * scale
@@ -64,12 +55,7 @@ def spot_profile(
 
 @compiled_ieee
 def spot_model(
-    x: float,
-    y: float,
-    sigma: float,
-    window: tuple[int, int, int, int],
-    model: npt.NDArray[np.float64],
-    work: npt.NDArray[np.float64],
+    x: float, y: float, sigma: float, window: tuple[int, int, int, int], model: Array, work: Array
 ) -> None:
     """Shares of a round spot in the pixels of a window.
 
@@ -104,7 +90,7 @@ def trail_model(
     sigma: float,
     trail: tuple[float, float],
     window: tuple[int, int, int, int],
-    model: npt.NDArray[np.float64],
+    model: Array,
 ) -> None:
     """As `spot_model`, for a spot that moves evenly by `trail` pixels during the exposure, x and y its middle.
 
@@ -148,8 +134,8 @@ def star_model(
     y: float,
     shape: tuple[float, float, float],
     window: tuple[int, int, int, int],
-    model: npt.NDArray[np.float64],
-    work: npt.NDArray[np.float64],
+    model: Array,
+    work: Array,
 ) -> None:
     """Model of a round spot or of a trail, depending on the shape (sigma, trail x, trail y)."""
     if math.hypot(shape[1], shape[2]) > SHORT_TRAIL_PX:
@@ -160,11 +146,7 @@ def star_model(
 
 @compiled_sums
 def _normal_equations(
-    pixels: npt.NDArray[np.float32],
-    model: npt.NDArray[np.float64],
-    flux: float,
-    noise: tuple[float, float, float],
-    sums: npt.NDArray[np.float64],
+    pixels: Array32, model: Array, flux: float, noise: tuple[float, float, float], sums: Array
 ) -> None:
     """Sums over a window that a Gauss–Newton step needs; see the order in `fit_star`."""
     variance, per_dn, model_error = noise
@@ -201,14 +183,14 @@ def _normal_equations(
 
 @compiled_ieee
 def fit_star(
-    pixels: npt.NDArray[np.float32],
+    pixels: Array32,
     window: tuple[int, int, int, int],
     start: tuple[float, float],
     shape: tuple[float, float, float],
     noise: tuple[float, float, float],
-    model: npt.NDArray[np.float64],
-    work: npt.NDArray[np.float64],
-    result: npt.NDArray[np.float64],
+    model: Array,
+    work: Array,
+    result: Array,
 ) -> None:
     """Fit one star to a window.
 
@@ -283,7 +265,7 @@ def fit_star(
 
 
 @compiled_sums
-def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) -> float:
+def _best_flux(pixels: Array32, model: Array) -> float:
     """Best-fitting flux at a fixed position, with equal weights of all pixels."""
     above = 0.0
     below = 1e-12
@@ -296,9 +278,7 @@ def _best_flux(pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]) 
 
 
 @compiled_sums
-def explained(
-    pixels: npt.NDArray[np.float32], model: npt.NDArray[np.float64]
-) -> tuple[float, float, float, float]:
+def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float]:
     """Reduction of the sum of squares of a window by the fitted shape, and by its highest pixel alone.
 
     Each has its best-fitting flux. Where the highest pixel explains more than the shape of a star, it is a hot pixel or

@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array32
 from starid.errors import StaridError
 
 _BLIND_SHARE: Final = 0.5
@@ -15,12 +16,12 @@ _NEIGHBOURS_PX: Final = 5
 Counts = npt.NDArray[Any]
 
 
-def dark_excess(dark: Counts) -> npt.NDArray[np.float32]:
+def dark_excess(dark: Counts) -> Array32:
     """Return how far each pixel (h, w) of a dark frame is above the median of all, counts."""
     return np.asarray(dark - np.float32(np.median(dark)), dtype=np.float32)
 
 
-def without_dark(image: Counts, excess_dn: npt.NDArray[np.float32]) -> Counts:
+def without_dark(image: Counts, excess_dn: Array32) -> Counts:
     """Subtract the dark signal from an image; its mean level stays.
 
     Parameters

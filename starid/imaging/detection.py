@@ -10,6 +10,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array, Array32, GreyImage, Indices32, Mask
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (
@@ -67,8 +68,8 @@ from starid.imaging.windows import (
     sky_under_lone_pixels,
 )
 
-Grid: TypeAlias = npt.NDArray[np.float32]
-Table: TypeAlias = npt.NDArray[np.float64]
+Grid: TypeAlias = Array32
+Table: TypeAlias = Array
 
 LEAST_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
@@ -180,12 +181,12 @@ class Detections:
         False if the image cannot be searched because it is saturated all over; an image without stars can.
     """
 
-    xy_px: npt.NDArray[np.float64]
-    flux: npt.NDArray[np.float64]
-    flux_sigma: npt.NDArray[np.float64]
-    xy_sigma_px: npt.NDArray[np.float64]
-    saturated: npt.NDArray[np.bool_]
-    edge: npt.NDArray[np.bool_]
+    xy_px: Array
+    flux: Array
+    flux_sigma: Array
+    xy_sigma_px: Array
+    saturated: Mask
+    edge: Mask
     background: float
     noise: float
     psf_sigma_px: float
@@ -195,7 +196,7 @@ class Detections:
     searchable: bool = True
 
     @property
-    def sigma_px(self) -> npt.NDArray[np.float64]:
+    def sigma_px(self) -> Array:
         """Errors (n,) of the position, root mean square of both axes."""
         return np.asarray(np.sqrt(np.mean(self.xy_sigma_px**2, axis=1)), dtype=np.float64)
 
@@ -208,7 +209,7 @@ class Detections:
 class _Scene:
     """An image (h, w) with its background, the settings, and the count from which a pixel is saturated."""
 
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    counts: GreyImage
     background: Background
     settings: DetectionSettings
     saturation: float
@@ -233,15 +234,15 @@ class _Fits:
 
     windows: Table
     pixels: Grid
-    first: npt.NDArray[np.int32]
-    neighbours: npt.NDArray[np.int32]
+    first: Indices32
+    neighbours: Indices32
     sensor: tuple[float, float, float, float, float]
     lit: tuple[float, float, float]
     size: tuple[int, int]
     stars: Table
     flags: npt.NDArray[np.uint8]
 
-    def measure(self, todo: npt.NDArray[np.bool_], turns: tuple[int, int]) -> None:
+    def measure(self, todo: Mask, turns: tuple[int, int]) -> None:
         """Fit the candidates of a mask (n,) in some turns."""
         measure(
             self.windows,
@@ -319,7 +320,7 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     return _stars_of(scene, fits, shape, len(hot))
 
 
-def _checked_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+def _checked_image(image: npt.NDArray[np.generic]) -> GreyImage:
     """Validate a grey image of counts; return it contiguous and in native byte order."""
     if not isinstance(image, np.ndarray):
         raise StaridError(f"image: must be an array (h, w) of uint8 or uint16, not a {type(image).__name__}")
@@ -342,29 +343,29 @@ def _no_detections(background: Background, reason: str, rejected: int = 0) -> De
     return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, rejected, reason)
 
 
-def _peaks(scene: _Scene, sigma_px: float) -> tuple[npt.NDArray[np.int32], Grid]:
+def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
     """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
     counts, background = scene.counts, scene.background
     bytes_taps = integer_taps(sigma_px)
     if counts.dtype == np.uint8 and bytes_taps is not None:
         taps8, image8 = bytes_taps, counts.view(np.uint8)
 
-        def search_bytes(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+        def search_bytes(threshold: Grid, peaks: Indices32, heights: Grid) -> int:
             return find_peaks_in_bytes(image8, threshold, background.block_px, taps8, peaks, heights)
 
         factor = noise_factor(taps8 / INTEGER_TAPS_SUM)
         return _search(search_bytes, background, scene.settings.threshold_sigma * factor)
     taps = spot_taps(sigma_px)
 
-    def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+    def search(threshold: Grid, peaks: Indices32, heights: Grid) -> int:
         return find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
 
     return _search(search, background, scene.settings.threshold_sigma * noise_factor(taps))
 
 
 def _without_hot_pixels(
-    scene: _Scene, peaks: npt.NDArray[np.int32], heights: Grid, sigma_px: float
-) -> tuple[npt.NDArray[np.int32], Grid, Table]:
+    scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float
+) -> tuple[Indices32, Grid, Table]:
     """Candidates that are more than a hot pixel, their heights, and (n, 3) the hot pixels with the sky under them."""
     if sigma_px < LEAST_SPREAD_PX:
         return peaks, heights, np.zeros((0, 3))
@@ -374,7 +375,7 @@ def _without_hot_pixels(
     return peaks[~hot], heights[~hot], np.column_stack([peaks[hot], sky[hot]])
 
 
-def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[npt.NDArray[np.int32], Grid]:
+def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[Indices32, Grid]:
     """As `_peaks`, with the filter for the frame's trails, and without the hot pixels, which it would smear."""
     background, counts = scene.background, scene.counts.copy()
     columns, rows = hot[:, :2].astype(np.int64).T
@@ -383,7 +384,7 @@ def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[npt.NDArr
     sums, scale = sum_along_trails(counts, shape.flow, steps)
     taps = spot_taps(shape.sigma_px)
 
-    def search(threshold: Grid, peaks: npt.NDArray[np.int32], heights: Grid) -> int:
+    def search(threshold: Grid, peaks: Indices32, heights: Grid) -> int:
         count = find_peaks(sums, np.float32(scale) * threshold, background.block_px, taps, peaks, heights)
         heights[:count] /= np.float32(scale)
         return count
@@ -393,8 +394,8 @@ def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[npt.NDArr
 
 
 def _search(
-    search: Callable[[Grid, npt.NDArray[np.int32], Grid], int], background: Background, factor: float
-) -> tuple[npt.NDArray[np.int32], Grid]:
+    search: Callable[[Grid, Indices32, Grid], int], background: Background, factor: float
+) -> tuple[Indices32, Grid]:
     """Search for peaks above `factor` times the noise, or above a higher threshold where there are too many."""
     peaks = np.empty((_MOST_PEAKS, 2), dtype=np.int32)
     heights = np.empty(_MOST_PEAKS, dtype=np.float32)
@@ -412,9 +413,7 @@ def _search(
     return peaks[order], heights[order]
 
 
-def _estimate_shape(
-    scene: _Scene, peaks: npt.NDArray[np.int32], assumed: float = _ASSUMED_SIGMA_PX
-) -> SpotShape:
+def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_SIGMA_PX) -> SpotShape:
     """Spot and trail from the brightest stars that are not saturated."""
     settings = scene.settings
     height, width = scene.counts.shape
@@ -439,7 +438,7 @@ def _estimate_shape(
     return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
 
 
-def _trails_among_round(scene: _Scene, peaks: npt.NDArray[np.int32], shape: SpotShape) -> SpotShape:
+def _trails_among_round(scene: _Scene, peaks: Indices32, shape: SpotShape) -> SpotShape:
     """Check whether stars leave trails although the brightest objects are round."""
     tries = peaks[:_PEAKS_FOR_TRAILS]
     table = np.empty((len(tries), MOMENT_COLUMNS))
@@ -448,7 +447,7 @@ def _trails_among_round(scene: _Scene, peaks: npt.NDArray[np.int32], shape: Spot
     return trails_among_round(table[:count], scene.counts.shape[1], scene.counts.shape[0], shape)
 
 
-def _fit_candidates(scene: _Scene, peaks: npt.NDArray[np.int32], heights: Grid, shape: SpotShape) -> _Fits:
+def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotShape) -> _Fits:
     """Fit the highest candidates, each as one star."""
     counts, background, settings = scene.counts, scene.background, scene.settings
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
@@ -503,7 +502,7 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     )
 
 
-def _misfits(fits: Table) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+def _misfits(fits: Table) -> tuple[Array, Mask]:
     """Sum of weighted squares per degree of freedom (n,) of fits, and where the shape of a star does not explain it."""
     freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
     misfit = fits[:, CHI2] / freedom

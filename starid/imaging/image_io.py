@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import GreyImage
 from starid.errors import StaridError
 from starid.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
@@ -24,7 +25,7 @@ _GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in the luma of ITU-R BT.601."""
 
 
-def read_image(path: str | Path, *, allow_colour: bool = False) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
     """Read a grey PNG, TIFF or JPEG of 8 or 16 bits.
 
     Parameters
@@ -98,7 +99,7 @@ def image_suffix(path: Path) -> str:
     return suffix
 
 
-def write_image(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+def write_image(path: str | Path, image: GreyImage) -> None:
     """Write a grey or colour image atomically.
 
     Parameters

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array32, GreyImage, Indices32
 from starid.imaging.background import block_position
 from starid.jit import compiled_ieee, compiled_sums
 
@@ -28,12 +29,12 @@ _HALF_WIDTH_SIGMA: Final = 2.2
 _SQRT_HALF: Final = math.sqrt(0.5)
 
 
-def spot_taps(sigma_px: float) -> npt.NDArray[np.float32]:
+def spot_taps(sigma_px: float) -> Array32:
     """Right half (r + 1,) of the filter along one axis, centre first: a Gaussian integrated over pixels, sum 1."""
     reach = max(1, math.floor(_HALF_WIDTH_SIGMA * sigma_px + 0.5))
     edges = (np.arange(reach + 2) - 0.5) / sigma_px * _SQRT_HALF
     shares = np.diff([math.erf(edge) for edge in edges])
-    taps: npt.NDArray[np.float32] = (shares / (shares[0] + 2.0 * shares[1:].sum())).astype(np.float32)
+    taps: Array32 = (shares / (shares[0] + 2.0 * shares[1:].sum())).astype(np.float32)
     return taps
 
 
@@ -53,12 +54,7 @@ def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
 
 
 @compiled_ieee
-def _smooth_down(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    y: int,
-    taps: npt.NDArray[np.float32],
-    out: npt.NDArray[np.float32],
-) -> None:
+def _smooth_down(image: GreyImage, y: int, taps: Array32, out: Array32) -> None:
     """Smooth row y of the image across rows; the first and the last row are repeated beyond the edge."""
     height, width = image.shape
     reach = taps.size - 1
@@ -83,9 +79,7 @@ def _smooth_down(
 
 
 @compiled_ieee
-def _smooth_along(
-    padded: npt.NDArray[np.float32], taps: npt.NDArray[np.float32], out: npt.NDArray[np.float32]
-) -> None:
+def _smooth_along(padded: Array32, taps: Array32, out: Array32) -> None:
     """Smooth a row padded by the reach of the filter at both ends with the values there."""
     width = out.size
     reach = taps.size - 1
@@ -110,7 +104,7 @@ def _smooth_along(
 
 
 @compiled_ieee
-def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDArray[np.float32]) -> None:
+def _grid_line(grid: Array32, i: int, block: float, out: Array32) -> None:
     """Values of row i of a grid of blocks at every image column."""
     columns = grid.shape[1]
     width = out.size
@@ -127,7 +121,7 @@ def _grid_line(grid: npt.NDArray[np.float32], i: int, block: float, out: npt.NDA
 
 
 @compiled_ieee
-def _threshold_row(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDArray[np.float32]) -> None:
+def _threshold_row(lines: Array32, q: np.float32, limit: Array32) -> None:
     """Interpolate the threshold of a row between two grid lines."""
     upper, lower = lines[0], lines[1]
     for x in range(limit.size):
@@ -136,10 +130,7 @@ def _threshold_row(lines: npt.NDArray[np.float32], q: np.float32, limit: npt.NDA
 
 @compiled_ieee
 def _flag_groups(
-    row: npt.NDArray[np.float32],
-    limit: npt.NDArray[np.float32],
-    above: npt.NDArray[np.uint8],
-    flags: npt.NDArray[np.uint8],
+    row: Array32, limit: Array32, above: npt.NDArray[np.uint8], flags: npt.NDArray[np.uint8]
 ) -> None:
     """Mark the groups of 32 pixels with one above its limit; `above` is workspace of 32 zero bytes per group."""
     for x in range(row.size):
@@ -171,14 +162,14 @@ def _flag_groups_integer(
 @compiled_ieee
 def _peaks_of_row(
     y: int,
-    row: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    before: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    after: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
-    limit: npt.NDArray[np.float32] | npt.NDArray[np.uint16],
+    row: Array32 | npt.NDArray[np.uint16],
+    before: Array32 | npt.NDArray[np.uint16],
+    after: Array32 | npt.NDArray[np.uint16],
+    limit: Array32 | npt.NDArray[np.uint16],
     flags: npt.NDArray[np.uint8],
     count: int,
-    peaks: npt.NDArray[np.int32],
-    heights: npt.NDArray[np.float32],
+    peaks: Indices32,
+    heights: Array32,
 ) -> int:
     """Add the peaks of row y above its limit, in the groups that are marked, to the list; return their number.
 
@@ -218,7 +209,7 @@ def _peaks_of_row(
 
 @compiled_ieee
 def _update_grid_lines(
-    grid: npt.NDArray[np.float32], block: float, y: int, current: int, lines: npt.NDArray[np.float32]
+    grid: Array32, block: float, y: int, current: int, lines: Array32
 ) -> tuple[int, np.float32]:
     """Update the two grid lines on either side of row y; return the first one and the fraction between them."""
     i, i2, q = block_position(float(y), block, grid.shape[0])
@@ -230,12 +221,7 @@ def _update_grid_lines(
 
 @compiled_ieee
 def find_peaks(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    threshold: npt.NDArray[np.float32],
-    block: float,
-    taps: npt.NDArray[np.float32],
-    peaks: npt.NDArray[np.int32],
-    heights: npt.NDArray[np.float32],
+    image: GreyImage, threshold: Array32, block: float, taps: Array32, peaks: Indices32, heights: Array32
 ) -> int:
     """Local maxima of the smoothed image above a threshold.
 
@@ -319,11 +305,11 @@ def _smooth_along_integer(
 @compiled_ieee
 def find_peaks_in_bytes(
     image: npt.NDArray[np.uint8],
-    threshold: npt.NDArray[np.float32],
+    threshold: Array32,
     block: float,
     taps: npt.NDArray[np.uint16],
-    peaks: npt.NDArray[np.int32],
-    heights: npt.NDArray[np.float32],
+    peaks: Indices32,
+    heights: Array32,
 ) -> int:
     """As `find_peaks`, several times faster, with the taps of `integer_taps`."""
     height, width = image.shape

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array, Array32, Indices, Indices32, Mask
 from starid.imaging.centroid import (
     CHI2,
     FLUX,
@@ -67,12 +68,7 @@ _LEAST_SIDE: Final = 11
 
 
 @compiled_ieee
-def find_neighbours(
-    windows: npt.NDArray[np.float64],
-    order: npt.NDArray[np.int64],
-    first: npt.NDArray[np.int32],
-    neighbours: npt.NDArray[np.int32],
-) -> int:
+def find_neighbours(windows: Array, order: Indices, first: Indices32, neighbours: Indices32) -> int:
     """List for every window the others whose stars may contribute light to it.
 
     Parameters
@@ -126,13 +122,7 @@ def find_neighbours(
 
 @compiled_ieee
 def _mask_stray_pixel(
-    pixels: npt.NDArray[np.float32],
-    model: npt.NDArray[np.float64],
-    star: npt.NDArray[np.float64],
-    window: npt.NDArray[np.float64],
-    sigma: float,
-    per_dn: float,
-    model_error: float,
+    pixels: Array32, model: Array, star: Array, window: Array, sigma: float, per_dn: float, model_error: float
 ) -> bool:
     """Mask the pixel that contradicts the fit most, if any does, outside the star's core."""
     worst = _STRAY_SIGMA * _STRAY_SIGMA
@@ -157,11 +147,11 @@ def _mask_stray_pixel(
 
 @compiled_ieee
 def _is_one_pixel(
-    pixels: npt.NDArray[np.float32],
+    pixels: Array32,
     shape: tuple[float, float, float],
     bounds: tuple[int, int, int, int],
-    model: npt.NDArray[np.float64],
-    work: npt.NDArray[np.float64],
+    model: Array,
+    work: Array,
 ) -> bool:
     """Whether one pixel holds so much of a window's light that it explains more than the shape of a star anywhere.
 
@@ -193,14 +183,14 @@ def _is_one_pixel(
 
 @compiled_ieee
 def _is_at_rest(
-    pixels: npt.NDArray[np.float32],
+    pixels: Array32,
     bounds: tuple[int, int, int, int],
     shape: tuple[float, float, float],
     noise: tuple[float, float, float],
-    model: npt.NDArray[np.float64],
-    work: npt.NDArray[np.float64],
-    star: npt.NDArray[np.float64],
-    spot: npt.NDArray[np.float64],
+    model: Array,
+    work: Array,
+    star: Array,
+    spot: Array,
 ) -> bool:
     """Whether a spot that did not move explains what the trail of a star does not; `spot` is workspace for its fit."""
     bad = BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
@@ -212,10 +202,10 @@ def _is_at_rest(
 
 @compiled_ieee
 def _classify_fit(
-    pixels: npt.NDArray[np.float32],
-    model: npt.NDArray[np.float64],
-    star: npt.NDArray[np.float64],
-    window: npt.NDArray[np.float64],
+    pixels: Array32,
+    model: Array,
+    star: Array,
+    window: Array,
     sigma: float,
     least_ratio: float,
     saturation_dn: float,
@@ -259,13 +249,7 @@ def _classify_fit(
 
 
 @compiled_ieee
-def _flags(
-    star: npt.NDArray[np.float64],
-    window: npt.NDArray[np.float64],
-    pixels: npt.NDArray[np.float32],
-    sigma: float,
-    size: tuple[int, int],
-) -> int:
+def _flags(star: Array, window: Array, pixels: Array32, sigma: float, size: tuple[int, int]) -> int:
     """Flags of a star: whether pixels of its core are saturated, whether the image's edge cuts its light."""
     flags = 0
     reach_x = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_X])
@@ -287,12 +271,12 @@ def _flags(
 
 @compiled_ieee
 def _subtract_star(
-    star: npt.NDArray[np.float64],
+    star: Array,
     shape: tuple[float, float, float],
     bounds: tuple[int, int, int, int],
-    lights: npt.NDArray[np.float64],
-    work: npt.NDArray[np.float64],
-    target: npt.NDArray[np.float32],
+    lights: Array,
+    work: Array,
+    target: Array32,
 ) -> None:
     """Subtract the light of a star, if it is one, from a window."""
     if star[STATE] != GOOD:
@@ -304,16 +288,16 @@ def _subtract_star(
 
 @compiled_ieee
 def measure(
-    windows: npt.NDArray[np.float64],
-    pixels: npt.NDArray[np.float32],
-    first: npt.NDArray[np.int32],
-    neighbours: npt.NDArray[np.int32],
+    windows: Array,
+    pixels: Array32,
+    first: Indices32,
+    neighbours: Indices32,
     sensor: tuple[float, float, float, float, float],
     lit: tuple[float, float, float],
     size: tuple[int, int],
-    todo: npt.NDArray[np.bool_],
+    todo: Mask,
     turns: tuple[int, int],
-    stars: npt.NDArray[np.float64],
+    stars: Array,
     flags: npt.NDArray[np.uint8],
 ) -> None:
     """Fit and judge candidates.
@@ -401,12 +385,7 @@ def measure(
 
 
 @compiled_ieee
-def _drop_doubles(
-    stars: npt.NDArray[np.float64],
-    first: npt.NDArray[np.int32],
-    neighbours: npt.NDArray[np.int32],
-    sigma: float,
-) -> None:
+def _drop_doubles(stars: Array, first: Indices32, neighbours: Indices32, sigma: float) -> None:
     """Mark the fainter of two fits with the same position."""
     reach = max(0.7 * sigma, 0.5)
     for k in range(stars.shape[0]):

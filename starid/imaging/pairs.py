@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array, Array32, Indices, Indices32, Mask
 from starid.imaging.centroid import (
     CHI2,
     FLUX,
@@ -25,8 +25,6 @@ from starid.imaging.centroid import (
 from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y
 from starid.jit import compiled_ieee
 from starid.photometry import EVEN_PAIR
-
-Array = npt.NDArray[np.float64]
 
 _UNKNOWNS: Final = 6
 _ITERATIONS: Final = 25
@@ -75,7 +73,7 @@ def _invert(matrix: Array, inverse: Array) -> bool:
 
 @compiled_ieee
 def fit_pair(
-    pixels: npt.NDArray[np.float32],
+    pixels: Array32,
     window: tuple[int, int, int, int],
     shape: tuple[float, float, float],
     noise: tuple[float, float, float],
@@ -206,9 +204,7 @@ def _first_guesses(
 
 
 @compiled_ieee
-def _is_better(
-    pair: Array, chi2: float, sigma: float, models: Array, pixels: npt.NDArray[np.float32]
-) -> bool:
+def _is_better(pair: Array, chi2: float, sigma: float, models: Array, pixels: Array32) -> bool:
     """Whether two stars explain a window much better than one did, and neither is noise or a single pixel."""
     apart = math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y])
     if pair[0, CHI2] > _BETTER * chi2 or apart < _CLOSEST_SIGMA * sigma:
@@ -238,7 +234,7 @@ def _blend_shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> f
 
 
 @compiled_ieee
-def doubt_close_pairs(stars: Array, order: npt.NDArray[np.int64], blend_px: float) -> None:
+def doubt_close_pairs(stars: Array, order: Indices, blend_px: float) -> None:
     """Increase the errors of the brighter star of a pair that is barely resolved.
 
     A catalogue with merged close pairs may hold it as one star, displaced by the shift of the merged position.
@@ -290,16 +286,16 @@ def _merge(pair: Array, blend_px: float, star: Array) -> None:
 @compiled_ieee
 def split_pairs(
     windows: Array,
-    pixels: npt.NDArray[np.float32],
-    first: npt.NDArray[np.int32],
-    neighbours: npt.NDArray[np.int32],
+    pixels: Array32,
+    first: Indices32,
+    neighbours: Indices32,
     noise: tuple[float, float, float],
     stars: Array,
-    suspects: npt.NDArray[np.int64],
+    suspects: Indices,
     blend_px: float,
     partners: Array,
-    owners: npt.NDArray[np.int64],
-    todo: npt.NDArray[np.bool_],
+    owners: Indices,
+    todo: Mask,
 ) -> int:
     """Fit badly fitted stars as pairs; the brighter member replaces the original star.
 

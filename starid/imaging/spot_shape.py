@@ -12,13 +12,11 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array, Array32, GreyImage, Indices32, Mask
 from starid.imaging.background import interpolate_at, median
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, mismatch, typical_trail
 from starid.jit import compiled_ieee
-
-Array = npt.NDArray[np.float64]
 
 MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
@@ -59,7 +57,7 @@ class SpotShape:
 
 @compiled_ieee
 def adaptive_moments(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    image: GreyImage,
     x0: float,
     y0: float,
     background: float,
@@ -138,9 +136,9 @@ def adaptive_moments(
 
 @compiled_ieee
 def moments_of(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    peaks: npt.NDArray[np.int32],
-    level: npt.NDArray[np.float32],
+    image: GreyImage,
+    peaks: Indices32,
+    level: Array32,
     block: float,
     start_sigma: float,
     largest: int,
@@ -201,7 +199,7 @@ def shape_from_moments(
     return SpotShape(_sigma(median(mean), known_sigma_px), still, 0.0, len(table))
 
 
-def long_trails(table: Array, sigma_px: float) -> npt.NDArray[np.bool_]:
+def long_trails(table: Array, sigma_px: float) -> Mask:
     """Mask (n,) of the stars in a table of moments too long to be explained by noise or a close neighbour."""
     mean, split = _mean_and_split(table)
     return np.asarray(trail_length(mean + split, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)

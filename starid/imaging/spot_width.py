@@ -6,13 +6,11 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array, Array32, GreyImage, Indices32
 from starid.imaging.background import interpolate_at
 from starid.imaging.centroid import FIT_COLUMNS, FLUX, GOOD, STATE, X, Y, fit_star, spot_model
 from starid.jit import compiled_ieee
-
-Array = npt.NDArray[np.float64]
 
 NARROWEST_PX: Final = 0.25
 WIDEST_PX: Final = 8.0
@@ -27,7 +25,7 @@ _MODEL_ERROR: Final = 0.02
 
 @compiled_ieee
 def _one_width(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    image: GreyImage,
     column: int,
     row: int,
     sky: float,
@@ -93,10 +91,10 @@ def _one_width(
 
 @compiled_ieee
 def spot_widths(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    peaks: npt.NDArray[np.int32],
-    level: npt.NDArray[np.float32],
-    noise: npt.NDArray[np.float32],
+    image: GreyImage,
+    peaks: Indices32,
+    level: Array32,
+    noise: Array32,
     block: float,
     start: float,
     saturation: float,

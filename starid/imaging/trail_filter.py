@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array, GreyImage
 from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
 from starid.jit import compiled_ieee
@@ -23,8 +24,8 @@ _MOST_STEPS: Final = 96
 
 @compiled_ieee
 def _sum_along(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    flow: npt.NDArray[np.float64],
+    image: GreyImage,
+    flow: Array,
     steps: int,
     shift: int,
     sums: npt.NDArray[np.uint16] | npt.NDArray[np.uint32],
@@ -60,7 +61,7 @@ def _sum_along(
                     target[begin + k] = sums[k] >> shift
 
 
-def trail_steps(flow: npt.NDArray[np.float64], width: int, height: int) -> int:
+def trail_steps(flow: Array, width: int, height: int) -> int:
     """Number of positions along a trail, about a pixel apart on the longest trail of the field."""
     corners = [(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]
     lengths = [
@@ -69,9 +70,7 @@ def trail_steps(flow: npt.NDArray[np.float64], width: int, height: int) -> int:
     return min(max(math.ceil(max(lengths)), 1), _MOST_STEPS)
 
 
-def sum_along_trails(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], flow: npt.NDArray[np.float64], steps: int
-) -> tuple[npt.NDArray[np.uint16], float]:
+def sum_along_trails(image: GreyImage, flow: Array, steps: int) -> tuple[npt.NDArray[np.uint16], float]:
     """Sum an image (h, w) along the trails of a flow (`starid.imaging.trail_flow`).
 
     Parameters

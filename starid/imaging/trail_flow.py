@@ -14,11 +14,9 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array
 from starid.jit import compiled_ieee
-
-Array = npt.NDArray[np.float64]
 
 FLOW_TERMS: Final = 5
 _TRANSLATION: Final = 2

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array, Array32, GreyImage, Indices32
 from starid.imaging.background import LEAST_NOISE_DN, interpolate_at
 from starid.imaging.trail_flow import trail_at
 from starid.jit import compiled_ieee
@@ -73,7 +74,7 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
 
 
 @compiled_ieee
-def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) -> tuple[float, float]:
+def _slopes(level: Array32, block: float, x: float, y: float) -> tuple[float, float]:
     """Slopes of the background along x and y, counts per pixel."""
     return (
         0.5 * (interpolate_at(level, block, x + 1.0, y) - interpolate_at(level, block, x - 1.0, y)),
@@ -83,14 +84,14 @@ def _slopes(level: npt.NDArray[np.float32], block: float, x: float, y: float) ->
 
 @compiled_ieee
 def _ring_statistics(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    image: GreyImage,
     x: int,
     y: int,
     radius_x: int,
     radius_y: int,
     slopes: tuple[float, float],
-    circle: npt.NDArray[np.float64],
-    values: npt.NDArray[np.float64],
+    circle: Array,
+    values: Array,
 ) -> tuple[float, float]:
     """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
 
@@ -121,13 +122,13 @@ def _ring_statistics(
 
 @compiled_ieee
 def _saturated_patch(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    image: GreyImage,
     x: int,
     y: int,
     saturation: float,
     seen: npt.NDArray[np.uint8],
-    stack: npt.NDArray[np.int32],
-    patch: npt.NDArray[np.float64],
+    stack: Indices32,
+    patch: Array,
 ) -> bool:
     """Follow the connected saturated pixels from (x, y); False if there are too many, or too far, for a star.
 
@@ -165,7 +166,7 @@ def _saturated_patch(
 
 
 @compiled_ieee
-def _in_patches(column: int, row: int, patches: npt.NDArray[np.float64], count: int) -> bool:
+def _in_patches(column: int, row: int, patches: Array, count: int) -> bool:
     """Whether a pixel lies in the bounding box of an earlier patch."""
     for k in range(count):
         if patches[k, 3] <= column <= patches[k, 4] and patches[k, 5] <= row <= patches[k, 6]:
@@ -193,9 +194,7 @@ def _sky_under(
 
 
 @compiled_ieee
-def _first_position(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float
-) -> tuple[float, float]:
+def _first_position(image: GreyImage, column: int, row: int, sky: float) -> tuple[float, float]:
     """First guess of a star's position: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
     height, width = image.shape
     if not (0 < column < width - 1 and 0 < row < height - 1):
@@ -212,9 +211,7 @@ def _first_position(
 
 
 @compiled_ieee
-def _stands_alone(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], column: int, row: int, sky: float, noise: float
-) -> bool:
+def _stands_alone(image: GreyImage, column: int, row: int, sky: float, noise: float) -> bool:
     """Whether a pixel is bright and none of its neighbours has even an eighth of its light: a hot pixel."""
     height, width = image.shape
     peak = image[row, column] - sky
@@ -229,12 +226,7 @@ def _stands_alone(
 
 @compiled_ieee
 def sky_under_lone_pixels(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    peaks: npt.NDArray[np.int32],
-    level: npt.NDArray[np.float32],
-    noise: npt.NDArray[np.float32],
-    block: float,
-    sky: npt.NDArray[np.float64],
+    image: GreyImage, peaks: Indices32, level: Array32, noise: Array32, block: float, sky: Array
 ) -> None:
     """Fill `sky` (n,) with the background under the peaks (n, 2) that are hot pixels, and NaN for the others."""
     for k in range(peaks.shape[0]):
@@ -247,15 +239,15 @@ def sky_under_lone_pixels(
 
 @compiled_ieee
 def lay_windows(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    peaks: npt.NDArray[np.int32],
-    flux: npt.NDArray[np.float32],
-    level: npt.NDArray[np.float32],
-    noise: npt.NDArray[np.float32],
+    image: GreyImage,
+    peaks: Indices32,
+    flux: Array32,
+    level: Array32,
+    noise: Array32,
     block: float,
     spot: tuple[float, float, float],
-    flow: npt.NDArray[np.float64],
-    windows: npt.NDArray[np.float64],
+    flow: Array,
+    windows: Array,
 ) -> int:
     """Lay a window around every candidate.
 
@@ -345,12 +337,7 @@ def lay_windows(
 
 @compiled_ieee
 def cut_windows(
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
-    windows: npt.NDArray[np.float64],
-    level: npt.NDArray[np.float32],
-    block: float,
-    saturation: float,
-    pixels: npt.NDArray[np.float32],
+    image: GreyImage, windows: Array, level: Array32, block: float, saturation: float, pixels: Array32
 ) -> None:
     """Copy the windows' pixels minus the sky, one window after another; saturated ones become infinite.
 

@@ -8,6 +8,7 @@ from typing import Final
 
 from numpy.typing import ArrayLike
 
+from starid.arrays import GreyImage
 from starid.camera import Camera, Model
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -15,7 +16,7 @@ from starid.imaging.detection import DetectionSettings
 from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
 from starid.photograph.solver import ImageSolution, refine_solution
 from starid.photograph.typical_camera import FIELD_STEP
-from starid.photograph.views import Counts, views
+from starid.photograph.views import views
 from starid.solution import Reason
 
 FIELDS_DEG: Final = tuple(
@@ -53,7 +54,7 @@ class FieldSweep:
 
     def solve(
         self,
-        image: Counts,
+        image: GreyImage,
         settings: DetectionSettings | None = None,
         observer_velocity: ArrayLike | None = None,
     ) -> ImageSolution:
@@ -96,7 +97,7 @@ class FieldSweep:
 
 
 def solve_any_field(
-    image: Counts,
+    image: GreyImage,
     catalog: StarCatalog,
     *,
     model: Model = "pinhole",

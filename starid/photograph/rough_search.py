@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starid.arrays import Array
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -122,7 +123,7 @@ class RoughSearch:
         )
         solution = Solution.invalid(Reason.NO_MATCH)
         plain = self._first.camera
-        straight: dict[float, NDArray[np.float64]] = {0.0: xy}
+        straight: dict[float, Array] = {0.0: xy}
         for attempt in self._attempts(xy, brightness, rounds):
             lens = distorted(plain, attempt.distortion)
             if attempt.distortion not in straight:
@@ -142,9 +143,7 @@ class RoughSearch:
                 break
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
 
-    def _attempts(
-        self, xy: NDArray[np.float64], flux: NDArray[np.float64], rounds: Sequence[int]
-    ) -> Iterator[_Attempt]:
+    def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
         """All attempts, the cheap ones first."""
         brightest = np.argsort(-flux, kind="stable")
         choices = [brightest[:MOST_AT_ONCE]]
@@ -168,9 +167,7 @@ class RoughSearch:
         )
 
 
-def even_choice(
-    xy: NDArray[np.float64], brightest: NDArray[np.intp], camera: Camera, depth: int
-) -> NDArray[np.intp]:
+def even_choice(xy: Array, brightest: NDArray[np.intp], camera: Camera, depth: int) -> NDArray[np.intp]:
     """Rows of the `depth` brightest detections of each cell of the image.
 
     Parameters

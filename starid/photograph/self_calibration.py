@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.calibration import (
     DEFAULT_ESTIMATE,
@@ -30,8 +30,6 @@ from starid.catalog import StarCatalog, load_catalog, merge_close_stars
 from starid.errors import StaridError
 from starid.photograph.rough_search import RoughSearch
 from starid.solution import Solution
-
-Array = NDArray[np.float64]
 
 MODELS: Final[tuple[tuple[str, ...], ...]] = (
     ("focal",),
@@ -81,7 +79,7 @@ class SelfCalibration:
 
     calibration: Calibration
     frame_index: tuple[int, ...]
-    matches: tuple[NDArray[np.int64], ...]
+    matches: tuple[Indices, ...]
     unidentified: dict[int, str]
 
 
@@ -191,7 +189,7 @@ def calibrate_identified(
         sky.brighter_than(faintest + _MAGNITUDE_MARGIN), _BLEND_PX * camera.pixel_scale_rad
     )
     _, result = next(_calibrations(matched, start, (_affordable_model(matched, ("focal", "k1")), ("focal",))))
-    matches: tuple[NDArray[np.int64], ...] = ()
+    matches: tuple[Indices, ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
             _paired(frames[index], result.camera, attitude, seen, result.sigma_px)
@@ -219,7 +217,7 @@ def _floored_sigma(stars: Stars) -> Array | None:
 
 
 def _frame(
-    stars: Stars, sigma: Array | None, chosen: NDArray[np.int64], reference: Array, attitude: Attitude
+    stars: Stars, sigma: Array | None, chosen: Indices, reference: Array, attitude: Attitude
 ) -> CalibrationFrame:
     return CalibrationFrame(
         xy_px=np.asarray(stars.xy_px)[chosen],
@@ -231,7 +229,7 @@ def _frame(
 
 def _paired(
     stars: Stars, camera: Camera, attitude: Attitude, sky: StarCatalog, sigma_px: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Indices, Indices]:
     """Pair detections and catalogue stars that are each other's nearest, within a window: indices of both (m,)."""
     near = sky.in_cone(attitude.boresight, camera.field_radius_rad * 1.02)
     xy, inside = camera.project(attitude.to_sensor(sky.vectors[near]))

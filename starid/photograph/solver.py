@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starid.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
@@ -18,7 +19,7 @@ from starid.geometric.identifier import Identifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
-from starid.photograph.views import Counts, View, views
+from starid.photograph.views import View, views
 from starid.solution import Reason, Solution
 
 _log = logging.getLogger(__name__)
@@ -55,13 +56,13 @@ class ImageSolution:
     stars: StarCatalog
     mirrored: bool = False
 
-    def on_image(self, xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def on_image(self, xy_px: Array) -> Array:
         """Convert positions (n, 2) of the solution to positions on the original image."""
         return flipped(xy_px, self.camera.width) if self.mirrored else xy_px
 
 
 def solve_image(
-    image: Counts,
+    image: GreyImage,
     camera: Camera | None = None,
     catalog: StarCatalog | None = None,
     *,
@@ -113,7 +114,7 @@ def solve_image(
 
 
 def _solve_roughly(
-    image: Counts,
+    image: GreyImage,
     camera: Camera,
     sky: StarCatalog,
     fov_tolerance: float,
@@ -193,6 +194,6 @@ def _refined(
     return outcome.calibration.camera
 
 
-def flipped(xy: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+def flipped(xy: Array, width: int) -> Array:
     """Positions (n, 2) in the image flipped left to right."""
     return np.stack([width - 1.0 - xy[:, 0], xy[:, 1]], axis=1)

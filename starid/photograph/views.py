@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import GreyImage
 from starid.imaging.detection import Detections, DetectionSettings, detect
-
-Counts: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 MOST_STARS: Final = 2000
 """Most detections of each view."""
@@ -39,7 +37,7 @@ class View(NamedTuple):
     mirrored: bool = False
 
 
-def views(image: Counts, settings: DetectionSettings | None = None) -> Iterator[View]:
+def views(image: GreyImage, settings: DetectionSettings | None = None) -> Iterator[View]:
     """Detect stars on the image as it is, on its negative, on coarser images, and mirrored.
 
     Parameters
@@ -60,7 +58,7 @@ def views(image: Counts, settings: DetectionSettings | None = None) -> Iterator[
     yield View(plain, mirrored=True)
 
 
-def has_dark_tail(image: Counts) -> bool:
+def has_dark_tail(image: GreyImage) -> bool:
     """Whether far dark pixels outnumber far bright ones, as in a negative."""
     middle = float(np.median(image))
     deviation = image.astype(np.float32) - np.float32(middle)
@@ -69,7 +67,7 @@ def has_dark_tail(image: Counts) -> bool:
     return int(np.count_nonzero(deviation < -far)) > _LONGER * int(np.count_nonzero(deviation > far))
 
 
-def _coarser(image: Counts, factor: int, settings: DetectionSettings) -> Detections:
+def _coarser(image: GreyImage, factor: int, settings: DetectionSettings) -> Detections:
     """Detections on the means of blocks of pixels, in the pixels and counts of the image itself.
 
     The noise per pixel assumes that the noise of different pixels is independent.

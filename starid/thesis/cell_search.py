@@ -15,11 +15,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Indices32
 from starid.jit import compiled
 from starid.thesis.database import CODE_MAX, FeatureDatabase
 from starid.thesis.features import FEATURE_COUNT
-from starid.thesis.frame_grid import cell_row
-from starid.thesis.frame_sky import cell_features
+from starid.thesis.frame_grid import GridArrays, cell_place
+from starid.thesis.frame_sky import SkyArrays, cell_features
 
 MAX_DEPTH: Final = 22
 """Most levels of the tree: four million buckets."""
@@ -51,52 +52,30 @@ class CellIndex(NamedTuple):
     """
 
     codes: NDArray[np.uint8]
-    cells: NDArray[np.int32]
-    start: NDArray[np.int32]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    cells: Indices32
+    start: Indices32
+    low: Array
+    high: Array
     depth: int
 
 
 class CellArrays(NamedTuple):
-    """Plain arrays of a database for compiled code: stars, frame, grid and normalisation."""
+    """Plain arrays of a database for compiled code: stars and frame, grid, and normalisation."""
 
-    stars: NDArray[np.float64]
-    bin_start: NDArray[np.int64]
-    frame: NDArray[np.float64]
-    row_start: NDArray[np.int64]
-    row_columns: NDArray[np.int64]
-    row_dec: NDArray[np.float64]
-    row_ra_step: NDArray[np.float64]
-    first_ra: float
-    minimum: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    sky: SkyArrays
+    grid: GridArrays
+    minimum: Array
+    scale: Array
 
 
 def cell_arrays(database: FeatureDatabase) -> CellArrays:
     """Gather the arrays of a database."""
-    grid, sky = database.grid, database.sky
-    return CellArrays(
-        sky.stars,
-        sky.bin_start,
-        sky.frame,
-        grid.row_start,
-        grid.row_columns,
-        grid.row_dec_deg,
-        grid.row_ra_step_deg,
-        grid.first_ra_deg,
-        database.minimum,
-        database.scale,
-    )
+    return CellArrays(database.sky.arrays, database.grid.arrays, database.minimum, database.scale)
 
 
 @compiled
 def _bucket_numbers(
-    codes: NDArray[np.uint8],
-    theta: NDArray[np.uint8],
-    rank: NDArray[np.int64],
-    depth: int,
-    count: NDArray[np.int32],
+    codes: NDArray[np.uint8], theta: NDArray[np.uint8], rank: Indices, depth: int, count: Indices32
 ) -> None:
     for cell in range(codes.shape[0]):
         if theta[cell] != 255:
@@ -104,7 +83,7 @@ def _bucket_numbers(
 
 
 @compiled
-def _bucket(codes: NDArray[np.uint8], cell: int, rank: NDArray[np.int64], depth: int) -> int:
+def _bucket(codes: NDArray[np.uint8], cell: int, rank: Indices, depth: int) -> int:
     bucket = 0
     for level in range(depth):
         feature = level % 5
@@ -116,11 +95,11 @@ def _bucket(codes: NDArray[np.uint8], cell: int, rank: NDArray[np.int64], depth:
 def _fill_buckets(
     codes: NDArray[np.uint8],
     theta: NDArray[np.uint8],
-    rank: NDArray[np.int64],
+    rank: Indices,
     depth: int,
-    place: NDArray[np.int32],
+    place: Indices32,
     sorted_codes: NDArray[np.uint8],
-    cells: NDArray[np.int32],
+    cells: Indices32,
 ) -> None:
     for cell in range(codes.shape[0]):
         if theta[cell] != 255:
@@ -161,9 +140,7 @@ def make_cell_index(database: FeatureDatabase) -> CellIndex:
 
 
 @compiled
-def _box_distance(
-    index: CellIndex, prefix: int, level: int, query: NDArray[np.float64], slack: float
-) -> float:
+def _box_distance(index: CellIndex, prefix: int, level: int, query: Array, slack: float) -> float:
     """Squared distance in code steps from the query to the box of a branch, less the slack on each side."""
     total = 0.0
     for feature in range(5):
@@ -187,10 +164,10 @@ def _push_children(
     index: CellIndex,
     level: int,
     prefix: int,
-    query: NDArray[np.float64],
+    query: Array,
     slack: float,
     limit: float,
-    stack: NDArray[np.float64],
+    stack: Array,
     top: int,
 ) -> int:
     """Push the halves of a branch that hold vectors within the limit, the nearer one last; return the new top."""
@@ -214,7 +191,23 @@ def _push_children(
 
 
 @compiled
-def _sift_down(distances: NDArray[np.float64], cells: NDArray[np.int64], size: int) -> None:
+def _next_vectors(
+    index: CellIndex, query: Array, slack: float, limit: float, stack: Array, top: int
+) -> tuple[int, int, int]:
+    """Take the nearest branch from the stack: the vectors to look at, none where it is cut or halved, and the new top."""
+    top -= 1
+    if stack[top, 2] > limit:
+        return 0, 0, top
+    level, prefix = int(stack[top, 0]), int(stack[top, 1])
+    rest = index.depth - level
+    first, last = index.start[prefix << rest], index.start[(prefix + 1) << rest]
+    if rest > 0 and last - first > _SCAN:
+        return 0, 0, _push_children(index, level, prefix, query, slack, limit, stack, top)
+    return first, last, top
+
+
+@compiled
+def _sift_down(distances: Array, cells: Indices, size: int) -> None:
     """Restore the heap (greatest distance, then greatest cell, on top) after its top was replaced."""
     at = 0
     while True:
@@ -232,9 +225,7 @@ def _sift_down(distances: NDArray[np.float64], cells: NDArray[np.int64], size: i
 
 
 @compiled
-def stored_neighbours(
-    index: CellIndex, query: NDArray[np.float64], distances: NDArray[np.float64], cells: NDArray[np.int64]
-) -> None:
+def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: Indices) -> None:
     """Find the k stored vectors nearest to the query, as the arrays are long, in no particular order.
 
     Of equal distances the lower cell is taken. Places that are not filled keep an infinite distance and cell −1.
@@ -252,23 +243,10 @@ def stored_neighbours(
     for i in range(size):
         distances[i] = math.inf
         cells[i] = -1
-    stack = np.empty((_STACK, 3))
-    stack[0, 0] = 0
-    stack[0, 1] = 0
-    stack[0, 2] = 0.0
+    stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
-        top -= 1
-        if stack[top, 2] > distances[0]:
-            continue
-        level = int(stack[top, 0])
-        prefix = int(stack[top, 1])
-        rest = index.depth - level
-        first = index.start[prefix << rest]
-        last = index.start[(prefix + 1) << rest]
-        if rest > 0 and last - first > _SCAN:
-            top = _push_children(index, level, prefix, query, 0.0, distances[0], stack, top)
-            continue
+        first, last, top = _next_vectors(index, query, 0.0, distances[0], stack, top)
         for i in range(first, last):
             d = 0.0
             for f in range(5):
@@ -281,20 +259,17 @@ def stored_neighbours(
 
 
 @compiled
-def exact_vector(arrays: CellArrays, cell: int, sums: NDArray[np.float64], out: NDArray[np.float64]) -> float:
+def exact_vector(arrays: CellArrays, cell: int, sums: Array, out: Array) -> float:
     """Write the normalised features of a cell in full precision to `out`; return its polar angle in radians."""
-    row = cell_row(arrays.row_start, cell)
-    ra = (arrays.first_ra + (cell - arrays.row_start[row]) * arrays.row_ra_step[row]) % 360.0
-    theta = cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra, arrays.row_dec[row], sums, out)
+    ra, dec = cell_place(arrays.grid, cell)
+    theta = cell_features(arrays.sky, ra % 360.0, dec, sums, out)
     for f in range(5):
         out[f] = (out[f] - arrays.minimum[f]) * arrays.scale[f]
     return theta
 
 
 @compiled
-def exact_nearest(
-    index: CellIndex, arrays: CellArrays, observation: NDArray[np.float64], found: NDArray[np.float64]
-) -> int:
+def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, found: Array) -> int:
     """Find the cell whose features in full precision are nearest to the observation; −1 in an empty database.
 
     Parameters
@@ -319,23 +294,10 @@ def exact_nearest(
     vector = np.empty(5)
     best = _exact_distance(arrays, best_cell, observation, sums, vector)
     computed = 1
-    stack = np.empty((_STACK, 3))
-    stack[0, 0] = 0
-    stack[0, 1] = 0
-    stack[0, 2] = 0.0
+    stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
-        top -= 1
-        if stack[top, 2] > best:
-            continue
-        level = int(stack[top, 0])
-        prefix = int(stack[top, 1])
-        rest = index.depth - level
-        first = index.start[prefix << rest]
-        last = index.start[(prefix + 1) << rest]
-        if rest > 0 and last - first > _SCAN:
-            top = _push_children(index, level, prefix, query, _HALF_STEP, best, stack, top)
-            continue
+        first, last, top = _next_vectors(index, query, _HALF_STEP, best, stack, top)
         for i in range(first, last):
             d = 0.0
             for f in range(5):
@@ -354,13 +316,7 @@ def exact_nearest(
 
 
 @compiled
-def _exact_distance(
-    arrays: CellArrays,
-    cell: int,
-    observation: NDArray[np.float64],
-    sums: NDArray[np.float64],
-    vector: NDArray[np.float64],
-) -> float:
+def _exact_distance(arrays: CellArrays, cell: int, observation: Array, sums: Array, vector: Array) -> float:
     """Squared distance in code steps between the observation and a cell in full precision."""
     exact_vector(arrays, cell, sums, vector)
     total = 0.0

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.jit import compiled
-from starid.thesis.false_stars import FilterError
+from starid.thesis.false_stars import FilterError, ObservedFrame
 
 MotionModel = Literal["rigid", "affine"]
 
@@ -51,25 +51,20 @@ class CameraMotion:
         Which of the matches the motion explains, (m,).
     """
 
-    matrix: NDArray[np.float64]
+    matrix: Array
     rotation_deg: float
-    translation_deg: NDArray[np.float64]
+    translation_deg: Array
     mean_distance_deg: float
     sigma_distance_deg: float
-    inliers: NDArray[np.bool_]
+    inliers: Mask
 
-    def apply(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, positions: Array) -> Array:
         """Where objects at these positions of the earlier frame are in the later one, (n, 2)."""
         return np.asarray(positions @ self.matrix[:2, :2].T + self.matrix[:2, 2], dtype=np.float64)
 
 
 @compiled
-def _mean_positions(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
-    centre: NDArray[np.float64],
-) -> int:
+def _mean_positions(before: Array, now: Array, chosen: Mask, centre: Array) -> int:
     """Fill in the mean positions (x, y before; x, y now) of the chosen stars; return how many there are."""
     count = 0
     for i in range(chosen.size):
@@ -85,12 +80,7 @@ def _mean_positions(
 
 
 @compiled
-def rigid_fit(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
-    motion: NDArray[np.float64],
-) -> bool:
+def rigid_fit(before: Array, now: Array, chosen: Mask, motion: Array) -> bool:
     """Least-squares rotation and translation of the chosen stars into `motion` (cos, sin, x, y); False below two."""
     centre = np.zeros(4)
     if _mean_positions(before, now, chosen, centre) < 2:
@@ -117,12 +107,7 @@ def rigid_fit(
 
 
 @compiled
-def affine_fit(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
-    matrix: NDArray[np.float64],
-) -> bool:
+def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
     """Least-squares affine transformation of the chosen stars into `matrix` (2, 3); False below three, or in a line."""
     centre = np.zeros(4)
     if _mean_positions(before, now, chosen, centre) < _AFFINE_SAMPLE:
@@ -154,13 +139,7 @@ def affine_fit(
 
 
 @compiled
-def fit(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
-    affine: bool,
-    matrix: NDArray[np.float64],
-) -> bool:
+def fit(before: Array, now: Array, chosen: Mask, affine: bool, matrix: Array) -> bool:
     """Least-squares transformation of the chosen stars, rigid or affine, into `matrix` (2, 3); False with too few."""
     if affine:
         return affine_fit(before, now, chosen, matrix)
@@ -177,12 +156,7 @@ def fit(
 
 
 @compiled
-def transform_distances(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    matrix: NDArray[np.float64],
-    distances: NDArray[np.float64],
-) -> None:
+def transform_distances(before: Array, now: Array, matrix: Array, distances: Array) -> None:
     """Write the distance of each transformed star from where it was seen."""
     for i in range(distances.size):
         x = matrix[0, 0] * before[i, 0] + matrix[0, 1] * before[i, 1] + matrix[0, 2] - now[i, 0]
@@ -191,7 +165,7 @@ def transform_distances(
 
 
 @compiled
-def _negative_log_likelihood(distances: NDArray[np.float64], sigma: float) -> float:
+def _negative_log_likelihood(distances: Array, sigma: float) -> float:
     """Cost of a hypothesis: a mixture of a normal error and a uniform one, its share found by expectation maximisation.
 
     It takes the place of the sum of distances below η of eq. 3.11, which MLESAC minimises in its simplest form.
@@ -212,14 +186,7 @@ def _negative_log_likelihood(distances: NDArray[np.float64], sigma: float) -> fl
 
 
 @compiled
-def _draw(
-    stars: int,
-    affine: bool,
-    every: bool,
-    trial: int,
-    state: int,
-    chosen: NDArray[np.bool_],
-) -> int:
+def _draw(stars: int, affine: bool, every: bool, trial: int, state: int, chosen: Mask) -> int:
     """Choose the stars of a hypothesis, the next pair in order or some at random; return the generator's state."""
     chosen[:] = False
     if every:
@@ -244,14 +211,14 @@ def _draw(
 
 @compiled
 def mlesac(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
+    before: Array,
+    now: Array,
     threshold: float,
     trials: int,
     seed: int,
     affine: bool,
-    matrix: NDArray[np.float64],
-    inliers: NDArray[np.bool_],
+    matrix: Array,
+    inliers: Mask,
 ) -> bool:
     """Find the transformation of greatest likelihood and refit it to its inliers; False if there is none.
 
@@ -306,8 +273,8 @@ def mlesac(
 
 
 def estimate_motion(
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
+    before: Array,
+    now: Array,
     *,
     threshold_deg: float = 1.0,
     trials: int = MAX_TRIALS,
@@ -356,3 +323,13 @@ def estimate_motion(
         float(kept.std(ddof=1)) if kept.size > 1 else 0.0,
         inliers,
     )
+
+
+def matched_motion(
+    before: ObservedFrame, now: ObservedFrame, matches: Indices, *, model: MotionModel = "rigid"
+) -> CameraMotion | None:
+    """Estimate the camera motion from the matches (m, 2) of two frames; None where there are too few for it."""
+    try:
+        return estimate_motion(before.positions[matches[:, 0]], now.positions[matches[:, 1]], model=model)
+    except FilterError:
+        return None

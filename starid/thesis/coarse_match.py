@@ -11,10 +11,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
-from starid.thesis.frame_sky import stars_near
+from starid.thesis.frame_sky import SkyArrays, stars_near
 
 MAX_STARS: Final = 256
 """Most catalogue stars of a cell that are considered."""
@@ -28,13 +28,13 @@ _INNERMOST: Final = 4.0
 
 @compiled
 def vote_roll(
-    observed: NDArray[np.float64],
-    polar: NDArray[np.float64],
-    near: NDArray[np.float64],
+    observed: Array,
+    polar: Array,
+    near: Array,
     count: int,
     offset_px: float,
     magnitude_gate: float,
-    votes: NDArray[np.float64],
+    votes: Array,
 ) -> tuple[float, float]:
     """Let the stars vote; return the best turn from catalogue to image in radians, and its votes.
 
@@ -77,13 +77,13 @@ def vote_roll(
 
 @compiled
 def pair_stars(
-    observed: NDArray[np.float64],
-    near: NDArray[np.float64],
+    observed: Array,
+    near: Array,
     count: int,
     turn: float,
     tolerance_px: float,
     magnitude_gate: float,
-    pairs: NDArray[np.int64],
+    pairs: Indices,
 ) -> int:
     """Pair observed and catalogue stars from a first turn on, refitting turn and shift; return the number of pairs.
 
@@ -139,20 +139,18 @@ def pair_stars(
 
 @compiled
 def next_candidate(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    observed: NDArray[np.float64],
-    candidates: NDArray[np.float64],
+    sky: SkyArrays,
+    observed: Array,
+    candidates: Array,
     start: int,
-    settings: NDArray[np.float64],
-    matched: NDArray[np.int64],
+    settings: Array,
+    matched: Indices,
 ) -> tuple[int, int]:
     """Find the next boresight from place `start` on that the stars vote for; return its place (−1: none) and pairs.
 
     Parameters
     ----------
-    stars, bin_start, frame
+    sky
         Stars of a spherical database.
     observed
         x, y in pixels and magnitude of the observed stars, (n, 3).
@@ -174,9 +172,7 @@ def next_candidate(
     votes = np.empty(ROLL_BINS)
     offset, gate, share, fewest = settings[0], settings[1], settings[2], settings[3]
     for place in range(start, candidates.shape[0]):
-        count = stars_near(
-            stars, bin_start, frame, candidates[place, 0], candidates[place, 1], offset, near, rows
-        )
+        count = stars_near(sky, candidates[place, 0], candidates[place, 1], offset, near, rows)
         need = max(fewest, share * min(n, count))
         if min(n, count) < fewest:
             continue

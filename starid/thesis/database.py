@@ -14,13 +14,14 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.camera import Camera
 from starid.catalog import Band, StarCatalog
 from starid.errors import StaridError
 from starid.jit import compiled
 from starid.thesis.features import FEATURE_COUNT, FeatureVector
-from starid.thesis.frame_grid import FrameGrid, Geometry, make_grid
-from starid.thesis.frame_sky import Direction, FrameSky, cell_features, make_frame_sky
+from starid.thesis.frame_grid import FrameGrid, Geometry, GridArrays, make_grid
+from starid.thesis.frame_sky import Direction, FrameSky, SkyArrays, cell_features, make_frame_sky
 
 CODE_MAX: Final = 255
 """Largest code of a stored feature; codes span 0 … 100 of the normalised scale."""
@@ -144,8 +145,8 @@ class FeatureDatabase:
     sky: FrameSky
     features: NDArray[np.uint8]
     theta: NDArray[np.uint8]
-    minimum: NDArray[np.float64]
-    maximum: NDArray[np.float64]
+    minimum: Array
+    maximum: Array
     catalog_identity: str
 
     @property
@@ -158,7 +159,7 @@ class FeatureDatabase:
         """Size of the stored features, bytes."""
         return int(self.features.nbytes)
 
-    def normalise(self, features: FeatureVector | NDArray[np.float64]) -> NDArray[np.float64]:
+    def normalise(self, features: FeatureVector | Array) -> Array:
         """Normalised feature vector, eq. 2.11: 100·(f − min)/(max − min) for each feature over the database, (5,)."""
         vector = (
             features.vector if isinstance(features, FeatureVector) else np.asarray(features, dtype=np.float64)
@@ -166,7 +167,7 @@ class FeatureDatabase:
         return np.asarray((vector - self.minimum) * self.scale, dtype=np.float64)
 
     @cached_property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Array:
         """Normalised units per unit of each feature, (5,); 0 for a feature that is the same everywhere."""
         return normalising_scale(self.minimum, self.maximum)
 
@@ -175,30 +176,19 @@ class FeatureDatabase:
         return self.sky.features(*self.grid.centre(cell))
 
 
-def normalising_scale(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> NDArray[np.float64]:
+def normalising_scale(minimum: Array, maximum: Array) -> Array:
     """100/(max − min) for each feature, 0 where the extremes agree."""
     span = maximum - minimum
     return np.asarray(np.where(span > 0.0, 100.0 / np.where(span > 0.0, span, 1.0), 0.0), dtype=np.float64)
 
 
 @compiled
-def _extremes_of_rows(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    row_dec: NDArray[np.float64],
-    row_ra_step: NDArray[np.float64],
-    row_columns: NDArray[np.int64],
-    first_ra: float,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-) -> None:
-    sums = np.empty(8)
-    out = np.empty(5)
-    for row in range(row_dec.size):
-        for column in range(row_columns[row]):
-            ra = (first_ra + column * row_ra_step[row]) % 360.0
-            cell_features(stars, bin_start, frame, ra, row_dec[row], sums, out)
+def _extremes_of_rows(sky: SkyArrays, grid: GridArrays, low: Array, high: Array) -> None:
+    sums, out = np.empty(8), np.empty(5)
+    for row in range(grid.row_dec.size):
+        for column in range(grid.row_columns[row]):
+            ra = (grid.first_ra + column * grid.row_ra_step[row]) % 360.0
+            cell_features(sky, ra, grid.row_dec[row], sums, out)
             if out[0] >= 1.0:
                 for f in range(5):
                     low[f] = min(low[f], out[f])
@@ -207,25 +197,19 @@ def _extremes_of_rows(
 
 @compiled
 def _store_rows(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    row_dec: NDArray[np.float64],
-    row_ra_step: NDArray[np.float64],
-    row_columns: NDArray[np.int64],
-    first_ra: float,
-    low: NDArray[np.float64],
-    scale: NDArray[np.float64],
+    sky: SkyArrays,
+    grid: GridArrays,
+    low: Array,
+    scale: Array,
     features: NDArray[np.uint8],
     theta: NDArray[np.uint8],
 ) -> None:
-    sums = np.empty(8)
-    out = np.empty(5)
+    sums, out = np.empty(8), np.empty(5)
     cell = 0
-    for row in range(row_dec.size):
-        for column in range(row_columns[row]):
-            ra = (first_ra + column * row_ra_step[row]) % 360.0
-            angle = cell_features(stars, bin_start, frame, ra, row_dec[row], sums, out)
+    for row in range(grid.row_dec.size):
+        for column in range(grid.row_columns[row]):
+            ra = (grid.first_ra + column * grid.row_ra_step[row]) % 360.0
+            angle = cell_features(sky, ra, grid.row_dec[row], sums, out)
             if out[0] >= 1.0:
                 for f in range(5):
                     features[cell, f] = np.uint8(round((out[f] - low[f]) * scale[f] * 2.55))
@@ -304,34 +288,11 @@ def build_database(
                 progress(done, 2 * grid.cells)
 
     def find_extremes(i: int) -> None:
-        rows = blocks[i]
-        _extremes_of_rows(
-            sky.stars,
-            sky.bin_start,
-            sky.frame,
-            grid.row_dec_deg[rows],
-            grid.row_ra_step_deg[rows],
-            grid.row_columns[rows],
-            grid.first_ra_deg,
-            low[i],
-            high[i],
-        )
+        _extremes_of_rows(sky.arrays, grid.arrays.rows(blocks[i]), low[i], high[i])
 
     def store(i: int) -> None:
-        rows, where = blocks[i], cells_of(blocks[i])
-        _store_rows(
-            sky.stars,
-            sky.bin_start,
-            sky.frame,
-            grid.row_dec_deg[rows],
-            grid.row_ra_step_deg[rows],
-            grid.row_columns[rows],
-            grid.first_ra_deg,
-            minimum,
-            scale,
-            features[where],
-            theta[where],
-        )
+        rows, where = grid.arrays.rows(blocks[i]), cells_of(blocks[i])
+        _store_rows(sky.arrays, rows, minimum, scale, features[where], theta[where])
 
     with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
         run(find_extremes)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.errors import StaridError
 
 
@@ -27,8 +27,8 @@ class ObservedFrame:
         Offsets from the frame's centre, (n, 2), degrees.
     """
 
-    brightness: NDArray[np.float64]
-    positions: NDArray[np.float64]
+    brightness: Array
+    positions: Array
 
     def __post_init__(self) -> None:
         if self.brightness.ndim != 1 or self.positions.shape != (self.brightness.size, 2):
@@ -57,9 +57,14 @@ class FilterResult:
         Pairs of objects (earlier, later) that are the same star, (m, 2).
     """
 
-    true_before: NDArray[np.bool_]
-    true_now: NDArray[np.bool_]
-    matches: NDArray[np.int64]
+    true_before: Mask
+    true_now: Mask
+    matches: Indices
+
+    @property
+    def matched(self) -> Mask:
+        """Which objects of the later frame belong to one of the earlier."""
+        return np.isin(np.arange(self.true_now.size), self.matches[:, 1])
 
 
 class FalseStarFilter(Protocol):

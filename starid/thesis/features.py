@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.errors import StaridError
 from starid.jit import compiled
 
@@ -60,20 +60,20 @@ class FeatureVector:
         return math.degrees(self.theta_rad)
 
     @property
-    def vector(self) -> NDArray[np.float64]:
+    def vector(self) -> Array:
         """The five features n, A, r, σ_A, σ_r, (5,)."""
         return np.array([self.n, self.A, self.r, self.sigma_A, self.sigma_r], dtype=np.float64)
 
 
 @compiled
-def clear_sums(sums: NDArray[np.float64]) -> None:
+def clear_sums(sums: Array) -> None:
     """Empty the accumulator of one frame, (8,)."""
     for i in range(SUM_COUNT):
         sums[i] = 0.0
 
 
 @compiled
-def add_star(sums: NDArray[np.float64], brightness: float, x: float, y: float, pivot: float) -> None:
+def add_star(sums: Array, brightness: float, x: float, y: float, pivot: float) -> None:
     """Add one star to the accumulator; `pivot` is a brightness near the mean, against cancellation."""
     q = x * x + y * y
     da = brightness - pivot
@@ -88,7 +88,7 @@ def add_star(sums: NDArray[np.float64], brightness: float, x: float, y: float, p
 
 
 @compiled
-def finish_features(sums: NDArray[np.float64], pivot: float, out: NDArray[np.float64]) -> float:
+def finish_features(sums: Array, pivot: float, out: Array) -> float:
     """Turn an accumulator into the five features in `out` and return the polar angle in radians.
 
     The frame object is X = Σ a·x / Σ a and Y = Σ a·y / Σ a; eq. 2.5 prints a division by n, while the published
@@ -120,9 +120,7 @@ def finish_features(sums: NDArray[np.float64], pivot: float, out: NDArray[np.flo
 
 
 @compiled
-def frame_features(
-    brightness: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64], out: NDArray[np.float64]
-) -> float:
+def frame_features(brightness: Array, x: Array, y: Array, out: Array) -> float:
     """Write the features of a list of stars to `out` (5,) and return the polar angle in radians."""
     sums = np.zeros(SUM_COUNT)
     pivot = brightness[0] if brightness.size > 0 else 0.0
@@ -132,11 +130,7 @@ def frame_features(
 
 
 def extract_features(
-    brightness: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    *,
-    half_width: float | None = None,
-    full_field: bool = False,
+    brightness: Array, offsets: Array, *, half_width: float | None = None, full_field: bool = False
 ) -> FeatureVector:
     """Condense the stars of one frame into its feature vector (function F_ψ of algorithm 1).
 
@@ -180,14 +174,11 @@ def extract_features(
     if a.size == 0:
         raise FeatureError("features: no star in the frame; check the pointing and the brightness limit")
     out = np.empty(FEATURE_COUNT)
-    theta = float(frame_features(a, x, y, out))
-    return FeatureVector(
-        n=a.size,
-        A=float(out[1]),
-        r=float(out[2]),
-        sigma_A=float(out[3]),
-        sigma_r=float(out[4]),
-        theta_rad=theta,
-        x=float(out[2] * math.cos(theta)),
-        y=float(out[2] * math.sin(theta)),
-    )
+    return feature_vector(out, float(frame_features(a, x, y, out)))
+
+
+def feature_vector(numbers: Array, theta_rad: float) -> FeatureVector:
+    """Feature vector of the numbers that `finish_features` writes and the angle that it returns."""
+    n, mean, r, sigma_a, sigma_r = numbers.tolist()
+    x, y = r * math.cos(theta_rad), r * math.sin(theta_rad)
+    return FeatureVector(int(n), mean, r, sigma_a, sigma_r, theta_rad, x, y)

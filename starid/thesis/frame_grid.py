@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.errors import StaridError
 from starid.jit import compiled
 
@@ -30,6 +30,23 @@ _ROUNDING: Final = 1e-9
 
 class GridError(StaridError):
     """A grid that cannot be laid out."""
+
+
+class GridArrays(NamedTuple):
+    """What the kernels read of a `FrameGrid`, or of some of its rows."""
+
+    row_start: Indices
+    row_columns: Indices
+    row_dec: Array
+    row_ra_step: Array
+    first_ra: float
+
+    def rows(self, chosen: slice) -> GridArrays:
+        """Only some of the rows; their cells keep their numbers."""
+        start = self.row_start[chosen.start : chosen.stop + 1]
+        return GridArrays(
+            start, self.row_columns[chosen], self.row_dec[chosen], self.row_ra_step[chosen], self.first_ra
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +71,10 @@ class FrameGrid:
     geometry: Geometry
     step_deg: float
     first_ra_deg: float
-    row_dec_deg: NDArray[np.float64]
-    row_ra_step_deg: NDArray[np.float64]
-    row_columns: NDArray[np.int64]
-    row_start: NDArray[np.int64]
+    row_dec_deg: Array
+    row_ra_step_deg: Array
+    row_columns: Indices
+    row_start: Indices
 
     @property
     def rows(self) -> int:
@@ -69,22 +86,21 @@ class FrameGrid:
         """Number of cells N."""
         return int(self.row_start[-1])
 
-    def row_and_column(self, cell: int) -> tuple[int, int]:
-        """Row and column of a cell, both from 0."""
-        row = int(cell_row(self.row_start, cell))
-        return row, cell - int(self.row_start[row])
+    @property
+    def arrays(self) -> GridArrays:
+        """What the kernels read."""
+        return GridArrays(
+            self.row_start, self.row_columns, self.row_dec_deg, self.row_ra_step_deg, self.first_ra_deg
+        )
 
     def centre(self, cell: int) -> tuple[float, float]:
         """Right ascension (0 … 360) and declination of a cell's centre, degrees."""
         if not 0 <= cell < self.cells:
             raise GridError(f"grid: cell {cell} does not exist; there are {self.cells}, counted from 0")
-        row, column = self.row_and_column(cell)
-        return (
-            (self.first_ra_deg + column * float(self.row_ra_step_deg[row])) % _FULL_TURN,
-            float(self.row_dec_deg[row]),
-        )
+        ra, dec = cell_place(self.arrays, cell)
+        return float(ra) % _FULL_TURN, float(dec)
 
-    def dictionary(self, cell: int) -> NDArray[np.int64]:
+    def dictionary(self, cell: int) -> Indices:
         """Cells of the 3×3 neighbourhood, (9,), row by row: the dictionary T of eq. 2.30 in terms of cells.
 
         Right ascension wraps. At the first and the last row the block is moved inwards as a whole, so that it has
@@ -92,14 +108,12 @@ class FrameGrid:
         """
         cells = np.empty(DICTIONARY_SIZE, dtype=np.int64)
         turns = np.empty(DICTIONARY_SIZE)
-        dictionary_cells(
-            self.row_start, self.row_columns, self.row_ra_step_deg, self.first_ra_deg, cell, cells, turns
-        )
+        dictionary_cells(self.arrays, cell, cells, turns)
         return cells
 
 
 @compiled
-def cell_row(row_start: NDArray[np.int64], cell: int) -> int:
+def cell_row(row_start: Indices, cell: int) -> int:
     """Row of a cell, by bisection."""
     low = 0
     high = row_start.size - 1
@@ -113,28 +127,26 @@ def cell_row(row_start: NDArray[np.int64], cell: int) -> int:
 
 
 @compiled
-def dictionary_cells(
-    row_start: NDArray[np.int64],
-    row_columns: NDArray[np.int64],
-    row_ra_step: NDArray[np.float64],
-    first_ra: float,
-    cell: int,
-    cells: NDArray[np.int64],
-    right_ascension: NDArray[np.float64],
-) -> int:
+def dictionary_cells(grid: GridArrays, cell: int, cells: Indices, right_ascension: Array) -> int:
     """Write the nine cells and their right ascensions (degrees, not wrapped); return the first of the three rows."""
-    row = cell_row(row_start, cell)
-    centre = (cell - row_start[row]) * row_ra_step[row]
-    first_row = min(max(row - 1, 0), row_columns.size - 3)
+    row = cell_row(grid.row_start, cell)
+    centre = (cell - grid.row_start[row]) * grid.row_ra_step[row]
+    first_row = min(max(row - 1, 0), grid.row_columns.size - 3)
     for i in range(3):
         r = first_row + i
-        columns = row_columns[r]
-        middle = round(centre / row_ra_step[r])
+        middle = round(centre / grid.row_ra_step[r])
         for j in range(3):
             column = middle - 1 + j
-            cells[3 * i + j] = row_start[r] + column % columns
-            right_ascension[3 * i + j] = first_ra + column * row_ra_step[r]
+            cells[3 * i + j] = grid.row_start[r] + column % grid.row_columns[r]
+            right_ascension[3 * i + j] = grid.first_ra + column * grid.row_ra_step[r]
     return first_row
+
+
+@compiled
+def cell_place(grid: GridArrays, cell: int) -> tuple[float, float]:
+    """Right ascension (not wrapped) and declination of a cell's centre, degrees."""
+    row = cell_row(grid.row_start, cell)
+    return grid.first_ra + (cell - grid.row_start[row]) * grid.row_ra_step[row], grid.row_dec[row]
 
 
 def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:

@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
 
 MAX_VOTERS: Final = 48
@@ -22,14 +22,14 @@ _LEAST_PAIR: Final = 15.0
 
 @compiled
 def nearest_objects(
-    positions: NDArray[np.float64],
-    brightness: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    predicted_brightness: NDArray[np.float64],
-    position_variance: NDArray[np.float64],
+    positions: Array,
+    brightness: Array,
+    predicted: Array,
+    predicted_brightness: Array,
+    position_variance: Array,
     brightness_sigma: float,
     gate: float,
-    partner: NDArray[np.int64],
+    partner: Indices,
 ) -> int:
     """Match predictions and objects that are each other's nearest within the gate; return how many.
 
@@ -70,12 +70,7 @@ def nearest_objects(
 
 @compiled
 def _pairs(
-    positions: NDArray[np.float64],
-    brightness: NDArray[np.float64],
-    least: float,
-    separation: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    members: NDArray[np.int64],
+    positions: Array, brightness: Array, least: float, separation: Array, slope: Array, members: Indices
 ) -> int:
     """Separations and directions of all pairs, brighter object first; return their number."""
     k = 0
@@ -96,11 +91,11 @@ def _pairs(
 
 @compiled
 def _score(
-    before: NDArray[np.float64],
-    brightness_before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    brightness_now: NDArray[np.float64],
-    motion: NDArray[np.float64],
+    before: Array,
+    brightness_before: Array,
+    now: Array,
+    brightness_now: Array,
+    motion: Array,
     gate2: float,
     faint: float,
 ) -> float:
@@ -122,15 +117,15 @@ def _score(
 
 @compiled
 def _pair_hypotheses(
-    first: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]],
-    second: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]],
+    first: tuple[Array, Array, Indices],
+    second: tuple[Array, Array, Indices],
     counts: tuple[int, int],
-    brightness_before: NDArray[np.float64],
-    brightness_now: NDArray[np.float64],
+    brightness_before: Array,
+    brightness_now: Array,
     tolerance: float,
     faint: float,
     max_rotation: float,
-    couples: NDArray[np.int64],
+    couples: Indices,
 ) -> int:
     """List couples of pairs alike in separation and brightness, turned by no more than allowed; longest pairs first."""
     order1 = np.argsort(-first[0][: counts[0]])
@@ -161,15 +156,15 @@ def _pair_hypotheses(
 
 @compiled
 def find_motion(
-    before: NDArray[np.float64],
-    brightness_before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    brightness_now: NDArray[np.float64],
+    before: Array,
+    brightness_before: Array,
+    now: Array,
+    brightness_now: Array,
     sigma: float,
     brightness_sigma: float,
     max_rotation: float,
     max_shift: float,
-    motion: NDArray[np.float64],
+    motion: Array,
 ) -> float:
     """Find the rigid motion that explains most objects; return its score, about the number of objects explained.
 

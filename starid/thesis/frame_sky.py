@@ -5,14 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.errors import StaridError
 from starid.jit import compiled
-from starid.thesis.features import SUM_COUNT, FeatureVector, add_star, clear_sums, finish_features
+from starid.thesis.features import (
+    SUM_COUNT,
+    FeatureVector,
+    add_star,
+    clear_sums,
+    feature_vector,
+    finish_features,
+)
 from starid.thesis.frame_grid import Geometry
 
 Direction = Literal["faintest", "brightest"]
@@ -35,6 +42,14 @@ class SkyError(StaridError):
     """Stars or a frame that no database can be made of."""
 
 
+class SkyArrays(NamedTuple):
+    """What the kernels read of a `FrameSky`: its table of stars, the first star of each bin, and the frame's numbers."""
+
+    stars: Array
+    bin_start: Indices
+    frame: Array
+
+
 @compiled
 def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) -> tuple[int, int, int, int]:
     """Bins that stars within reach of a place lie in: first and last band, first bin along α, and how many of these."""
@@ -52,9 +67,7 @@ def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) 
 
 
 @compiled
-def stars_of_bins(
-    bin_start: NDArray[np.int64], band: int, first: int, count: int, part: int
-) -> tuple[int, int]:
+def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: int) -> tuple[int, int]:
     """First star, and one past the last, of the bins of a band: up to the end of the band (part 0), or beyond (part 1)."""
     end = min(first + count, RA_BINS)
     start = band * RA_BINS + (first if part == 0 else 0)
@@ -97,15 +110,9 @@ def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) 
 
 
 @compiled
-def cell_sums(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    ra_deg: float,
-    dec_deg: float,
-    sums: NDArray[np.float64],
-) -> None:
+def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> None:
     """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
+    stars, bin_start, frame = sky
     clear_sums(sums)
     half = frame[HALF_WIDTH]
     half2 = half * half
@@ -127,19 +134,13 @@ def cell_sums(
 
 @compiled
 def stars_near(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    ra_deg: float,
-    dec_deg: float,
-    margin: float,
-    found: NDArray[np.float64],
-    rows: NDArray[np.int64],
+    sky: SkyArrays, ra_deg: float, dec_deg: float, margin: float, found: Array, rows: Indices
 ) -> int:
     """List the stars of a circular frame with north up and a margin around it; return how many.
 
     `found` (n, 3) receives x, y in the frame's unit and the magnitude, `rows` (n,) the stars' rows in the table.
     """
+    stars, bin_start, frame = sky
     spherical = frame[SPHERICAL] > 0.5
     limit = (frame[HALF_WIDTH] + margin) ** 2
     reach = frame[HALF_WIDTH] + margin
@@ -166,18 +167,10 @@ def stars_near(
 
 
 @compiled
-def cell_features(
-    stars: NDArray[np.float64],
-    bin_start: NDArray[np.int64],
-    frame: NDArray[np.float64],
-    ra_deg: float,
-    dec_deg: float,
-    sums: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> float:
+def cell_features(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array, out: Array) -> float:
     """Write the features of the frame centred at (ra, dec) to `out`; return the polar angle in radians."""
-    cell_sums(stars, bin_start, frame, ra_deg, dec_deg, sums)
-    return finish_features(sums, frame[PIVOT], out)
+    cell_sums(sky, ra_deg, dec_deg, sums)
+    return finish_features(sums, sky.frame[PIVOT], out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,12 +200,12 @@ class FrameSky:
     half_width: float
     full_field: bool
     focal_px: float
-    stars: NDArray[np.float64]
-    bin_start: NDArray[np.int64]
-    source: NDArray[np.int64]
+    stars: Array
+    bin_start: Indices
+    source: Indices
 
     @cached_property
-    def frame(self) -> NDArray[np.float64]:
+    def frame(self) -> Array:
         """The frame's numbers for the kernels, (6,)."""
         reach = self.half_width
         corner = math.sqrt(2.0) if self.full_field else 1.0
@@ -230,6 +223,11 @@ class FrameSky:
             ]
         )
 
+    @cached_property
+    def arrays(self) -> SkyArrays:
+        """What the kernels read."""
+        return SkyArrays(self.stars, self.bin_start, self.frame)
+
     def features(self, ra_deg: float, dec_deg: float) -> FeatureVector:
         """Feature vector of the frame centred at (ra, dec), degrees, north up.
 
@@ -239,28 +237,14 @@ class FrameSky:
             If no star lies in that frame.
         """
         out = np.empty(5)
-        theta = float(
-            cell_features(self.stars, self.bin_start, self.frame, ra_deg, dec_deg, np.empty(SUM_COUNT), out)
-        )
+        theta = float(cell_features(self.arrays, ra_deg, dec_deg, np.empty(SUM_COUNT), out))
         if out[0] < 1.0:
             raise SkyError(
                 f"sky: no star in the frame at ({ra_deg:.3f}°, {dec_deg:.3f}°) within the brightness limit"
             )
-        r = float(out[2])
-        return FeatureVector(
-            int(out[0]),
-            float(out[1]),
-            r,
-            float(out[3]),
-            float(out[4]),
-            theta,
-            r * math.cos(theta),
-            r * math.sin(theta),
-        )
+        return feature_vector(out, theta)
 
-    def stars_in_frame(
-        self, ra_deg: float, dec_deg: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def stars_in_frame(self, ra_deg: float, dec_deg: float) -> tuple[Array, Array, Indices]:
         """Brightness (n,), offsets (n, 2) and source rows (n,) of the stars in the frame centred at (ra, dec)."""
         x, y = self.offsets(ra_deg, dec_deg)
         if self.full_field:
@@ -269,7 +253,7 @@ class FrameSky:
             inside = x * x + y * y <= self.half_width * self.half_width
         return self.stars[inside, BRIGHTNESS], np.column_stack([x[inside], y[inside]]), self.source[inside]
 
-    def offsets(self, ra_deg: float, dec_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def offsets(self, ra_deg: float, dec_deg: float) -> tuple[Array, Array]:
         """Offsets x, y of all stars from the frame centre; infinite behind the camera."""
         if self.geometry == "planar":
             x = self.stars[:, RIGHT_ASCENSION] - ra_deg
@@ -286,9 +270,9 @@ class FrameSky:
 
 
 def make_frame_sky(
-    ra_deg: NDArray[np.float64],
-    dec_deg: NDArray[np.float64],
-    brightness: NDArray[np.float64],
+    ra_deg: Array,
+    dec_deg: Array,
+    brightness: Array,
     *,
     geometry: Geometry,
     half_width: float,

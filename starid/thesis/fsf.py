@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.jit import compiled
 from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 
@@ -34,12 +34,7 @@ def pair_count(objects: int) -> int:
 
 
 @compiled
-def pair_features(
-    brightness: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    members: NDArray[np.int64],
-) -> None:
+def pair_features(brightness: Array, positions: Array, vectors: Array, members: Indices) -> None:
     """Write the set of feature vectors of a frame (eq. 3.8), one v = (A_ij, d_ij, m_ij) (eq. 3.3) for each pair i < j.
 
     A_ij is the mean brightness, eq. 3.4, d_ij the separation in degrees, eq. 3.5, and m_ij the slope of the line
@@ -58,10 +53,15 @@ def pair_features(
             k += 1
 
 
+def pairs_of(frame: ObservedFrame) -> Array:
+    """The feature vectors of a frame's pairs, (L, 3)."""
+    vectors = np.empty((pair_count(len(frame)), 3))
+    pair_features(frame.brightness, frame.positions, vectors, np.empty((len(vectors), 2), dtype=np.int64))
+    return vectors
+
+
 @compiled
-def disparity_list(
-    before: NDArray[np.float64], now: NDArray[np.float64], disparities: NDArray[np.float64]
-) -> None:
+def disparity_list(before: Array, now: Array, disparities: Array) -> None:
     """Write all differences d = v_i − v_j (eq. 3.9), D = L₁·L₂ rows (eq. 3.10), the later frame's pairs running fastest.
 
     The slope's difference is taken on the circle of 180°, −90 < Δm ≤ 90, so that a line near the horizontal is like
@@ -78,9 +78,7 @@ def disparity_list(
 
 
 @compiled
-def _bin_points(
-    points: NDArray[np.float64], side: float, order: NDArray[np.int64], shape: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _bin_points(points: Array, side: float, order: Indices, shape: Indices) -> tuple[Indices, Indices]:
     """Sort points into square bins of their second and third coordinate.
 
     `order` (n,) receives the points bin by bin, in their own order within each, and `shape` (2,) the number of bins.
@@ -108,11 +106,7 @@ def _bin_points(
 
 @compiled
 def _neighbours(
-    points: NDArray[np.float64],
-    bins: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
-    here: int,
-    epsilon: float,
-    found: NDArray[np.int64],
+    points: Array, bins: tuple[Indices, Indices, Indices], here: int, epsilon: float, found: Indices
 ) -> int:
     """Write all points within ε of one, itself included; return how many.
 
@@ -136,7 +130,7 @@ def _neighbours(
 
 
 @compiled
-def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: float) -> NDArray[np.int64]:
+def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indices:
     """Label the density-based clusters of a list of points (n, 3); −1 is an outlier (eq. 3.1).
 
     The same labels as scikit-learn's DBSCAN: clusters are numbered by their first core point, a border point goes to
@@ -187,7 +181,7 @@ def density_clusters(points: NDArray[np.float64], epsilon: float, min_samples: f
 
 
 @compiled
-def main_cluster(labels: NDArray[np.int64]) -> int:
+def main_cluster(labels: Indices) -> int:
     """Label of the cluster with most members, the first of several; −1 without any."""
     clusters = 0
     for i in range(labels.size):
@@ -203,11 +197,7 @@ def main_cluster(labels: NDArray[np.int64]) -> int:
 
 @compiled
 def trace_back(
-    labels: NDArray[np.int64],
-    main: int,
-    members_before: NDArray[np.int64],
-    members_now: NDArray[np.int64],
-    votes: NDArray[np.int64],
+    labels: Indices, main: int, members_before: Indices, members_now: Indices, votes: Indices
 ) -> None:
     """Count for each object of the earlier and of the later frame how often the main cluster lets them correspond."""
     width = members_now.shape[0]
@@ -221,7 +211,7 @@ def trace_back(
 
 
 @compiled
-def _mutual_matches(votes: NDArray[np.int64], matches: NDArray[np.int64]) -> int:
+def _mutual_matches(votes: Indices, matches: Indices) -> int:
     """Write the pairs of objects that vote for each other most, each at least twice; return how many."""
     count = 0
     for i in range(votes.shape[0]):
@@ -235,15 +225,15 @@ def _mutual_matches(votes: NDArray[np.int64], matches: NDArray[np.int64]) -> int
 
 @compiled
 def filter_kernel(
-    brightness_before: NDArray[np.float64],
-    positions_before: NDArray[np.float64],
-    brightness_now: NDArray[np.float64],
-    positions_now: NDArray[np.float64],
+    brightness_before: Array,
+    positions_before: Array,
+    brightness_now: Array,
+    positions_now: Array,
     epsilon: float,
     min_samples: float,
-    true_before: NDArray[np.bool_],
-    true_now: NDArray[np.bool_],
-    matches: NDArray[np.int64],
+    true_before: Mask,
+    true_now: Mask,
+    matches: Indices,
 ) -> int:
     """Run the filter; return the number of matches."""
     first, second = brightness_before.size, brightness_now.size

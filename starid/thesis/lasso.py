@@ -13,11 +13,11 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.jit import compiled
 
-LAMBDAS: Final[NDArray[np.float64]] = np.arange(1, 101, dtype=np.float64) * np.float64(0.05)
+LAMBDAS: Final[Array] = np.arange(1, 101, dtype=np.float64) * np.float64(0.05)
 """The regularisation parameters of the thesis: 0.05, 0.10 … 5.00."""
 LAMBDAS.setflags(write=False)
 
@@ -32,12 +32,7 @@ _OPTIMALITY: Final = 1e-6
 
 @compiled
 def _solve_active(
-    gram: NDArray[np.float64],
-    active: NDArray[np.int64],
-    size: int,
-    right: NDArray[np.float64],
-    work: NDArray[np.float64],
-    solution: NDArray[np.float64],
+    gram: Array, active: Indices, size: int, right: Array, work: Array, solution: Array
 ) -> bool:
     """Solve the active part of the Gram matrix by Cholesky; False if it is singular."""
     for i in range(size):
@@ -66,9 +61,7 @@ def _solve_active(
 
 
 @compiled
-def _slope(
-    gram: NDArray[np.float64], j: int, active: NDArray[np.int64], size: int, direction: NDArray[np.float64]
-) -> float:
+def _slope(gram: Array, j: int, active: Indices, size: int, direction: Array) -> float:
     """How fast the correlation of column j falls along the path."""
     value = 0.0
     for k in range(size):
@@ -78,13 +71,13 @@ def _slope(
 
 @compiled
 def _next_joining(
-    gram: NDArray[np.float64],
-    rest: NDArray[np.float64],
+    gram: Array,
+    rest: Array,
     level: float,
-    idle: NDArray[np.bool_],
-    active: NDArray[np.int64],
+    idle: Mask,
+    active: Indices,
     size: int,
-    direction: NDArray[np.float64],
+    direction: Array,
     dropped: int,
     length: float,
 ) -> tuple[int, float]:
@@ -107,11 +100,7 @@ def _next_joining(
 
 @compiled
 def _next_dropping(
-    omega: NDArray[np.float64],
-    active: NDArray[np.int64],
-    size: int,
-    direction: NDArray[np.float64],
-    length: float,
+    omega: Array, active: Indices, size: int, direction: Array, length: float
 ) -> tuple[int, float]:
     """Place among the active columns whose weight first reaches zero within `length`, and where; −1 if none does."""
     dropping = -1
@@ -125,13 +114,7 @@ def _next_dropping(
 
 
 @compiled
-def lars_path(
-    gram: NDArray[np.float64],
-    correlation: NDArray[np.float64],
-    end: float,
-    breaks: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> int:
+def lars_path(gram: Array, correlation: Array, end: float, breaks: Array, weights: Array) -> int:
     """Follow the LASSO path down to λ = `end`; return the number of breakpoints, 0 if the path could not be followed.
 
     Parameters
@@ -199,9 +182,7 @@ def lars_path(
 
 
 @compiled
-def coordinate_descent(
-    gram: NDArray[np.float64], correlation: NDArray[np.float64], penalty: float, omega: NDArray[np.float64]
-) -> int:
+def coordinate_descent(gram: Array, correlation: Array, penalty: float, omega: Array) -> int:
     """Solve one LASSO problem from the start value in `omega`, in place; return the number of sweeps."""
     n = correlation.size
     for sweep in range(_MAX_SWEEPS):
@@ -224,9 +205,7 @@ def coordinate_descent(
 
 
 @compiled
-def optimality_gap(
-    gram: NDArray[np.float64], correlation: NDArray[np.float64], penalty: float, omega: NDArray[np.float64]
-) -> float:
+def optimality_gap(gram: Array, correlation: Array, penalty: float, omega: Array) -> float:
     """How far ω is from the optimality conditions of the LASSO, relative to the greatest correlation."""
     n = correlation.size
     worst = 0.0
@@ -246,12 +225,7 @@ def optimality_gap(
 
 
 @compiled
-def lasso_path(
-    dictionary: NDArray[np.float64],
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> bool:
+def lasso_path(dictionary: Array, observation: Array, lambdas: Array, weights: Array) -> bool:
     """Solve the LASSO for all λ, eq. 2.34; return whether the path was followed (False: coordinate descent).
 
     It is the least-squares problem of eq. 2.31 with the elastic-net penalty of eq. 2.32, P_a of eq. 2.33, at a = 1.
@@ -304,12 +278,7 @@ def lasso_path(
 
 
 @compiled
-def choose_lambdas(
-    dictionary: NDArray[np.float64],
-    observation: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    error: NDArray[np.float64],
-) -> tuple[int, int]:
+def choose_lambdas(dictionary: Array, observation: Array, weights: Array, error: Array) -> tuple[int, int]:
     """Pick the λ of least mean squared error and the largest λ within one standard error of it.
 
     The error is the mean over the M features of the squared residual ψ̂ − Tω, its standard error their standard

@@ -10,6 +10,7 @@ from typing import Final, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
 from starid.thesis.cell_search import (
     CellArrays,
@@ -28,7 +29,6 @@ from starid.thesis.matlab_lasso import matlab_path
 from starid.thesis.reference import ReferenceSearch, reference_path
 
 Precision = Literal["exact", "stored"]
-Choice = Literal["mse", "1se"]
 Solver = Literal["exact", "matlab", "sklearn"]
 
 _WHOLE_SKY_DEG: Final = 720.0
@@ -77,12 +77,12 @@ class LsiWork(NamedTuple):
         Distance of the nearest cell and number of cells looked at, (2,).
     """
 
-    cells: NDArray[np.int64]
-    dictionary: NDArray[np.float64]
-    places: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    results: NDArray[np.float64]
-    found: NDArray[np.float64]
+    cells: Indices
+    dictionary: Array
+    places: Array
+    weights: Array
+    results: Array
+    found: Array
 
 
 def lsi_work() -> LsiWork:
@@ -126,12 +126,12 @@ class LsiEstimate:
     right_ascension_deg: float
     declination_deg: float
     theta_rad: float
-    omega: NDArray[np.float64]
+    omega: Array
     penalty: float
     error_psi: float
-    reconstruction: NDArray[np.float64]
-    boresight: NDArray[np.float64]
-    pointer: NDArray[np.float64]
+    reconstruction: Array
+    boresight: Array
+    pointer: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +154,13 @@ class LsiSolution:
         Weights and numbers of the two estimates, (2, 9) and (2, 16).
     """
 
-    observation: NDArray[np.float64]
+    observation: Array
     nearest: int
     distance: float
-    cells: NDArray[np.int64]
-    dictionary: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    results: NDArray[np.float64]
+    cells: Indices
+    dictionary: Array
+    weights: Array
+    results: Array
 
     @cached_property
     def mse(self) -> LsiEstimate:
@@ -171,10 +171,6 @@ class LsiSolution:
     def one_se(self) -> LsiEstimate:
         """Estimate at the largest λ within one standard error of the least."""
         return self._estimate(1)
-
-    def choose(self, choice: Choice) -> LsiEstimate:
-        """Estimate by name."""
-        return self.mse if choice == "mse" else self.one_se
 
     def _estimate(self, row: int) -> LsiEstimate:
         numbers, omega = self.results[row], self.weights[row]
@@ -195,19 +191,11 @@ class LsiSolution:
 def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
     """Set up the dictionary about a cell: its features, the boresights F of eq. 2.16 and the angles Θ of eq. 2.18."""
     arrays = searched.arrays
-    first_row = dictionary_cells(
-        arrays.row_start,
-        arrays.row_columns,
-        arrays.row_ra_step,
-        arrays.first_ra,
-        cell,
-        work.cells,
-        work.places[0],
-    )
+    first_row = dictionary_cells(arrays.grid, cell, work.cells, work.places[0])
     sums = np.empty(8)
     vector = np.empty(5)
     for j in range(9):
-        work.places[1, j] = arrays.row_dec[first_row + j // 3]
+        work.places[1, j] = arrays.grid.row_dec[first_row + j // 3]
         if searched.exact:
             work.places[2, j] = exact_vector(arrays, work.cells[j], sums, vector)
             for f in range(5):
@@ -219,7 +207,7 @@ def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
 
 
 @compiled
-def _flat_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np.float64]) -> None:
+def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     """Combine boresights and angles in the flat plane, with weights scaled to a sum of one."""
     cos_sum = 0.0
     sin_sum = 0.0
@@ -236,7 +224,7 @@ def _flat_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np
 
 
 @compiled
-def _sphere_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[np.float64]) -> None:
+def _sphere_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     """Combine boresights and frame-object directions as vectors, so that poles and 0°/360° are like any other place."""
     boresight = np.zeros(3)
     pointer = np.zeros(3)
@@ -274,9 +262,9 @@ def _sphere_estimate(omega: NDArray[np.float64], work: LsiWork, result: NDArray[
 def estimate_from_path(
     searched: SearchedCells,
     cell: int,
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    path: NDArray[np.float64],
+    observation: Array,
+    lambdas: Array,
+    path: Array,
     chosen: tuple[int, int],
     work: LsiWork,
 ) -> None:
@@ -303,7 +291,7 @@ def estimate_from_path(
         result[0] = total
         result[4] = math.sqrt(square)
         result[5] = lambdas[chosen[row]]
-        if searched.arrays.frame[0] > 0.5:
+        if searched.arrays.sky.frame[0] > 0.5:
             _sphere_estimate(omega, work, result)
         else:
             _flat_estimate(omega, work, result)
@@ -312,11 +300,7 @@ def estimate_from_path(
 
 @compiled
 def estimate_from_cell(
-    searched: SearchedCells,
-    cell: int,
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    work: LsiWork,
+    searched: SearchedCells, cell: int, observation: Array, lambdas: Array, work: LsiWork
 ) -> None:
     """Dictionary, LASSO and estimates about a cell."""
     fill_dictionary(searched, cell, work)
@@ -332,11 +316,7 @@ def estimate_from_cell(
 
 @compiled
 def lsi_kernel(
-    index: CellIndex,
-    searched: SearchedCells,
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    work: LsiWork,
+    index: CellIndex, searched: SearchedCells, observation: Array, lambdas: Array, work: LsiWork
 ) -> int:
     """Search and estimate in one go; return the nearest cell, −1 if there is none."""
     if searched.exact:
@@ -362,12 +342,12 @@ def _angle_gap(code: float, other: float, slack: float) -> float:
 @compiled
 def region_nearest(
     searched: SearchedCells,
-    observation: NDArray[np.float64],
+    observation: Array,
     ra_deg: float,
     dec_deg: float,
     side_deg: float,
     theta: float,
-    found: NDArray[np.float64],
+    found: Array,
 ) -> int:
     """Find the nearest neighbour among the cells of a square region of search; −1 if the region holds no cell.
 
@@ -382,7 +362,7 @@ def region_nearest(
     found
         Output (2,): distance on the normalised scale and number of cells in the region.
     """
-    arrays = searched.arrays
+    arrays, grid = searched.arrays, searched.arrays.grid
     sums = np.empty(8)
     vector = np.empty(5)
     best_cell = -1
@@ -392,18 +372,18 @@ def region_nearest(
     counts_angle = not math.isnan(theta)
     theta_code = theta * _CODES_PER_RADIAN if counts_angle else 0.0
     slack = 0.5 + 1e-9 if searched.exact else 0.0
-    for row in range(arrays.row_dec.size):
-        if abs(arrays.row_dec[row] - dec_deg) > half:
+    for row in range(grid.row_dec.size):
+        if abs(grid.row_dec[row] - dec_deg) > half:
             continue
-        step = arrays.row_ra_step[row]
-        columns = arrays.row_columns[row]
+        step = grid.row_ra_step[row]
+        columns = grid.row_columns[row]
         width = half
-        if arrays.frame[0] > 0.5:
-            width = half / max(math.cos(math.radians(arrays.row_dec[row])), half / 180.0)
-        first = math.ceil((ra_deg - width - arrays.first_ra) / step)
-        last = min(math.floor((ra_deg + width - arrays.first_ra) / step), first + columns - 1)
+        if arrays.sky.frame[0] > 0.5:
+            width = half / max(math.cos(math.radians(grid.row_dec[row])), half / 180.0)
+        first = math.ceil((ra_deg - width - grid.first_ra) / step)
+        last = min(math.floor((ra_deg + width - grid.first_ra) / step), first + columns - 1)
         for place in range(first, last + 1):
-            cell = arrays.row_start[row] + place % columns
+            cell = grid.row_start[row] + place % columns
             if searched.theta[cell] == 255:
                 continue
             count += 1
@@ -477,7 +457,7 @@ class LostInSpace:
         """Estimate boresight and roll from the features of one frame, searching the whole database."""
         return self.solve_normalised(self.database.normalise(features))
 
-    def solve_normalised(self, observation: NDArray[np.float64]) -> LsiSolution:
+    def solve_normalised(self, observation: Array) -> LsiSolution:
         """Estimate from a normalised observation ψ̂, (5,).
 
         Raises
@@ -492,7 +472,7 @@ class LostInSpace:
         nearest = lsi_kernel(self.index, self.searched, observation, LAMBDAS, work)
         return _solution(observation, nearest, float(work.found[0]), work)
 
-    def nearest(self, observation: NDArray[np.float64], *, theta_rad: float = math.nan) -> tuple[int, float]:
+    def nearest(self, observation: Array, *, theta_rad: float = math.nan) -> tuple[int, float]:
         """Nearest cell of the whole database and its distance, for a normalised observation; the search alone.
 
         With a polar angle that counts as a sixth feature, 100 for a full turn; the answer then depends on the roll.
@@ -509,9 +489,7 @@ class LostInSpace:
         distances, cells = self.neighbours(observation, 1)
         return int(cells[0]), float(distances[0])
 
-    def neighbours(
-        self, observation: NDArray[np.float64], count: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def neighbours(self, observation: Array, count: int) -> tuple[Array, Indices]:
         """Distances (count,) of the nearest cells by their stored codes, in any order, and these cells; −1 where there are fewer."""
         if self._reference is not None:
             return self._reference.nearest(observation, count)
@@ -521,7 +499,7 @@ class LostInSpace:
 
     def nearest_in_region(
         self,
-        observation: NDArray[np.float64],
+        observation: Array,
         ra_deg: float,
         dec_deg: float,
         side_deg: float,
@@ -537,7 +515,7 @@ class LostInSpace:
         cell = region_nearest(self.searched, observation, ra_deg, dec_deg, side_deg, theta_rad, found)
         return cell, float(found[0]), int(found[1])
 
-    def estimate(self, observation: NDArray[np.float64], cell: int, distance: float) -> LsiSolution:
+    def estimate(self, observation: Array, cell: int, distance: float) -> LsiSolution:
         """Dictionary, LASSO and estimates about a given cell."""
         self._check(observation)
         work = lsi_work()
@@ -550,12 +528,12 @@ class LostInSpace:
             estimate_from_path(self.searched, cell, observation, LAMBDAS, path, chosen, work)
         return _solution(observation, cell, distance, work)
 
-    def _check(self, observation: NDArray[np.float64]) -> None:
+    def _check(self, observation: Array) -> None:
         if observation.shape != (5,) or not np.isfinite(observation).all():
             raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
 
 
-def _solution(observation: NDArray[np.float64], nearest: int, distance: float, work: LsiWork) -> LsiSolution:
+def _solution(observation: Array, nearest: int, distance: float, work: LsiWork) -> LsiSolution:
     return LsiSolution(
         observation, nearest, distance, work.cells, work.dictionary, work.weights, work.results
     )

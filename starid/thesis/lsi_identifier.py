@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.catalog import StarCatalog, load_catalog
+from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import seen_stars
 from starid.geometric.verified import VerifiedIdentifier
+from starid.single_camera import Measured
 from starid.solution import Reason, Solution
-from starid.solver_input import checked_detections
 from starid.thesis.coarse_match import next_candidate
 from starid.thesis.database import DatabaseParameters
 from starid.thesis.database_choice import given_database, obtain_database
@@ -39,12 +38,14 @@ from starid.wahba import solve_wahba
 STARS_PER_FIELD: Final = 60
 """Stars in a field that the default brightness limit of the features aims at."""
 
+WINDOW_PX: Final = 12.0
+"""Window in which a candidate is verified, pixels."""
+
 _FEWEST_STARS: Final = 5
 _MAGNITUDE_GATE: Final = 0.8
 _MOST_VOTERS: Final = 60
 _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
 _ZERO_POINT_STAR: Final = 25
-_WINDOW_PX: Final = 12.0
 _BLEND_PX: Final = 2.0
 _VOTE_SHARE: Final = 0.25
 _SPREAD: Final = 0.8
@@ -68,9 +69,9 @@ class FieldStars:
         Row of each in the detections given, (n,).
     """
 
-    place: NDArray[np.float64]
-    magnitude: NDArray[np.float64]
-    row: NDArray[np.int64]
+    place: Array
+    magnitude: Array
+    row: Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +165,9 @@ class LsiIdentifier(VerifiedIdentifier):
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or LsiOptions(), **changes)
-        self._catalog = load_catalog() if catalog is None else catalog
+        super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
-        self._camera = camera
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
         limit = self._limit_for(share) if options.feature_limit is None else options.feature_limit
@@ -188,16 +188,6 @@ class LsiIdentifier(VerifiedIdentifier):
             camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
         )
         self.last_report = LsiReport(None, 0, 0, math.nan)
-
-    @property
-    def camera(self) -> Camera:
-        """The camera that the positions belong to."""
-        return self._camera
-
-    @property
-    def catalog(self) -> StarCatalog:
-        """The catalogue that `Solution.catalog_index` counts in."""
-        return self._catalog
 
     @property
     def verifier(self) -> Identifier:
@@ -234,51 +224,21 @@ class LsiIdentifier(VerifiedIdentifier):
         xy = self._camera.border(4)[:_FEWEST_STARS] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
-        self._identify(xy, np.ones(len(xy)), None, [0.0])
+        self._first_verified(Measured.of(xy, np.ones(len(xy))), [0.0])
 
-    def identify(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Lost in space: attitude without any knowledge of it.
-
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            As in `Identifier.identify`.
-
-        Raises
-        ------
-        StaridError
-            The arrays do not fit each other, or hold values that are not finite.
-        """
-        begin = time.perf_counter()
-        xy, brightness, _ = checked_detections(xy_px, flux)
-        solution = self._identify(
-            xy, brightness, xy_sigma_px, self._zero_points(brightness), observer_velocity
-        )
+    def _identify(self, measured: Measured) -> Solution:
+        solution = self._first_verified(measured, self._zero_points(measured.flux))
         if solution.valid:
-            self.learn(solution, brightness)
-        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+            self.learn(solution, measured.flux)
+        return solution
 
-    def _identify(
-        self,
-        xy: NDArray[np.float64],
-        brightness: NDArray[np.float64],
-        xy_sigma_px: ArrayLike | None,
-        zero_points: Sequence[float],
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
+    def _first_verified(self, measured: Measured, zero_points: Sequence[float]) -> Solution:
         """First verified answer of the zero points, tried in their order."""
         tried = verified = 0
         coarse: Attitude | None = None
         enough = False
         for zero_point in zero_points:
-            field = self.field_stars(xy, brightness, zero_point)
+            field = self.field_stars(measured.xy, measured.flux, zero_point)
             features = self.features(field)
             if features is None:
                 continue
@@ -290,22 +250,14 @@ class LsiIdentifier(VerifiedIdentifier):
                 if attitude is None:
                     continue
                 verified += 1
-                solution = self.verifier.verify(
-                    xy,
-                    brightness,
-                    attitude,
-                    xy_sigma_px,
-                    window_px=_WINDOW_PX,
-                    observer_velocity=observer_velocity,
-                )
+                solution = self.verify(measured, attitude, WINDOW_PX)
                 if solution.valid:
                     self.last_report = LsiReport(coarse, tried, verified, zero_point)
                     return dataclasses.replace(solution, mode="lost_in_space")
         self.last_report = LsiReport(coarse, tried, verified, math.nan)
-        reason = Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS
-        return Solution.invalid(reason)
+        return Solution.invalid(Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS)
 
-    def _zero_points(self, flux: NDArray[np.float64]) -> list[float]:
+    def _zero_points(self, flux: Array) -> list[float]:
         """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""
         if self._given_zero_point is not None:
             return [self._given_zero_point]
@@ -317,16 +269,14 @@ class LsiIdentifier(VerifiedIdentifier):
         guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
         return shown + [guess + step for step in _ZERO_POINT_STEPS]
 
-    def learn(self, solution: Solution, flux: NDArray[np.float64]) -> None:
+    def learn(self, solution: Solution, flux: Array) -> None:
         """Take the zero point that the matched stars of a valid answer show, where none was given."""
         if self._given_zero_point is None and solution.star_count >= _FEWEST_STARS:
             magnitudes = self._catalog.v[solution.catalog_index]
             found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
             self._zero_point = float(np.median(found))
 
-    def field_stars(
-        self, xy: NDArray[np.float64], flux: NDArray[np.float64], zero_point: float
-    ) -> FieldStars:
+    def field_stars(self, xy: Array, flux: Array, zero_point: float) -> FieldStars:
         """Detections with flux in the circular field of the features, brightest first."""
         rows = np.flatnonzero(flux > 0.0)
         directions = self._camera.back_project(xy[rows])
@@ -345,7 +295,7 @@ class LsiIdentifier(VerifiedIdentifier):
             return None
         return extract_features(field.magnitude[bright], field.place[bright])
 
-    def _coarse(self, features: FeatureVector) -> tuple[Attitude, NDArray[np.float64]]:
+    def _coarse(self, features: FeatureVector) -> tuple[Attitude, Array]:
         """Attitude in the thesis's form, one neighbour and LASSO, and its boresight (1, 2) in degrees."""
         solution = self.lost_in_space.solve(features).mse
         x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
@@ -354,7 +304,7 @@ class LsiIdentifier(VerifiedIdentifier):
         place = np.array([[solution.right_ascension_deg, solution.declination_deg]])
         return Attitude.from_matrix(np.stack(rows)), place
 
-    def _candidates(self, features: FeatureVector) -> Iterator[NDArray[np.float64]]:
+    def _candidates(self, features: FeatureVector) -> Iterator[Array]:
         """Boresights (k, 2) in degrees to try: centres of the nearest cells in growing numbers, none twice."""
         observation = self.database.normalise(features)
         most = min(self._neighbours, self.database.cells)
@@ -369,7 +319,7 @@ class LsiIdentifier(VerifiedIdentifier):
             tried = np.concatenate([tried, spots[new]])
             yield centres[new]
 
-    def _spots(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _spots(self, places: Array) -> Array:
         """Number of the spot that each place (n, 2) lies in, on a grid just fine enough for the votes."""
         step = math.degrees(_SPREAD * self._offset_px / self.database.parameters.focal_px)
         band = np.floor((places[:, 1] + 90.0) / step)
@@ -377,22 +327,20 @@ class LsiIdentifier(VerifiedIdentifier):
         return np.asarray(band * _SPOTS_PER_BAND + np.floor(places[:, 0] / 360.0 * columns), dtype=np.float64)
 
     def _attitudes_of(
-        self, field: FieldStars, place: NDArray[np.float64], features: FeatureVector
+        self, field: FieldStars, place: Array, features: FeatureVector
     ) -> Iterator[tuple[Attitude | None, int]]:
         yield from self.attitudes(field, place)
         for places in self._candidates(features):
             yield from self.attitudes(field, places)
 
-    def cell_centres(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    def cell_centres(self, cells: Indices) -> Array:
         """Right ascension and declination of cells, degrees, (n, 2)."""
         grid = self.database.grid
         row = np.searchsorted(grid.row_start, cells, side="right") - 1
         ra = grid.first_ra_deg + (cells - grid.row_start[row]) * grid.row_ra_step_deg[row]
         return np.column_stack([ra % 360.0, grid.row_dec_deg[row]])
 
-    def attitudes(
-        self, field: FieldStars, candidates: NDArray[np.float64]
-    ) -> Iterator[tuple[Attitude | None, int]]:
+    def attitudes(self, field: FieldStars, candidates: Array) -> Iterator[tuple[Attitude | None, int]]:
         """Attitudes of the candidate boresights (k, 2) that the stars vote for, and how many were tried since the last.
 
         The last item has no attitude unless the last candidate gave one.
@@ -404,9 +352,7 @@ class LsiIdentifier(VerifiedIdentifier):
         matched = np.empty((voters, 2), dtype=np.int64)
         start = 0
         while start < len(candidates):
-            place, count = next_candidate(
-                sky.stars, sky.bin_start, sky.frame, observed, candidates, start, settings, matched
-            )
+            place, count = next_candidate(sky.arrays, observed, candidates, start, settings, matched)
             if place < 0:
                 yield None, len(candidates) - start
                 return

@@ -13,8 +13,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Mask
 from starid.jit import compiled
 
 RELATIVE_TOLERANCE: Final = 1e-4
@@ -25,9 +25,7 @@ MAX_SWEEPS: Final = 100_000
 
 
 @compiled
-def standardise(
-    dictionary: NDArray[np.float64], columns: NDArray[np.float64], deviation: NDArray[np.float64]
-) -> None:
+def standardise(dictionary: Array, columns: Array, deviation: Array) -> None:
     """Write the columns with mean 0 and standard deviation 1 over the rows (divisor M), and their deviations.
 
     A column that is the same in every row becomes zero and has the deviation 0.
@@ -51,13 +49,7 @@ def standardise(
 
 
 @compiled
-def sweep(
-    columns: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    active: NDArray[np.bool_],
-    penalty: float,
-) -> float:
+def sweep(columns: Array, rest: Array, weights: Array, active: Mask, penalty: float) -> float:
     """Set each active weight to its minimum in turn; return the greatest change relative to one plus its size.
 
     `rest` is the residual of the observation; a weight that becomes zero leaves the active set.
@@ -83,12 +75,7 @@ def sweep(
 
 
 @compiled
-def _residual(
-    columns: NDArray[np.float64],
-    centred: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    rest: NDArray[np.float64],
-) -> None:
+def _residual(columns: Array, centred: Array, weights: Array, rest: Array) -> None:
     for f in range(centred.size):
         rest[f] = centred[f]
         for j in range(weights.size):
@@ -97,12 +84,7 @@ def _residual(
 
 @compiled
 def _descend(
-    columns: NDArray[np.float64],
-    centred: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    active: NDArray[np.bool_],
-    usable: NDArray[np.bool_],
-    penalty: float,
+    columns: Array, centred: Array, weights: Array, active: Mask, usable: Mask, penalty: float
 ) -> None:
     """Solve for one λ from the weights at hand: sweeps over the active set until they settle, then one over all."""
     rows, n = columns.shape
@@ -134,12 +116,7 @@ def _descend(
 
 
 @compiled
-def matlab_path(
-    dictionary: NDArray[np.float64],
-    observation: NDArray[np.float64],
-    lambdas: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> None:
+def matlab_path(dictionary: Array, observation: Array, lambdas: Array, weights: Array) -> None:
     """Weights of the LASSO for all λ as MATLAB's `lasso(T, ψ̂, 'Lambda', λ)` returns them, without the intercept.
 
     Parameters

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from starid.arrays import Array, Indices, Mask
 
 
 def boresight_error(
     ra_deg: ArrayLike, dec_deg: ArrayLike, true_ra_deg: ArrayLike, true_dec_deg: ArrayLike
-) -> NDArray[np.float64]:
+) -> Array:
     """Error of the boresight ε_f = ‖f − f̃‖, eq. 2.21, degrees of the flat plane, with α on the circle."""
     east = (np.asarray(ra_deg) - np.asarray(true_ra_deg) + 180.0) % 360.0 - 180.0
     north = np.asarray(dec_deg) - np.asarray(true_dec_deg)
     return np.asarray(np.hypot(east, north), dtype=np.float64)
 
 
-def rotation_error(angle_deg: ArrayLike, true_angle_deg: ArrayLike) -> NDArray[np.float64]:
+def rotation_error(angle_deg: ArrayLike, true_angle_deg: ArrayLike) -> Array:
     """Error of the rotation angle ε_θ = |θ − θ̃|, eq. 2.22, degrees on the circle, 0 … 180."""
     turn = (np.asarray(angle_deg) - np.asarray(true_angle_deg) + 180.0) % 360.0 - 180.0
     return np.asarray(np.abs(turn), dtype=np.float64)
 
 
-def error_colours(error: ArrayLike, greatest: float) -> NDArray[np.float64]:
+def error_colours(error: ArrayLike, greatest: float) -> Array:
     """Colours of an error map, eq. 6.1: from green at 0 to red at `greatest` and beyond, RGB 0 … 1, (…, 3)."""
     share = np.clip(np.asarray(error, dtype=np.float64) / greatest, 0.0, 1.0)
     return np.stack([share, 1.0 - share, np.zeros_like(share)], axis=-1)
@@ -48,22 +51,22 @@ class Confusion:
     true_negative: int = 0
 
     def __add__(self, other: Confusion) -> Confusion:
-        return Confusion(
-            self.true_positive + other.true_positive,
-            self.false_positive + other.false_positive,
-            self.false_negative + other.false_negative,
-            self.true_negative + other.true_negative,
-        )
+        return Confusion(*(int(count) for count in self.counts + other.counts))
+
+    @property
+    def counts(self) -> Indices:
+        """True positives, false positives, false negatives and true negatives, (4,)."""
+        return np.array(dataclasses.astuple(self), dtype=np.int64)
+
+    def percent(self, indicator: str) -> float:
+        """An indicator by its name, percent."""
+        return 100.0 * float(getattr(self, indicator))
 
     @classmethod
-    def of(cls, taken_for_true: NDArray[np.bool_], is_star: NDArray[np.bool_]) -> Confusion:
+    def of(cls, taken_for_true: Mask, is_star: Mask) -> Confusion:
         """Count one frame."""
-        return cls(
-            int(np.count_nonzero(taken_for_true & is_star)),
-            int(np.count_nonzero(taken_for_true & ~is_star)),
-            int(np.count_nonzero(~taken_for_true & is_star)),
-            int(np.count_nonzero(~taken_for_true & ~is_star)),
-        )
+        taken = (taken_for_true, ~taken_for_true)
+        return cls(*(int(np.count_nonzero(a & b)) for a in taken for b in (is_star, ~is_star)))
 
     @property
     def accuracy(self) -> float:

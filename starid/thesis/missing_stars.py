@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.cme import CameraMotion
 from starid.thesis.database import DatabaseError
 from starid.thesis.false_stars import FilterResult, ObservedFrame
@@ -115,7 +115,7 @@ class DividedField:
         self._lsi = lost_in_space
         self._agreement = agreement_deg
 
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> Array:
         """Centres of the circles, (9, 2) degrees: the middle and eight around it."""
         turns = np.arange(8) * (math.pi / 4.0)
         ring = self._offset * np.column_stack([np.cos(turns), np.sin(turns)])

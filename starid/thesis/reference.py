@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.thesis.database import FeatureDatabase
 from starid.thesis.false_stars import FilterResult, ObservedFrame
 from starid.thesis.features import FeatureVector
@@ -51,7 +51,7 @@ class ReferenceAnswer:
     theta_rad: float
     nearest: int
     distance: float
-    omega: NDArray[np.float64]
+    omega: Array
     penalty: float
     error_psi: float
 
@@ -72,9 +72,7 @@ class ReferenceSearch:
         self._cells = np.flatnonzero(database.theta != NO_STAR)
         self._tree: Any = NearestNeighbors().fit(database.features[self._cells] / CODES_PER_UNIT)
 
-    def nearest(
-        self, observation: NDArray[np.float64], count: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def nearest(self, observation: Array, count: int) -> tuple[Array, Indices]:
         """Distances of the nearest cells, growing, and these cells, (count,) each; ∞ and −1 beyond the last."""
         most = min(count, self._cells.size)
         found = self._tree.kneighbors(observation[None, :], n_neighbors=most)
@@ -82,7 +80,7 @@ class ReferenceSearch:
         distances[:most], cells[:most] = found[0][0], self._cells[found[1][0]]
         return distances, cells
 
-    def exact_nearest(self, observation: NDArray[np.float64]) -> tuple[int, float]:
+    def exact_nearest(self, observation: Array) -> tuple[int, float]:
         """Cell nearest in full precision and its distance, eqs 2.12 and 2.29, of those whose codes leave it open."""
         distances, _ = self.nearest(observation, 1)
         # a code is off by half a step at most in each of five features: so are both distances that are compared
@@ -95,9 +93,7 @@ class ReferenceSearch:
         return int(cells[best]), float(exact[best])
 
 
-def reference_path(
-    dictionary: NDArray[np.float64], observation: NDArray[np.float64], *, intercept: bool = False
-) -> NDArray[np.float64]:
+def reference_path(dictionary: Array, observation: Array, *, intercept: bool = False) -> Array:
     """Weights ω of eq. 2.34 for each λ of `LAMBDAS`, (k, 9), by scikit-learn's coordinate descent.
 
     Columns that are nearly alike keep it from the last digit of the minimum; its warning of that is not passed on.
@@ -173,9 +169,7 @@ class ReferenceLostInSpace:
             float(np.linalg.norm(observation - dictionary @ omega)),  # eq. 2.20
         )
 
-    def regularise(
-        self, dictionary: NDArray[np.float64], observation: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], float]:
+    def regularise(self, dictionary: Array, observation: Array) -> tuple[Array, float]:
         """ω of least mean squared error among the λ of eq. 2.34, (9,), and its λ."""
         path = reference_path(dictionary, observation, intercept=self.intercept)
         residuals = observation - path @ dictionary.T
@@ -227,7 +221,7 @@ class ReferenceFilter:
         )
 
 
-def _pairs(frame: ObservedFrame) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _pairs(frame: ObservedFrame) -> tuple[Array, Indices]:
     """Mean brightness, separation and slope of all pairs, eqs 3.3 to 3.6, (n, 3), and their objects, (n, 2)."""
     i, j = np.triu_indices(len(frame), 1)
     away = frame.positions[j] - frame.positions[i]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Mask
 from starid.errors import StaridError
 from starid.thesis.cme import CameraMotion, MotionModel, estimate_motion
 from starid.thesis.false_stars import FalseStarFilter, FilterError, ObservedFrame
@@ -113,7 +113,7 @@ class RsiStep:
     region_deg: float
     region_cells: int
     motion: CameraMotion | None
-    true_stars: NDArray[np.bool_]
+    true_stars: Mask
     search_s: float
     lasso_s: float
 
@@ -132,7 +132,7 @@ def region_cells(side_deg: float, fov_deg: float, overlap: float) -> float:
     return (side_deg / (fov_deg * (1.0 - overlap))) ** 2
 
 
-def correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> tuple[float, float]:
+def correlation(first: Array, second: Array) -> tuple[float, float]:
     """Correlation coefficient ρ(μ_d, σ_d) of eq. 4.2, and the probability of as much by chance."""
     from scipy.stats import pearsonr
 
@@ -263,7 +263,7 @@ class RecursiveIdentification:
         return voted, place.roll_deg
 
     def _whole_database(
-        self, observation: NDArray[np.float64], angle: float, solution: LsiSolution
+        self, observation: Array, angle: float, solution: LsiSolution
     ) -> tuple[LsiSolution, float, float]:
         start = time.perf_counter()
         cell, distance = self._lsi.nearest(observation, theta_rad=angle)
@@ -273,7 +273,7 @@ class RecursiveIdentification:
         better = other if other.mse.error_psi < solution.mse.error_psi else solution
         return better, found - start, solved - found
 
-    def _filtered(self, frame: ObservedFrame) -> tuple[NDArray[np.bool_], CameraMotion | None]:
+    def _filtered(self, frame: ObservedFrame) -> tuple[Mask, CameraMotion | None]:
         """Which objects are stars, and how they moved; without a frame before, or matches, all and None."""
         everything = np.ones(len(frame), dtype=np.bool_)
         if self._before is None or self._filter is None:
@@ -292,14 +292,14 @@ class RecursiveIdentification:
             return everything, None
         return result.true_now, motion
 
-    def _features(self, frame: ObservedFrame, chosen: NDArray[np.bool_]) -> FeatureVector | None:
+    def _features(self, frame: ObservedFrame, chosen: Mask) -> FeatureVector | None:
         inside = chosen & (np.sum(frame.positions**2, axis=1) <= self._radius**2)
         if not inside.any():
             return None
         return extract_features(frame.brightness[inside], frame.positions[inside])
 
 
-def _empty_step(true_stars: NDArray[np.bool_], motion: CameraMotion | None) -> RsiStep:
+def _empty_step(true_stars: Mask, motion: CameraMotion | None) -> RsiStep:
     return RsiStep(
         estimate=None,
         roll_deg=math.nan,

@@ -8,26 +8,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.errors import StaridError
+from starid.single_camera import Measured, SingleCameraIdentifier
 from starid.solution import Reason, Solution
-from starid.solver_input import checked_detections
-from starid.thesis.cme import estimate_motion
-from starid.thesis.false_stars import FilterError, ObservedFrame
-from starid.thesis.lsi_identifier import FieldStars, LsiIdentifier, LsiOptions
+from starid.thesis.cme import matched_motion
+from starid.thesis.false_stars import ObservedFrame
+from starid.thesis.lsi_identifier import WINDOW_PX, FieldStars, LsiIdentifier, LsiOptions
 from starid.thesis.rsi import RsiSettings, region_side
 from starid.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings
 
-_WINDOW_PX: Final = 12.0
 _FEWEST_MATCHES: Final = 3
 _SPOT_DEG: Final = 1.0
 
@@ -79,7 +76,7 @@ class RsiOptions(LsiOptions):
     position_sigma_px: float = 0.5
 
 
-class RsiIdentifier:
+class RsiIdentifier(SingleCameraIdentifier):
     """Star identification by the recursive algorithm, for one camera against one catalogue.
 
     Parameters
@@ -101,6 +98,7 @@ class RsiIdentifier:
     ) -> None:
         options = dataclasses.replace(options or RsiOptions(), **changes)
         self.lsi = LsiIdentifier(camera, catalog, options)
+        super().__init__(camera, self.lsi.catalog)
         self._settings = RsiSettings(gamma_min_deg=options.gamma_min_deg, gamma_scale=options.gamma_scale)
         scale = math.degrees(1.0 / camera.focal_px[0])
         half_field = 0.5 * self.lsi.database.parameters.fov_deg
@@ -118,16 +116,6 @@ class RsiIdentifier:
         )
         self._before: ObservedFrame | None = None
         self.statistics = RsiStatistics()
-
-    @property
-    def camera(self) -> Camera:
-        """The camera that the positions belong to."""
-        return self.lsi.camera
-
-    @property
-    def catalog(self) -> StarCatalog:
-        """The catalogue that `Solution.catalog_index` counts in."""
-        return self.lsi.catalog
 
     @property
     def database_bytes(self) -> int:
@@ -150,66 +138,33 @@ class RsiIdentifier:
             self._filter.reset()
         self.statistics = RsiStatistics()
 
-    def identify(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
-        """Lost in space, by the LSI algorithm.
+    def _identify(self, measured: Measured) -> Solution:
+        self._follow(measured.xy, measured.flux)
+        return self._whole_sky(measured)
 
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            As in `LsiIdentifier.identify`.
-        """
-        xy, brightness, _ = checked_detections(xy_px, flux)
-        self._follow(xy, brightness)
-        return self.lsi.identify(xy, brightness, xy_sigma_px, observer_velocity=observer_velocity)
+    def _whole_sky(self, measured: Measured) -> Solution:
+        """Answer of the LSI algorithm."""
+        return self.lsi.identify(
+            measured.xy,
+            measured.flux,
+            measured.given_sigmas,
+            observer_velocity=measured.observer_velocity,
+        )
 
-    def track(
-        self,
-        xy_px: ArrayLike,
-        flux: ArrayLike,
-        predicted: Attitude | ArrayLike,
-        xy_sigma_px: ArrayLike | None = None,
-        *,
-        window_px: float | None = None,
-        observer_velocity: ArrayLike | None = None,
-    ) -> Solution:
+    def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
         """Attitude from the region of search about a predicted one, or from the whole sky if that fails.
 
-        A prediction serves to place the region; neither its roll nor what it is off by within the region matters.
-
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            As in `LsiIdentifier.identify`.
-        predicted
-            Attitude expected, or its scalar-last quaternion.
-        window_px
-            Where it is wider than the region, the region is widened to it, up to the field of view.
-
-        Raises
-        ------
-        StaridError
-            The arrays do not fit each other, or a value is not finite or out of its range.
+        A prediction serves to place the region; neither its roll nor what it is off by within the region matters. Where the
+        window is wider than the region, the region is widened to it, up to the field of view.
         """
-        begin = time.perf_counter()
-        xy, brightness, _ = checked_detections(xy_px, flux)
-        if window_px is not None and not 0.0 < window_px < math.inf:
-            raise StaridError(f"tracking window_px: must be a positive number of pixels, not {window_px}")
-        attitude = predicted if isinstance(predicted, Attitude) else Attitude.from_quaternion(predicted)
-        true_stars, side = self._follow(xy, brightness)
+        true_stars, side = self._follow(measured.xy, measured.flux)
         if window_px is not None:
             side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
-        solution = self._in_region(xy, brightness, true_stars, attitude, side, xy_sigma_px, observer_velocity)
+        solution = self._in_region(measured, true_stars, predicted, side)
         triggered = not solution.valid
         if triggered:
-            solution = self.lsi.identify(xy, brightness, xy_sigma_px, observer_velocity=observer_velocity)
+            solution = self._whole_sky(measured)
         old = self.statistics
         self.statistics = RsiStatistics(
             old.frames + 1,
@@ -218,9 +173,9 @@ class RsiIdentifier:
             old.invalid + (not solution.valid),
             old.region_sum_deg + side,
         )
-        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+        return solution
 
-    def _follow(self, xy: NDArray[np.float64], flux: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float]:
+    def _follow(self, xy: Array, flux: Array) -> tuple[Mask, float]:
         """Which detections are stars, as far as the previous frames show, and the side of the region of search."""
         everything = np.ones(flux.size, dtype=np.bool_)
         if self._filter is None:
@@ -237,11 +192,8 @@ class RsiIdentifier:
         result = self._filter(before, frame)
         if result.matches.shape[0] < _FEWEST_MATCHES:
             return everything, self._settings.gamma_min_deg
-        try:
-            motion = estimate_motion(
-                before.positions[result.matches[:, 0]], frame.positions[result.matches[:, 1]]
-            )
-        except FilterError:
+        motion = matched_motion(before, frame, result.matches)
+        if motion is None:
             return everything, self._settings.gamma_min_deg
         true_stars = np.zeros(flux.size, dtype=np.bool_)
         true_stars[usable] = result.true_now
@@ -249,21 +201,14 @@ class RsiIdentifier:
         return true_stars, side
 
     def _in_region(
-        self,
-        xy: NDArray[np.float64],
-        flux: NDArray[np.float64],
-        true_stars: NDArray[np.bool_],
-        predicted: Attitude,
-        side_deg: float,
-        xy_sigma_px: ArrayLike | None,
-        observer_velocity: ArrayLike | None,
+        self, measured: Measured, true_stars: Mask, predicted: Attitude, side_deg: float
     ) -> Solution:
         """Verified answer from the cells of the region, the likeliest first."""
         lsi = self.lsi
         zero_point = lsi.zero_point
         if zero_point is None:
             return Solution.invalid(Reason.NO_MATCH, mode="tracking")
-        field = lsi.field_stars(xy, flux, zero_point)
+        field = lsi.field_stars(measured.xy, measured.flux, zero_point)
         trusted = true_stars[field.row]
         chosen = FieldStars(field.place[trusted], field.magnitude[trusted], field.row[trusted])
         features = lsi.features(chosen)
@@ -280,16 +225,14 @@ class RsiIdentifier:
         for attitude, _ in lsi.attitudes(chosen, places):
             if attitude is None:
                 continue
-            solution = lsi.verifier.verify(
-                xy, flux, attitude, xy_sigma_px, window_px=_WINDOW_PX, observer_velocity=observer_velocity
-            )
+            solution = lsi.verify(measured, attitude, WINDOW_PX)
             if solution.valid:
-                lsi.learn(solution, flux)
+                lsi.learn(solution, measured.flux)
                 return dataclasses.replace(solution, mode="tracking")
         return Solution.invalid(Reason.NO_MATCH, mode="tracking")
 
 
-def _spots(predicted: Attitude, side_deg: float) -> NDArray[np.float64]:
+def _spots(predicted: Attitude, side_deg: float) -> Array:
     """Boresights (k, 2) in degrees that cover the region, from its middle outwards."""
     steps = math.ceil(0.5 * side_deg / _SPOT_DEG)
     offsets = np.linspace(-0.5 * side_deg, 0.5 * side_deg, 2 * steps + 1)

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.cme import CameraMotion
 
 _RA, _DEC, _ROLL, _TURN, _X, _Y = range(6)
@@ -98,6 +98,6 @@ class AnswerMemory:
         )
 
 
-def _wrapped(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrapped(angle_deg: Array) -> Array:
     """Angles into −180 … 180 degrees."""
     return np.asarray((angle_deg + 180.0) % 360.0 - 180.0, dtype=np.float64)

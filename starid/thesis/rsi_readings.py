@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from starid.arrays import Array
 
 
 def side_as_printed(mean_distance_deg: float, sigma_distance_deg: float, gamma_min_deg: float) -> float:
@@ -16,7 +17,7 @@ def side_as_printed(mean_distance_deg: float, sigma_distance_deg: float, gamma_m
     return gamma_min_deg + power * sigma_distance_deg * mean_distance_deg
 
 
-def nearest_distances(transformed: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
+def nearest_distances(transformed: Array, seen: Array) -> Array:
     """Distance of each transformed object, (n, 2), to the nearest that is seen, (m, 2): the "min" in the definition of the distances."""
     from scipy.spatial import cKDTree
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.thesis.cme import rigid_fit
 from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 from starid.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
@@ -91,9 +91,9 @@ class TrackResult:
         Motion of the stars since the frame before: cosine, sine, shift x, shift y (degrees); None without one.
     """
 
-    true_now: NDArray[np.bool_]
-    track: NDArray[np.int64]
-    motion: NDArray[np.float64] | None
+    true_now: Mask
+    track: Indices
+    motion: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,18 +104,18 @@ class _Tracks:
     move with the stars, and Σu, Σv, Σ(u² + v²) in those of the sensor.
     """
 
-    number: NDArray[np.int64]
-    position: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    brightness: NDArray[np.float64]
-    seen: NDArray[np.int64]
-    missed: NDArray[np.int64]
-    sums: NDArray[np.float64]
+    number: Indices
+    position: Array
+    variance: Array
+    brightness: Array
+    seen: Indices
+    missed: Indices
+    sums: Array
 
     def __len__(self) -> int:
         return int(self.number.size)
 
-    def kept(self, mask: NDArray[np.bool_]) -> _Tracks:
+    def kept(self, mask: Mask) -> _Tracks:
         return _Tracks(
             self.number[mask],
             self.position[mask],
@@ -219,7 +219,7 @@ class TrackFilter:
         self._suspect = np.concatenate([wandering[keep], np.zeros(len(fresh), dtype=np.bool_)])
         return TrackResult(true_now, number, motion)
 
-    def _new_tracks(self, positions: NDArray[np.float64], brightness: NDArray[np.float64]) -> _Tracks:
+    def _new_tracks(self, positions: Array, brightness: Array) -> _Tracks:
         n = brightness.size
         number = np.arange(self._next_number, self._next_number + n, dtype=np.int64)
         self._next_number += n
@@ -235,18 +235,14 @@ class TrackFilter:
         self._add_to_sums(tracks.sums, np.arange(n), positions)
         return tracks
 
-    def _add_to_sums(
-        self, sums: NDArray[np.float64], which: NDArray[np.int64], positions: NDArray[np.float64]
-    ) -> None:
+    def _add_to_sums(self, sums: Array, which: Indices, positions: Array) -> None:
         x, y = _moved_back(positions, self._anchor).T
         u, v = positions.T
         t = np.full(x.size, float(self._frame))
         terms = [np.ones_like(t), t, t * t, x, y, x * x + y * y, t * x, t * y, u, v, u * u + v * v]
         sums[which] += np.column_stack(terms)
 
-    def _find_motion(
-        self, positions: NDArray[np.float64], brightness: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
+    def _find_motion(self, positions: Array, brightness: Array) -> Array | None:
         """Motion since the frame before, from the objects seen most often and the brightest; None if none fits."""
         tracks, settings = self._tracks, self.settings
         if len(tracks) < _LEAST_OBJECTS or brightness.size < _LEAST_OBJECTS:
@@ -267,9 +263,7 @@ class TrackFilter:
         )
         return motion if score >= _LEAST_SCORE else None
 
-    def _associate(
-        self, positions: NDArray[np.float64], brightness: NDArray[np.float64], motion: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
+    def _associate(self, positions: Array, brightness: Array, motion: Array) -> Indices:
         """Match tracks and objects and refine the motion in place; the object of each track, −1 for none."""
         tracks, settings = self._tracks, self.settings
         partner = np.empty(len(tracks), dtype=np.int64)
@@ -302,13 +296,7 @@ class TrackFilter:
                 error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
         return partner
 
-    def _follow(
-        self,
-        positions: NDArray[np.float64],
-        brightness: NDArray[np.float64],
-        partner: NDArray[np.int64],
-        motion: NDArray[np.float64],
-    ) -> None:
+    def _follow(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
         """Move all tracks with the stars and bring the matched ones up to date."""
         old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
         which = np.flatnonzero(partner >= 0)
@@ -327,7 +315,7 @@ class TrackFilter:
         self._add_to_sums(sums, which, positions[objects])
         self._tracks = _Tracks(old.number, position, variance, magnitude, seen, missed, sums)
 
-    def _wandering(self) -> NDArray[np.bool_]:
+    def _wandering(self) -> Mask:
         """Which tracks are explained better as fixed on the sensor or as drifting than as stars.
 
         Each of the three explanations leaves a sum of squared distances; their differences, in units of the usual
@@ -352,20 +340,20 @@ class TrackFilter:
         return result
 
 
-def _moved(positions: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+def _moved(positions: Array, motion: Array) -> Array:
     c, s, x, y = motion
     return np.column_stack(
         [c * positions[:, 0] - s * positions[:, 1] + x, s * positions[:, 0] + c * positions[:, 1] + y]
     )
 
 
-def _moved_back(positions: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+def _moved_back(positions: Array, motion: Array) -> Array:
     c, s, x, y = motion
     u, v = positions[:, 0] - x, positions[:, 1] - y
     return np.column_stack([c * u + s * v, c * v - s * u])
 
 
-def _composed(second: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
+def _composed(second: Array, first: Array) -> Array:
     """Motion `first` followed by `second`."""
     c, s = second[0] * first[0] - second[1] * first[1], second[1] * first[0] + second[0] * first[1]
     x = second[0] * first[2] - second[1] * first[3] + second[2]

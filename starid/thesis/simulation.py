@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices, Mask
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.frame_sky import FrameSky, SkyError
 
@@ -93,26 +93,22 @@ class SimulatedFrame:
     """
 
     observed: ObservedFrame
-    identity: NDArray[np.int64]
+    identity: Indices
     right_ascension_deg: float
     declination_deg: float
     roll_deg: float
-    shift_deg: NDArray[np.float64]
+    shift_deg: Array
     rotation_deg: float
 
     @property
-    def is_star(self) -> NDArray[np.bool_]:
+    def is_star(self) -> Mask:
         """Which objects are true stars."""
         return self.identity >= 0
 
 
 def add_noise(
-    rng: np.random.Generator,
-    brightness: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    noise: NoiseModel,
-    radius_deg: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    rng: np.random.Generator, brightness: Array, positions: Array, noise: NoiseModel, radius_deg: float
+) -> tuple[Array, Array, Indices]:
     """Noise of a frame: brightness, positions and identity (star's number, −1 for a false star) of its objects.
 
     A star that is in the frame stays in the list however far noise moves it, as in the published experiments.
@@ -153,8 +149,8 @@ def add_noise(
 
 def moved_frames(
     rng: np.random.Generator,
-    brightness: NDArray[np.float64],
-    positions: NDArray[np.float64],
+    brightness: Array,
+    positions: Array,
     noise: NoiseModel,
     *,
     count: int,
@@ -271,7 +267,7 @@ def sky_sequence(
         )
 
 
-def turned(positions: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]:
+def turned(positions: Array, angle_deg: float) -> Array:
     """Positions (n, 2) turned counter-clockwise about the centre."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.asarray(positions @ np.array([[c, s], [-s, c]]), dtype=np.float64)

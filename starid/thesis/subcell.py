@@ -13,13 +13,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array, Indices
 from starid.jit import compiled
 from starid.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
 from starid.thesis.database import DatabaseError
 from starid.thesis.features import FeatureVector
-from starid.thesis.frame_grid import cell_row
+from starid.thesis.frame_grid import cell_place
 from starid.thesis.frame_sky import HALF_WIDTH, cell_features, stars_near
 from starid.thesis.lsi import LostInSpace
 
@@ -35,15 +35,10 @@ _NO_STARS = np.empty((0, 2))
 
 @compiled
 def _residual(
-    arrays: CellArrays,
-    observation: NDArray[np.float64],
-    ra: float,
-    dec: float,
-    sums: NDArray[np.float64],
-    vector: NDArray[np.float64],
+    arrays: CellArrays, observation: Array, ra: float, dec: float, sums: Array, vector: Array
 ) -> float:
     """Write the normalised features at (ra, dec) less the observation to `vector`; return the squared length."""
-    cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, sums, vector)
+    cell_features(arrays.sky, ra % 360.0, dec, sums, vector)
     total = 0.0
     for f in range(5):
         vector[f] = (vector[f] - arrays.minimum[f]) * arrays.scale[f] - observation[f]
@@ -53,12 +48,7 @@ def _residual(
 
 @compiled
 def newton_from(
-    arrays: CellArrays,
-    observation: NDArray[np.float64],
-    ra: float,
-    dec: float,
-    reach_deg: float,
-    place: NDArray[np.float64],
+    arrays: CellArrays, observation: Array, ra: float, dec: float, reach_deg: float, place: Array
 ) -> float:
     """Improve a boresight until r and σ_r agree; return the squared residual of all five features at the best place.
 
@@ -85,7 +75,7 @@ def newton_from(
             place[0] = a
             place[1] = d
         widen = 1.0
-        if arrays.frame[0] > 0.5:
+        if arrays.sky.frame[0] > 0.5:
             widen = 1.0 / max(math.cos(math.radians(d)), 1e-3)
         _residual(arrays, observation, a + _DIFFERENCE_DEG * widen, d, sums, east)
         east_stars = sums[0]
@@ -131,13 +121,7 @@ def newton_from(
 
 @compiled
 def share_seen(
-    arrays: CellArrays,
-    positions: NDArray[np.float64],
-    theta: float,
-    ra: float,
-    dec: float,
-    found: NDArray[np.float64],
-    rows: NDArray[np.int64],
+    arrays: CellArrays, positions: Array, theta: float, ra: float, dec: float, found: Array, rows: Indices
 ) -> float:
     """Share of the observed stars that the catalogue has within 0.75 % of the frame's half width, from a place.
 
@@ -150,12 +134,12 @@ def share_seen(
     found, rows
         Work space for `stars_near`.
     """
-    count = stars_near(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, 0.0, found, rows)
+    count = stars_near(arrays.sky, ra % 360.0, dec, 0.0, found, rows)
     sums = np.empty(8)
     vector = np.empty(5)
-    turn = theta - cell_features(arrays.stars, arrays.bin_start, arrays.frame, ra % 360.0, dec, sums, vector)
+    turn = theta - cell_features(arrays.sky, ra % 360.0, dec, sums, vector)
     c, s = math.cos(turn), math.sin(turn)
-    limit = (_NEAR * arrays.frame[HALF_WIDTH]) ** 2
+    limit = (_NEAR * arrays.sky.frame[HALF_WIDTH]) ** 2
     seen = 0
     for i in range(positions.shape[0]):
         x = c * positions[i, 0] + s * positions[i, 1]
@@ -171,13 +155,13 @@ def share_seen(
 def subcell_kernel(
     index: CellIndex,
     arrays: CellArrays,
-    observation: NDArray[np.float64],
-    positions: NDArray[np.float64],
+    observation: Array,
+    positions: Array,
     theta: float,
     reach_deg: float,
-    distances: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    answer: NDArray[np.float64],
+    distances: Array,
+    cells: Indices,
+    answer: Array,
 ) -> int:
     """Try the neighbours from the nearest outwards; return how many starts were made.
 
@@ -204,10 +188,8 @@ def subcell_kernel(
         cell = first if turn < 0 else cells[order[turn]]
         if cell < 0:
             continue
-        row = cell_row(arrays.row_start, cell)
-        dec = arrays.row_dec[row]
-        ra = arrays.first_ra + (cell - arrays.row_start[row]) * arrays.row_ra_step[row]
-        narrow = math.cos(math.radians(dec)) if arrays.frame[0] > 0.5 else 1.0
+        ra, dec = cell_place(arrays.grid, cell)
+        narrow = math.cos(math.radians(dec)) if arrays.sky.frame[0] > 0.5 else 1.0
         known = False
         for i in range(starts):
             gap = (ra - places[i, 0] + 180.0) % 360.0 - 180.0
@@ -229,9 +211,7 @@ def subcell_kernel(
     if starts > 0:
         sums = np.empty(8)
         vector = np.empty(5)
-        answer[2] = cell_features(
-            arrays.stars, arrays.bin_start, arrays.frame, answer[0], answer[1], sums, vector
-        )
+        answer[2] = cell_features(arrays.sky, answer[0], answer[1], sums, vector)
         answer[3] = math.sqrt(best)
         answer[4] = most
     return starts
@@ -284,7 +264,7 @@ class SubcellSearch:
         self._reach = reach_steps * lost_in_space.database.grid.step_deg
         self._neighbours = neighbours
 
-    def solve(self, features: FeatureVector, positions: NDArray[np.float64] | None = None) -> FineEstimate:
+    def solve(self, features: FeatureVector, positions: Array | None = None) -> FineEstimate:
         """Boresight from the features of one frame.
 
         Parameters

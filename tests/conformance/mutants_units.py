@@ -128,7 +128,7 @@ def any_address(unit: SimulatedUnit) -> None:
 def any_class(unit: SimulatedUnit) -> None:
     """Take an unknown class for that of telemetry."""
     stack = stack_of(unit)
-    names = stack.classes._requests
+    names = stack.classes.requests
     for code in range(256):
         names.setdefault(code, "telemetry")
 

@@ -12,7 +12,7 @@ import pytest
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.images import decode_bmp
-from starhil.hil_tests.png import encode_png, write_png
+from starhil.hil_tests.png import write_png
 from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
 from starhil.hil_tests.truth_log import TruthLogReader
@@ -32,9 +32,9 @@ def test_an_image_is_read_back_by_opencv_pixel_for_pixel(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_an_image_of_another_size_is_rejected():
+def test_an_image_of_another_size_is_rejected(tmp_path):
     with pytest.raises(BenchError, match="4096 bytes, not 10"):
-        encode_png(bytes(10), 64, 64)
+        write_png(tmp_path / "a.png", bytes(10), 64, 64)
 
 
 @pytest.mark.parametrize("width", [64, 61])

@@ -6,7 +6,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
 
 FAST_BAUD = 921600
@@ -20,7 +20,7 @@ needs_vcan0 = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def bus():
     """A CAN bus of the module's own: vcan0 or a hub."""
-    with PrivateCanBus() as channel:
+    with private_can_bus() as channel:
         yield channel
 
 

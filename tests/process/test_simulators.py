@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 from tests.emulator.truth.simulators import blocks_of_42
 
 pytestmark = pytest.mark.process
@@ -129,7 +129,7 @@ def test_two_heads_on_one_bus(tmp_path):
     write_files(tmp_path, "first.toml", "second.toml")
     control = tmp_path / "control"
     heads = ["--head", str(tmp_path / "first.toml"), "--head", str(tmp_path / "second.toml")]
-    with PrivateCanBus() as bus:
+    with private_can_bus() as bus:
         command = emulator_command(serial="off", can=bus, extra=[*heads, "--control", f"unix:{control}"])
         with EmulatorProcess(command) as emulator:
             assert emulator.ready["can.2"] == emulator.ready["can"] == bus

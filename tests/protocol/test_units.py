@@ -53,6 +53,12 @@ CODED = [
      {"x_1": 1, "y_1": 2, "x_2": 3, "y_2": 4}, "01 02 00 03 04 00"),
     ("constant", HEAD, '{ name = "a", type = "u16", const = 0xBEEF }', {"a": 0xBEEF}, "EF BE"),
     ("map", HEAD, '{ name = "a", type = "u8", map = { "7" = "on", "0x10" = "off" } }', {"a": "off"}, "10"),
+    ("fields in a text", HEAD, '"i16 mag{0,1}_{x,y} uT 0.01", "u8 -", "u8 css{8..10}"',
+     {"mag0_x": 0.01, "mag0_y": 0.02, "mag1_x": 0.03, "mag1_y": 0.04, "css8": 5, "css9": 6, "css10": 7}, "01 00 02 00 03 00 04 00 00 05 06 07"),
+    ("bits in a text", HEAD, '"bits a:4 b{0..2} - c:2", "bytes d 2", "text e 3"',
+     {"a": 5, "b0": True, "b1": False, "b2": True, "c": 3, "d": b"12", "e": "xy"}, "55 03 31 32 78 79 00"),
+    ("group of texts from 0 on", HEAD, '{ repeat = { count = 2, first = 0, fields = ["u8 {x,y}"] } }',
+     {"x_0": 1, "y_0": 2, "x_1": 3, "y_1": 4}, "01 02 03 04"),
     ("filler", HEAD, '{ name = "a", type = "u8" }, { type = "u32" }, { name = "b", type = "u8" }', {"a": 1, "b": 2}, "01 00 00 00 00 02"),
 ]  # fmt: skip
 
@@ -153,6 +159,15 @@ INVALID = [
     ("id that the link cannot carry", telemetry("", number=256), "id 256 is above 255"),
     ("unknown parameter", '[[parameter]]\nid = 1\nname = "exposur"\n', "the device has no parameter of this name; did you mean exposure"),
     ("map that is no number", telemetry('{ name = "a", type = "u8", map = { one = "on" } }'), "'one' is not a number on the wire"),
+    ("text without a name", telemetry('"u16"'), "row: field 'u16': needs a type and a name"),
+    ("type in a text", telemetry('"u17 a"'), "row: field 'u17 a': type: Input should be 'u8'"),
+    ("scale in a text", telemetry('"u16 a s 1,5"'), "field 'u16 a s 1,5': scale: '1,5' is not a number"),
+    ("too much in a text", telemetry('"bytes a 5 s"'), "field 'bytes a 5 s': after the name comes size at most"),
+    ("bits across bytes in a text", telemetry('"bits a:5 b:4"'), "field 'bits a:5 b:4': b: 4 bits do not fit the 3 that its byte has left"),
+    ("no end of fields in a text", telemetry('"u8 a{0..9999999999}"'), "must be 1 to 256 fields"),
+    ("readback of another name", telecommand("", more="readback = 1"), "command: a telecommand with a readback is named set_…"),
+    ("readback of telemetry", telemetry("", more="readback = 1"), "row: only telecommands have an action or a readback"),
+    ("no provenance", telemetry("").replace('provenance = "ours"', ""), "row: needs `provenance`, here or in \\[unit\\]"),
     ("no plugin", 'plugin = "unit.py"\n', "no such plugin"),
 ]  # fmt: skip
 
@@ -190,6 +205,65 @@ def test_rows_that_are_bound_to_nothing_cannot_be_emulated(unit, tmp_path):
     command, row = check_unit(tmp_path)
     assert "telecommand command: no `action`" in command
     assert "telemetry row: field a: no `value`" in row
+
+
+def test_a_row_may_send_zeros_on_purpose(unit, tmp_path):
+    icd = unit(
+        HEAD + telemetry('"u8 {a,b}", { name = "c", type = "u8", const = 7 }', more='unbound = "zeros"')
+    )
+    assert check_unit(tmp_path) == []
+    assert icd.telemetry["row"].encode() == b"\0\0\7"
+
+
+def test_a_readback_reports_the_fields_of_its_telecommand(unit):
+    head = HEAD + 'provenance = "confirmed"\nsource = "s"\n'
+    text = telecommand('"u8 a", "f32 b deg"', more="readback = 8").replace("command", "set_thing")
+    icd = unit(head + text.replace("[[teleset_thing]]", "[[telecommand]]").replace('provenance = "ours"', ""))
+    row = icd.telemetry["thing"]
+    assert (row.id, row.provenance, row.source) == (8, "confirmed", "s")
+    assert {name: field.telecommand for name, field in row.named_fields.items()} == dict.fromkeys(
+        "ab", "set_thing"
+    )
+
+
+GENERATION_2 = {
+    "telecommand": "1:1 2:8 5:0 7:0 40:4 42:5 43:2 46:13 47:12 48:12 49:33 50:13 51:1 52:1 54:12 55:6 56:20 57:1 58:3 59:62 60:64 61:42 "
+    "62:98 63:24 64:4 65:104 66:24 67:40 68:64 69:8 70:20 71:2 72:1 73:277 74:16 76:12 77:1 78:258 79:2 80:141 99:1 111:120 112:17 "
+    "114:6 115:11 116:2 117:23 120:20 122:1",
+    "telemetry": "128:8 129:70 131:8 133:8 134:6 135:32 136:22 137:3 138:4 139:16 140:21 149:4 150:5 153:82 154:194 155:13 156:12 157:12 "
+    "158:8 159:36 160:28 161:13 162:1 163:1 164:107 165:34 166:18 167:30 168:44 169:49 170:33 171:57 172:115 173:71 174:85 175:41 "
+    "176:21 177:21 178:33 179:21 180:21 181:12 182:6 183:20 184:1 185:3 186:62 187:64 188:13 189:42 190:98 191:24 192:4 193:104 "
+    "194:24 195:40 196:64 197:8 198:20 199:2 200:1 201:277 202:16 203:19 204:33 205:25 206:15 207:57 208:81 209:33 210:71 211:36 "
+    "212:52 213:134 214:26 215:12 216:40 217:20 218:32 219:258 220:4 221:1 225:44 226:53 227:10 228:17 229:1 230:24 231:14 232:15 "
+    "233:2 234:19 235:41 236:38 237:10 238:72 239:120 240:65 241:141 242:105 243:26 244:64",
+}
+"""Identifiers and bytes of all rows in the public driver: COMMAND_SPECS, ADDITIONAL_COMMAND_SPECS and TELEMETRY_SPECS."""
+
+
+def test_generation_2_has_every_row_of_its_public_source():
+    icd = load_unit("cubestar-gen2")
+    for kind, rows in GENERATION_2.items():
+        public = {(int(row), int(size)) for row, size in (item.split(":") for item in rows.split())}
+        assert {(row.id, row.size) for row in icd.rows if row.kind == kind} == public
+
+
+PLACES = {
+    ("set_simulated_sensors", "str1_measured_2_z"): (1192, 16), ("set_simulated_sensors", "gnss_new"): (2206, 1),
+    ("set_mounting", "str0_alpha"): (592, 16), ("set_mounting", "ext_gyr1_axis3"): (824, 8),
+    ("set_estimator_configuration", "triad_2"): (312, 4), ("event_log_transfer", "ext_sensor1"): (156, 1),
+    ("auriga_raw", "rate_1_1"): (1304, 32), ("auriga_health", "last_error_1"): (640, 8), ("pst3s_raw", "saa_mode_1"): (1028, 4),
+    ("hil", "fmc_stage"): (852, 4), ("controller", "mtq0_dipole"): (688, 16), ("models", "orbit_source"): (676, 2),
+    ("nss_wheel_raw", "rwl2_high_command_error"): (409, 1), ("litef_raw", "axis2_no_go_1"): (287, 1),
+    ("port_diagnostics", "sensor_serial_error_3"): (155, 1), ("node_states", "str0"): (56, 4), ("file_information", "owner_program"): (832, 8),
+}  # fmt: skip
+"""Bit offset and bits of some fields there, one from each part of the longest rows."""
+
+
+@pytest.mark.parametrize(("row", "name"), PLACES)
+def test_fields_of_generation_2_are_where_the_public_driver_reads_them(row, name):
+    icd = load_unit("cubestar-gen2")
+    field = (icd.telemetry if row in icd.telemetry else icd.telecommands)[row].named_fields[name]
+    assert (8 * field.offset + field.shift, field.width or 8 * field.size) == PLACES[row, name]
 
 
 def test_units_of_measure_are_converted_within_a_kind():

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
+from starhil.protocol.checks import reversed_bits
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header, HeaderField
 from starhil.protocol.export.row_key import row_key
@@ -84,12 +85,9 @@ class _Writer:
         }
         match stack.link.framing:
             case SlipFraming() as model:
-                pair = model.substitutes or (0xDC, 0xDD)
-                if model.xor is not None:
-                    pair = (model.end ^ model.xor, model.escape ^ model.xor)
                 macros = {
-                    "END_BYTE": model.end, "ESCAPE": model.escape, "ESCAPED_END": pair[0], "ESCAPED_ESCAPE": pair[1],
-                    "LEADING_END": int(model.leading_end),
+                    "END_BYTE": model.end, "ESCAPE": model.escape, "ESCAPED_END": model.escaped[0],
+                    "ESCAPED_ESCAPE": model.escaped[1], "LEADING_END": int(model.leading_end),
                 }  # fmt: skip
             case EscapedFraming() as model:
                 macros = {"ESCAPE": model.escape, "START_BYTE": model.start, "END_BYTE": model.end}
@@ -102,7 +100,7 @@ class _Writer:
             poly = stack.link.check.poly
             macros |= {
                 "CRC_BITS": bits, "CRC_MASK": (1 << bits) - 1, "CRC_REFLECTED": int(stack.link.check.reflect),
-                "CRC_POLYNOMIAL": _reversed(poly, bits) if stack.link.check.reflect else poly,
+                "CRC_POLYNOMIAL": reversed_bits(poly, bits) if stack.link.check.reflect else poly,
             }  # fmt: skip
         return found | {name: f"#define {name} {_number(value)}" for name, value in macros.items()}
 
@@ -241,7 +239,7 @@ class _Writer:
                 initial = _number(model.init)
             case CrcCheck():
                 bits = 8 * check.size
-                initial = _number(_reversed(model.init, bits) if model.reflect else model.init)
+                initial = _number(reversed_bits(model.init, bits) if model.reflect else model.init)
                 result = f"state ^ {_number(model.xor)}"
             case XxHashCheck():
                 initial = _number(model.seed)
@@ -295,10 +293,6 @@ def _number(value: int) -> str:
 
 def _bytes(data: bytes) -> str:
     return ", ".join(f"{byte:#04x}" for byte in data or b"\0")
-
-
-def _reversed(value: int, bits: int) -> int:
-    return int(f"{value:0{bits}b}"[::-1], 2)
 
 
 def _part(name: str) -> str:

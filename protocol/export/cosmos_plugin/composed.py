@@ -59,12 +59,9 @@ def _framing(stack: ComposedStack) -> dict[str, Any]:
     constants: dict[str, Any] = {"START": stack.framing.start, "END": stack.framing.end}
     match stack.link.framing:
         case SlipFraming() as model:
-            pair = model.substitutes or (0xDC, 0xDD)
-            if model.xor is not None:
-                pair = (model.end ^ model.xor, model.escape ^ model.xor)
             constants |= {
                 "ESCAPE": bytes((model.escape,)),
-                "SUBSTITUTES": bytes(pair),
+                "SUBSTITUTES": bytes(model.escaped),
                 "LEADING_END": model.leading_end,
             }
         case EscapedFraming() as model:

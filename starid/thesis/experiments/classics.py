@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.interface import ALGORITHMS, CLASSICS
 from starid.thesis.experiments.classics_sky import SkyName, ThesisSky, thesis_sky
 from starid.thesis.experiments.experiment import (
@@ -22,14 +22,15 @@ from starid.thesis.experiments.experiment import (
     Results,
     Row,
     row,
-    write_csv,
+    write_lines,
 )
 from starid.thesis.experiments.lsi_noise import IDENTIFIED_DEG
-from starid.thesis.experiments.lsi_trials import centres
+from starid.thesis.experiments.lsi_trials import centres, share
 from starid.thesis.experiments.plots import figure, save
+from starid.thesis.metrics import boresight_error
 from starid.thesis.simulation import NoiseModel, add_noise
 
-_SHORT: Final = {
+SHORT: Final = {
     "pyramid": "PA",
     "grid": "GA",
     "modified-grid": "MGA",
@@ -54,7 +55,7 @@ _PUBLISHED: Final = {
 }
 """Identification rates in the thesis's text, %; its figures show the rest as curves."""
 
-_TABLE_6_2: Final = {
+TABLE_6_2: Final = {
     "pyramid": (130.57, 27.5),
     "modified-grid": (7380.0, 394.6),
     "log-polar": (665.89, 73.8),
@@ -121,8 +122,8 @@ def _noise(case: str) -> NoiseModel:
 
 
 def _identify_frames(
-    context: Context, sky: ThesisSky, name: str, solver: Any, noise: NoiseModel, frames: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    context: Context, sky: ThesisSky, name: str, solver: Any, noise: NoiseModel, frames: Array
+) -> tuple[Array, Array]:
     """ε_f of each frame, degrees, NaN where there is no answer, and milliseconds."""
     errors, times = np.full(len(frames), np.nan), np.empty(len(frames))
     rng = context.rng(sky.name, repr(noise))
@@ -143,8 +144,6 @@ def _identify_frames(
 
 def _distance(sky: SkyName, found: tuple[float, float], true: tuple[float, float]) -> float:
     """Error of a boresight, degrees: in the plane, or on the sphere."""
-    from starid.thesis.metrics import boresight_error
-
     if sky == "flat":
         return float(boresight_error(*found, *true))
     a, b = (
@@ -222,7 +221,7 @@ def _kilobytes(context: Context, name: str, solver: Any) -> tuple[float, float, 
 
 
 def _rate(results: Results, case: str) -> float:
-    return 100.0 * float(np.mean(results[f"f_{case}"] <= IDENTIFIED_DEG))
+    return share(results[f"f_{case}"], IDENTIFIED_DEG)
 
 
 def _wrong(results: Results, case: str) -> float:
@@ -244,7 +243,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 name, result = part.values["algorithm"], results[part.key]
                 rows.append(
                     row(
-                        f"{_SHORT[name]}, {_SKY_WORDS[sky]}, {_case_words(case)}: identified",
+                        f"{SHORT[name]}, {_SKY_WORDS[sky]}, {_case_words(case)}: identified",
                         published=_PUBLISHED.get(case, {}).get(name),
                         ours=_rate(result, case),
                         unit="%",
@@ -254,7 +253,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 )
     first = context.parameters["skies"][0]
     # the first sky is the thesis's own where both are asked for
-    for name, (size, milliseconds) in _TABLE_6_2.items():
+    for name, (size, milliseconds) in TABLE_6_2.items():
         key = f"{first}-{name}"
         if key not in results:
             continue
@@ -262,7 +261,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         at_sensor = "" if math.isnan(usual) else f"12° sensor: {usual:.0f} kB, built in {build:.2f} s"
         rows += [
             row(
-                f"{_SHORT[name]}: database",
+                f"{SHORT[name]}: database",
                 published=size,
                 ours=float(here),
                 unit="kB",
@@ -270,7 +269,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 remark=at_sensor,
             ),
             row(
-                f"{_SHORT[name]}: median time, no noise",
+                f"{SHORT[name]}: median time, no noise",
                 published=milliseconds,
                 ours=float(np.median(results[key]["ms_none"])),
                 unit="ms",
@@ -318,7 +317,7 @@ def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
                     marker="o",
                     ms=3,
                     color="black" if own else f"C{i % 10}",
-                    label=_SHORT[part.values["algorithm"]],
+                    label=SHORT[part.values["algorithm"]],
                 )
             for level in levels:
                 for value in _PUBLISHED.get(f"{kind}-{level}" if level else "none", {}).values():
@@ -332,26 +331,16 @@ def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    columns: dict[str, list[Any]] = {
-        "sky": [], "algorithm": [], "case": [], "identified_percent": [], "wrong_percent": [], "median_ms": [], "p99_ms": [],
-    }  # fmt: skip
+    lines = []
     for part in _parts(context.parameters):
         result = results[part.key]
         for case in context.parameters["cases"] or _CASES:
             times = result[f"ms_{case}"]
-            values = (
-                part.values["sky"],
-                part.values["algorithm"],
-                case,
-                _rate(result, case),
-                _wrong(result, case),
-                float(np.median(times)),
-                float(np.percentile(times, 99.0)),
-            )
-            for column, value in zip(columns.values(), values, strict=True):
-                column.append(value)
-    write_csv(context.folder / "rates.csv", columns)
-    files = ["rates.csv", *_figures(context, results)]
+            line = {**part.values, "case": case}
+            line |= {"identified_percent": _rate(result, case), "wrong_percent": _wrong(result, case)}
+            line |= {"median_ms": float(np.median(times)), "p99_ms": float(np.percentile(times, 99.0))}
+            lines.append(line)
+    files = [write_lines(context.folder / "rates.csv", lines), *_figures(context, results)]
     stars = len(thesis_sky("sphere").catalog)
     note = _NOTE.format(limit=IDENTIFIED_DEG, unit=NoiseModel().magnitude_per_unit, stars=stars)
     return Outcome(tuple(_rows(context, results)), tuple(files), (note,))

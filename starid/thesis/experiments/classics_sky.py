@@ -14,8 +14,8 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
@@ -66,7 +66,7 @@ class ThesisSky:
 
     def observe(
         self, rng: np.random.Generator, ra_deg: float, dec_deg: float, noise: NoiseModel
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Array, Array]:
         """Positions (n, 2), pixels, and fluxes (n,), 1 at magnitude 0, of the objects in a frame with north up."""
         brightness, places, _ = self.frames.stars_in_frame(ra_deg % 360.0, dec_deg)
         to_deg = PIXEL_DEG if self.name == "sphere" else 1.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypedDict
 
-from starid.thesis.experiments.experiment import ReproduceError, Row, space_before, value_text
+from starid.thesis.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
 
 
 class Readings(TypedDict, total=False):
@@ -42,6 +43,34 @@ def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
     return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
 
 
+def shown(
+    quantity: str,
+    *,
+    published: float | str | None = None,
+    author: float | str | None = None,
+    printed: float | str | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a row that informs and checks nothing."""
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        remark=remark,
+        author=value_text(author, unit, digits),
+        printed=value_text(printed, unit, digits),
+    )
+
+
+def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -> Row:
+    """The row as a check of a class that is passed when all its published numbers match."""
+    met, of = sum(map(bool, matches)), len(matches)
+    return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
+
+
 def agreement(
     quantity: str,
     *,
@@ -69,20 +98,9 @@ def agreement(
             f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
         )
     greatest, origin = tolerance
-    passed = bool(abs(checked - published) <= greatest)
-    return Row(
-        quantity,
-        value_text(published, unit, digits),
-        value_text(ours, unit, digits),
-        f"± {origin}",
-        passed,
-        remark,
-        value_text(author, unit, digits),
-        value_text(printed, unit, digits),
-        "agrees",
-        int(passed),
-        1,
-    )
+    readings = {"published": published, "author": author, "printed": printed, "ours": ours}
+    informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
+    return _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= greatest])
 
 
 def same(
@@ -98,19 +116,9 @@ def same(
 ) -> Row:
     """Make one row for several published numbers, of which each agrees or not under the rule named by `target`."""
     met, of = sum(map(bool, matches)), len(matches)
-    return Row(
-        quantity,
-        published,
-        ours or "—",
-        target,
-        met == of,
-        f"{met} of {of} agree. {remark}".strip() if of > 1 else remark,
-        author or "—",
-        printed or "—",
-        "agrees",
-        met,
-        of,
-    )
+    remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
+    informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
+    return _checked(informing, "agrees", target, matches)
 
 
 def improvement(
@@ -119,51 +127,16 @@ def improvement(
     published: float,
     ours: float,
     larger: bool,
-    author: float | None = None,
-    printed: float | None = None,
     unit: str = "",
     digits: int = 2,
     remark: str = "",
 ) -> Row:
     """Make a check that ours is on the better side of a published number; the remark says by how much."""
-    space = space_before(unit)
     gain = ours - published if larger else published - ours
-    better = f"by {gain:.{digits}f}{space}{unit}"
+    better = f"by {value_text(gain, unit, digits)}"
     if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:
         better = f"by a factor of {published / ours:.3g}"
     passed = bool(ours >= published if larger else ours <= published)
-    return Row(
-        quantity,
-        value_text(published, unit, digits),
-        value_text(ours, unit, digits),
-        f"{'≥' if larger else '≤'} {value_text(published, unit, digits)}",
-        passed,
-        f"Better {better}. {remark}".strip() if passed else remark,
-        value_text(author, unit, digits),
-        value_text(printed, unit, digits),
-        "better",
-        int(passed),
-        1,
-    )
-
-
-def shown(
-    quantity: str,
-    *,
-    published: float | str | None = None,
-    author: float | str | None = None,
-    printed: float | str | None = None,
-    ours: float | str | None = None,
-    unit: str = "",
-    digits: int = 2,
-    remark: str = "",
-) -> Row:
-    """Make a row that informs and checks nothing."""
-    return Row(
-        quantity,
-        value_text(published, unit, digits),
-        value_text(ours, unit, digits),
-        remark=remark,
-        author=value_text(author, unit, digits),
-        printed=value_text(printed, unit, digits),
-    )
+    remark = f"Better {better}. {remark}".strip() if passed else remark
+    informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
+    return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])

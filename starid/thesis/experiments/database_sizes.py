@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,9 +18,10 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     row,
     star_catalog,
-    write_csv,
+    write_lines,
 )
 
 _SIZES_KB: Final = {
@@ -60,7 +61,7 @@ grid times five bytes, in kB of 1 000 bytes; the polar angle takes a sixth."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    return [Part(f"p{percent:g}", {"percent": percent}) for percent in parameters["percent"]]
+    return parts_of("p{percent:g}", percent=parameters["percent"])
 
 
 def _work(context: Context, part: Part) -> Results:
@@ -116,17 +117,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
 
     least = minimum_overlap()
     rows = [agreement("p_min, eq. 2.27", published=0.2929, tolerance=rounding(4), printed=least, digits=4)]
-    columns: dict[str, list[Any]] = {
-        "percent": [],
-        "nominal_N_42_deg": [],
-        "published_N": [],
-        "cells": [],
-        "bytes_features": [],
-        "published_kB": [],
-        "build_s": [],
-        "build_processor_s": [],
-        "bytes_file": [],
-    }
+    lines = []
     for percent in context.parameters["percent"]:
         result = results[f"p{percent:g}"]
         cells, nominal = int(result["cells"]), nominal_cells(42.0, percent / 100.0)
@@ -143,18 +134,10 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             )
         if percent in _SIZES_KB:
             rows.append(_size_row(percent, _BYTES * cells / 1000.0))
-        for name, value in (
-            ("percent", percent),
-            ("nominal_N_42_deg", nominal),
-            ("published_N", _NOMINAL.get(percent, "")),
-            ("cells", cells),
-            ("bytes_features", _BYTES * cells),
-            ("published_kB", _SIZES_KB.get(percent, "")),
-            ("build_s", float(result["seconds"])),
-            ("build_processor_s", float(result["processor_s"])),
-            ("bytes_file", int(result["bytes_file"])),
-        ):
-            columns[name].append(value)
+        line = {"percent": percent, "nominal_N_42_deg": nominal, "published_N": _NOMINAL.get(percent, "")}
+        line |= {"cells": cells, "bytes_features": _BYTES * cells, "published_kB": _SIZES_KB.get(percent, "")}
+        line |= {"build_s": float(result["seconds"]), "build_processor_s": float(result["processor_s"])}
+        lines.append(line | {"bytes_file": int(result["bytes_file"])})
     last = results[f"p{context.parameters['percent'][-1]:g}"]
     if context.parameters["build"]:
         rows += [
@@ -172,8 +155,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 at_most=_FILE_LIMIT_BYTES / 1e6,
             ),
         ]
-    write_csv(context.folder / "table_6_1_sizes.csv", columns)
-    return Outcome(tuple(rows), ("table_6_1_sizes.csv",), (_NOTE,))
+    return Outcome(tuple(rows), (write_lines(context.folder / "table_6_1_sizes.csv", lines),), (_NOTE,))
 
 
 _PERCENT: Final = [96.0, 97.0, 98.0, 99.0, 99.1, 99.2, 99.3, 99.4, 99.5, 99.6, 99.75]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -53,6 +54,12 @@ class Part:
 
     key: str
     values: Parameters = field(default_factory=dict)
+
+
+def parts_of(key: str, **values: Iterable[Any]) -> list[Part]:
+    """A part for each combination of values, the last running fastest; `key` is a format of their names."""
+    chosen = [dict(zip(values, line, strict=True)) for line in itertools.product(*values.values())]
+    return [Part(key.format(**line), line) for line in chosen]
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,8 +289,8 @@ def value_text(value: float | str | None, unit: str, digits: int) -> str:
     return value if isinstance(value, str) else f"{value:.{digits}f}{space_before(unit)}{unit}"
 
 
-def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
-    """Write columns of equal length under their names; numbers with nine significant digits."""
+def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> str:
+    """Write columns of equal length under their names; numbers with nine significant digits. Return the file's name."""
     lengths = {len(column) for column in columns.values()}
     if len(lengths) != 1:
         raise ReproduceError(f"reproduce: columns of {path.name} have the lengths {sorted(lengths)}")
@@ -295,6 +302,12 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -
         writer = csv.writer(stream)
         writer.writerow(columns)
         writer.writerows([text(value) for value in values] for values in zip(*columns.values(), strict=True))
+    return path.name
+
+
+def write_lines(path: Path, lines: Sequence[Mapping[str, Any]]) -> str:
+    """Write lines that all have the same names as `write_csv` does."""
+    return write_csv(path, {name: [line[name] for line in lines] for name in lines[0]})
 
 
 @lru_cache(maxsize=1)

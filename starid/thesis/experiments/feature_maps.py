@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import agreement, same, shown
 from starid.thesis.experiments.experiment import (
     Context,
@@ -17,8 +17,10 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     planar_sky,
     write_csv,
+    write_lines,
 )
 from starid.thesis.experiments.plots import colours, figure, save
 
@@ -29,16 +31,15 @@ NO_LIMIT: Final = -99.0
 """A brightness limit that keeps every star."""
 
 _COLUMNS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
-_FIGURES: Final = {"n": "2_3", "A": "2_4", "r": "2_5", "theta": "2_6", "sigma_A": "2_7", "sigma_r": "2_8"}
-_LABELS: Final = {
-    "n": "number of stars n",
-    "A": "brightness mean A / mag",
-    "r": "polar radius r / °",
-    "sigma_A": "brightness deviation σ_A / mag",
-    "sigma_r": "polar radius deviation σ_r / °",
-    "theta": "polar angle θ / °",
+_MAPS: Final = {
+    "n": ("2_3", "number of stars", "n"),
+    "A": ("2_4", "brightness mean", "A / mag"),
+    "r": ("2_5", "polar radius", "r / °"),
+    "theta": ("2_6", "polar angle", "θ / °"),
+    "sigma_A": ("2_7", "brightness deviation", "σ_A / mag"),
+    "sigma_r": ("2_8", "polar radius deviation", "σ_r / °"),
 }
-_PANELS: Final = ("n", "A", "r", "theta", "sigma_A", "sigma_r")
+"""Feature → number of its map, its name, and symbol with unit; in the order of the panels."""
 
 _NOTE: Final = """No brightness limit, frames 42° wide in the flat (α, δ) plane, as the thesis draws them; every star of the
 catalogue takes part. The thesis prints no numbers with these figures; the values it names in the text are compared.
@@ -46,7 +47,7 @@ As a frame near δ = ±90° reaches beyond the pole, where the flat plane ends, 
 makes r grow and n fall at the upper and lower rims of the maps."""
 
 
-def _features(centres: NDArray[np.float64], kappa: float) -> NDArray[np.float64]:
+def _features(centres: Array, kappa: float) -> Array:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without a star."""
     from starid.thesis.frame_sky import cell_features
 
@@ -54,7 +55,7 @@ def _features(centres: NDArray[np.float64], kappa: float) -> NDArray[np.float64]
     table = np.full((len(centres), 6), np.nan)
     sums, out = np.empty(8), np.empty(5)
     for i, (ra, dec) in enumerate(centres):
-        angle = cell_features(sky.stars, sky.bin_start, sky.frame, ra % 360.0, dec, sums, out)
+        angle = cell_features(sky.arrays, ra % 360.0, dec, sums, out)
         if out[0] >= 1.0:
             table[i, :5] = out
             table[i, 5] = np.degrees(angle)
@@ -62,20 +63,11 @@ def _features(centres: NDArray[np.float64], kappa: float) -> NDArray[np.float64]
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    lines = [
-        Part(f"{axis}-p{percent:g}", {"axis": axis, "percent": percent, "kappa": NO_LIMIT})
-        for axis in ("ra", "dec")
-        for percent in parameters["percent"]
-    ]
-    limits = [
-        Part(f"{axis}-kappa{kappa:g}", {"axis": axis, "percent": 90.0, "kappa": kappa})
-        for axis in ("ra", "dec")
-        for kappa in parameters["kappa"]
-    ]
+    axes, whole = ("ra", "dec"), {"axis": "map", "percent": parameters["map_percent"], "kappa": NO_LIMIT}
     return [
-        Part("map", {"axis": "map", "percent": parameters["map_percent"], "kappa": NO_LIMIT}),
-        *lines,
-        *limits,
+        Part("map", whole),
+        *parts_of("{axis}-p{percent:g}", axis=axes, percent=parameters["percent"], kappa=[NO_LIMIT]),
+        *parts_of("{axis}-kappa{kappa:g}", axis=axes, percent=[90.0], kappa=parameters["kappa"]),
     ]
 
 
@@ -99,53 +91,42 @@ def _maps(context: Context, result: Results) -> list[str]:
     files = []
     shape = (result["dec"].size, result["ra"].size)
     for i, name in enumerate(_COLUMNS):
+        number, words, symbol = _MAPS[name]
         fig, axis = figure(width=7.0, height=3.6)
         options: dict[str, Any] = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}
         values = result["features"][:, i].reshape(shape)
         image = axis.pcolormesh(result["ra"], result["dec"], values, shading="nearest", **options)
-        fig.colorbar(image, ax=axis, label=_LABELS[name])
+        fig.colorbar(image, ax=axis, label=f"{words} {symbol}")
         axis.grid(visible=False)
         axis.set(xlabel="α of the centre / °", ylabel="δ of the centre / °", xlim=(0, 360), ylim=(-90, 90))
         axis.set_xticks(range(0, 361, 60))
         axis.set_yticks(range(-90, 91, 30))
-        files.append(save(fig, context.folder / f"figure_{_FIGURES[name]}.png"))
+        files.append(save(fig, context.folder / f"figure_{number}.png"))
     columns = {"ra_deg": result["places"][:, 0], "dec_deg": result["places"][:, 1]}
     columns.update({name: result["features"][:, i] for i, name in enumerate(_COLUMNS)})
-    write_csv(context.folder / "feature_maps.csv", columns)
-    return [*files, "feature_maps.csv"]
+    return [*files, write_csv(context.folder / "feature_maps.csv", columns)]
 
 
 def _variation(
     context: Context, results: Mapping[str, Results], number: int, axis: str, keys: dict[str, str]
 ) -> list[str]:
     fig, axes = figure(6, 1, width=7.5, height=9.5, sharex=True)
-    columns: dict[str, list[Any]] = {"curve": [], "ra_deg": [], "dec_deg": []} | {n: [] for n in _COLUMNS}
+    lines: list[dict[str, Any]] = []
     for (key, label), colour in zip(keys.items(), colours(len(keys)), strict=True):
         result = results[key]
         where = result["places"][:, 0 if axis == "ra" else 1]
-        for panel, name in zip(axes, _PANELS, strict=True):
+        for panel, name in zip(axes, _MAPS, strict=True):
             panel.plot(where, result["features"][:, _COLUMNS.index(name)], color=colour, label=label)
-        columns["curve"] += [label] * len(where)
-        columns["ra_deg"] += list(result["places"][:, 0])
-        columns["dec_deg"] += list(result["places"][:, 1])
-        for i, name in enumerate(_COLUMNS):
-            columns[name] += list(result["features"][:, i])
-    for panel, name in zip(axes, _PANELS, strict=True):
-        panel.set_ylabel(
-            _LABELS[name]
-            .replace("brightness deviation ", "")
-            .replace("polar radius deviation ", "")
-            .replace("brightness mean ", "")
-            .replace("number of stars ", "")
-            .replace("polar radius ", "")
-            .replace("polar angle ", "")
-        )
+        for (ra, dec), features in zip(result["places"], result["features"], strict=True):
+            line = {"curve": label, "ra_deg": ra, "dec_deg": dec}
+            lines.append(line | dict(zip(_COLUMNS, features, strict=True)))
+    for panel, name in zip(axes, _MAPS, strict=True):
+        panel.set_ylabel(_MAPS[name][2])
     axes[-1].set_xlabel("α of the centre / °" if axis == "ra" else "δ of the centre / °")
     axes[-1].set_xlim((0, 360) if axis == "ra" else (-90, 90))
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(keys))
     name = f"figure_2_{number}"
-    write_csv(context.folder / f"{name}.csv", columns)
-    return [save(fig, context.folder / f"{name}.png"), f"{name}.csv"]
+    return [save(fig, context.folder / f"{name}.png"), write_lines(context.folder / f"{name}.csv", lines)]
 
 
 def _rows(whole: Results) -> list[Row]:

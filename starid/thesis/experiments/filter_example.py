@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starid.thesis.cme import estimate_motion
+from starid.arrays import Array, Mask
+from starid.thesis.cme import matched_motion
 from starid.thesis.experiments.comparison import same, shown
 from starid.thesis.experiments.experiment import (
     Context,
@@ -30,7 +31,7 @@ from starid.thesis.fsf import (
     disparity_list,
     main_cluster,
     pair_count,
-    pair_features,
+    pairs_of,
 )
 from starid.thesis.simulation import INTENSITY_UNITS, PIXEL_DEG, turned
 
@@ -56,7 +57,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return [Part("example")]
 
 
-def _field(limit: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _field(limit: float) -> tuple[Array, Array]:
     """Magnitudes (n,) and α, δ in degrees (n, 2) of the stars of the field to a limit, brightest first."""
     catalog = star_catalog()
     places = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad]))
@@ -83,15 +84,11 @@ def _to_pixels(frame: ObservedFrame) -> ObservedFrame:
     return ObservedFrame(frame.brightness, np.rint(frame.positions / PIXEL_DEG) * PIXEL_DEG)
 
 
-def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[Array, Mask]:
     """All disparities of two frames, (n, 3), and which of them are in the main cluster."""
-    vectors = []
-    for frame in (before, now):
-        pairs = np.empty((pair_count(len(frame)), 3))
-        pair_features(frame.brightness, frame.positions, pairs, np.empty((len(pairs), 2), dtype=np.int64))
-        vectors.append(pairs)
-    found = np.empty((len(vectors[0]) * len(vectors[1]), 3))
-    disparity_list(vectors[0], vectors[1], found)
+    first, second = pairs_of(before), pairs_of(now)
+    found = np.empty((len(first) * len(second), 3))
+    disparity_list(first, second, found)
     labels = density_clusters(found, EPSILON, MIN_SAMPLES_SHARE * len(now))
     return found, labels == main_cluster(labels)
 
@@ -102,14 +99,10 @@ def _work(context: Context, part: Part) -> Results:
     for name, frames in (("exact", (before, now)), ("pixels", (_to_pixels(before), _to_pixels(now)))):
         disparities, chosen = _disparities(*frames)
         result = ClusterFilter()(*frames)
-        motion = estimate_motion(
-            frames[0].positions[result.matches[:, 0]],
-            frames[1].positions[result.matches[:, 1]],
-            model="affine",
-        )
+        motion = matched_motion(*frames, result.matches, model="affine")
         found[f"disparities_{name}"], found[f"chosen_{name}"] = disparities, chosen
         found[f"stars_{name}"] = result.true_now
-        found[f"turn_{name}"] = np.array(motion.rotation_deg)
+        found[f"turn_{name}"] = np.array(math.nan if motion is None else motion.rotation_deg)
     for name, frame in (("before", before), ("now", now)):
         found[name] = np.column_stack([frame.positions, frame.brightness])
     return found
@@ -127,7 +120,7 @@ def _cluster_figure(context: Context, result: Results) -> str:
     return save(fig, context.folder / "figure_3_2.png")
 
 
-def _image(brightness: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def _image(brightness: Array, pixels: Array) -> Array:
     """Stars as Gaussians on the detector; intensity falls linearly with magnitude, as in the thesis's 8-bit images."""
     image = np.zeros((_PIXELS, _PIXELS))
     reach = np.arange(-8, 9)
@@ -211,17 +204,10 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             )
         )
     points = result["disparities_pixels"]
-    write_csv(
-        context.folder / "figure_3_2.csv",
-        {
-            "brightness_mag": points[:, 0],
-            "separation_deg": points[:, 1],
-            "slope_deg": points[:, 2],
-            "in_cluster": result["chosen_pixels"].astype(int),
-        },
-    )
+    columns = dict(zip(("brightness_mag", "separation_deg", "slope_deg"), points.T, strict=True))
+    columns["in_cluster"] = result["chosen_pixels"].astype(int)
     files = (_cluster_figure(context, result), _noise_figure(context), _pair_figure(context, result))
-    return Outcome(tuple(rows), (*files, "figure_3_2.csv"), (_NOTE,))
+    return Outcome(tuple(rows), (*files, write_csv(context.folder / "figure_3_2.csv", columns)), (_NOTE,))
 
 
 EXPERIMENTS: Final = (

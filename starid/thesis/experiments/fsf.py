@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from starid.thesis.cme import MotionModel, estimate_motion
-from starid.thesis.experiments.comparison import (
-    Readings,
-    agreement,
-    improvement,
-    same,
-    sampled_mean,
-    sampling,
-)
+from starid.thesis.cme import CameraMotion, MotionModel, matched_motion
+from starid.thesis.experiments.comparison import agreement, improvement, same, sampled_mean, sampling
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -25,12 +19,13 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     star_catalog,
-    write_csv,
+    write_lines,
 )
-from starid.thesis.experiments.fsf_published import TABLES
 from starid.thesis.experiments.plots import colours, figure, save
-from starid.thesis.false_stars import FilterError, FilterResult
+from starid.thesis.experiments.published import TABLES
+from starid.thesis.false_stars import FilterResult
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.metrics import Confusion
 from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
@@ -50,6 +45,8 @@ _CORNER: Final = (87.41, -8.86)
 _BRIGHTEST: Final = 3.0
 _MAGNITUDES: Final = (-1.5, 3.0)
 _COUNTS: Final = ("TP", "FP", "FN", "TN")
+_INDICATORS: Final = ("accuracy", "precision", "recall", "f1")
+_FILTERS: Final = ("any", "matched", "followed")
 _WORST_MOTION_DEG: Final = 0.0419
 _ALL: Final = 100.0
 _SPREAD_OF_MOTION: Final = 0.35
@@ -74,10 +71,17 @@ _NAMED: Final = (
 def first_frame() -> tuple[Any, Any]:
     """Magnitudes (7,) and offsets in degrees (7, 2) of the stars of the published experiments: Hp < 3 in the square."""
     catalog = star_catalog()
-    x = np.degrees(catalog.ra_rad) - _CORNER[0] - RADIUS_DEG
-    y = np.degrees(catalog.dec_rad) - _CORNER[1] - RADIUS_DEG
-    chosen = (catalog.hp < _BRIGHTEST) & (np.abs(x) <= RADIUS_DEG) & (np.abs(y) <= RADIUS_DEG)
-    return catalog.hp[chosen].copy(), np.column_stack([x[chosen], y[chosen]])
+    places = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad])) - _CORNER - RADIUS_DEG
+    chosen = (catalog.hp < _BRIGHTEST) & np.all(np.abs(places) <= RADIUS_DEG, axis=1)
+    return catalog.hp[chosen].copy(), places[chosen]
+
+
+def frames_of_seven(
+    rng: np.random.Generator, noise: NoiseModel, count: int
+) -> tuple[SimulatedFrame, Iterator[SimulatedFrame]]:
+    """The clean frame of those seven stars, and so many frames that are moved from it."""
+    frames = moved_frames(rng, *first_frame(), noise, count=count, radius_deg=RADIUS_DEG)
+    return next(frames), frames
 
 
 def noise_of(kind: str, factor: float, false_stars: int) -> NoiseModel:
@@ -91,55 +95,40 @@ def noise_of(kind: str, factor: float, false_stars: int) -> NoiseModel:
     )
 
 
-def _matched(result: FilterResult) -> Any:
-    mask = np.zeros(result.true_now.size, dtype=np.bool_)
-    mask[result.matches[:, 1]] = True
-    return mask
-
-
 def _motion(
     first: SimulatedFrame, frame: SimulatedFrame, result: FilterResult, model: MotionModel
 ) -> tuple[float, float, float, float]:
     """μ_d, σ_d, error of the rotation and of the translation, degrees; NaN without matches enough."""
-    try:
-        motion = estimate_motion(
-            first.observed.positions[result.matches[:, 0]],
-            frame.observed.positions[result.matches[:, 1]],
-            model=model,
-        )
-    except FilterError:
+    motion = matched_motion(first.observed, frame.observed, result.matches, model=model)
+    if motion is None:
         return math.nan, math.nan, math.nan, math.nan
-    return (
-        motion.mean_distance_deg,
-        motion.sigma_distance_deg,
-        abs(motion.rotation_deg - frame.rotation_deg),
-        float(np.hypot(*(motion.translation_deg - frame.shift_deg))),
-    )
+    return motion.mean_distance_deg, motion.sigma_distance_deg, *motion_errors(motion, frame)
+
+
+def motion_errors(motion: CameraMotion, frame: SimulatedFrame) -> tuple[float, float]:
+    """Errors of the rotation and of the translation of a frame, degrees."""
+    away = motion.translation_deg - frame.shift_deg
+    return abs(motion.rotation_deg - frame.rotation_deg), float(np.hypot(*away))
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    return [
-        Part(f"{kind}-f{f}-x{scale:g}", {"kind": kind, "false_stars": f, "scale": scale})
-        for kind in parameters["kinds"]
-        for f in parameters["false_stars"]
-        for scale in parameters["scales"]
-    ]
+    return parts_of(
+        "{kind}-f{false_stars}-x{scale:g}",
+        kind=parameters["kinds"],
+        false_stars=parameters["false_stars"],
+        scale=parameters["scales"],
+    )
 
 
 def _work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame()
     kind, false_stars, scale = part.values["kind"], part.values["false_stars"], part.values["scale"]
     count = int(context.parameters["frames"])
-    shape = (len(FACTORS), 4)
-    any_member, matched, followed = (np.zeros(shape, dtype=np.int64) for _ in range(3))
+    counts = {name: np.zeros((len(FACTORS), 4), dtype=np.int64) for name in _FILTERS}
     motions = {model: np.full((len(FACTORS), count, 4), math.nan) for model in _MODELS}
     cluster = ClusterFilter()
     for k, factor in enumerate(FACTORS):
         noise = noise_of(kind, factor * scale, false_stars)
-        frames = moved_frames(
-            context.rng(part.key, factor), brightness, positions, noise, count=count, radius_deg=RADIUS_DEG
-        )
-        first = next(frames)
+        first, frames = frames_of_seven(context.rng(part.key, factor), noise, count)
         track = TrackFilter(
             TrackFilterSettings(
                 position_sigma_deg=max(noise.position_sigma_px * PIXEL_DEG, 0.01),
@@ -151,75 +140,50 @@ def _work(context: Context, part: Part) -> Results:
         track.update(first.observed)
         for i, frame in enumerate(frames):
             result = cluster(first.observed, frame.observed)
-            any_member[k] += _counts(result.true_now, frame)
-            matched[k] += _counts(_matched(result), frame)
-            followed[k] += _counts(track.update(frame.observed).true_now, frame)
+            followed = track.update(frame.observed).true_now
+            for name, taken in zip(_FILTERS, (result.true_now, result.matched, followed), strict=True):
+                counts[name][k] += Confusion.of(taken, frame.is_star).counts
             for model, values in motions.items():
                 values[k, i] = _motion(first, frame, result, model)
-    found: Results = {"any": any_member, "matched": matched, "followed": followed}
-    for model, values in motions.items():
-        found[model] = values
-    return found
+    return {**counts, **{str(model): values for model, values in motions.items()}}
 
 
-def _counts(taken: Any, frame: SimulatedFrame) -> Any:
-    c = Confusion.of(taken, frame.is_star)
-    return np.array([c.true_positive, c.false_positive, c.false_negative, c.true_negative])
-
-
-def _confusion(counts: Any) -> Confusion:
-    return Confusion(*(int(v) for v in counts))
+def _percent(counts: Sequence[int], indicator: str) -> float:
+    """An indicator of eq. 6.2, percent, of true positives, false positives, false negatives and true negatives."""
+    return Confusion(*(int(count) for count in counts)).percent(indicator)
 
 
 def _table(context: Context, results: Mapping[str, Results]) -> str:
-    columns: dict[str, list[Any]] = {
-        name: []
-        for name in (
-            "noise",
-            "scale",
-            "false_stars",
-            "factor",
-            "filter",
-            *_COUNTS,
-            "accuracy",
-            "precision",
-            "recall",
-            "f1",
-        )
-    }
+    lines = []
     for part in _parts(context.parameters):
-        key = (part.values["kind"], part.values["false_stars"])
-        rows: dict[str, Any] = {name: results[part.key][name] for name in ("any", "matched", "followed")}
-        rows["published"] = np.array(TABLES[key])
-        for name, counts in rows.items():
+        kind, false_stars, scale = part.values["kind"], part.values["false_stars"], part.values["scale"]
+        published = np.array(TABLES[kind, false_stars])
+        for name, counts in (
+            *((name, results[part.key][name]) for name in _FILTERS),
+            ("published", published),
+        ):
             for k, factor in enumerate(FACTORS):
-                c = _confusion(counts[k])
-                values = (
-                    key[0], part.values["scale"], key[1], factor, name, *counts[k].tolist(),
-                    c.accuracy, c.precision, c.recall, c.f1,
-                )  # fmt: skip
-                for column, value in zip(columns.values(), values, strict=True):
-                    column.append(value)
-    write_csv(context.folder / "confusion_matrices.csv", columns)
-    return "confusion_matrices.csv"
+                line = {"noise": kind, "scale": scale, "false_stars": false_stars, "factor": factor}
+                line |= {"filter": name, **dict(zip(_COUNTS, counts[k].tolist(), strict=True))}
+                confusion = Confusion(*counts[k].tolist())
+                lines.append(line | {indicator: getattr(confusion, indicator) for indicator in _INDICATORS})
+    return write_lines(context.folder / "confusion_matrices.csv", lines)
 
 
 def _indicator_figures(context: Context, results: Mapping[str, Results]) -> list[str]:
     files = []
-    names = (("accuracy", "6_14"), ("precision", "6_15"), ("recall", "6_16"), ("f1", "6_17"))
-    for indicator, number in names:
+    for number, indicator in enumerate(_INDICATORS, start=14):
         fig, axes = figure(1, len(context.parameters["kinds"]), width=11.0)
         for kind, ax in zip(context.parameters["kinds"], np.ravel(axes), strict=True):
             for f, colour in zip(context.parameters["false_stars"], colours(6), strict=False):
                 counts = results[f"{kind}-f{f}-x1"]["any"]
-                ours = [100.0 * getattr(_confusion(c), indicator) for c in counts]
-                theirs = [100.0 * getattr(Confusion(*c), indicator) for c in TABLES[kind, f]]
+                ours, theirs = ([_percent(c, indicator) for c in sets] for sets in (counts, TABLES[kind, f]))
                 ax.plot(FACTORS, ours, "-o", color=colour, markersize=3, label=f"f = {f}")
                 ax.plot(FACTORS, theirs, ":", color=colour)
             ax.set(title=f"{_KIND_WORDS[kind]} noise", xlabel="noise factor μ", ylabel=f"{indicator} / %")
         fig.legend(*np.ravel(axes)[0].get_legend_handles_labels(), loc="outside right upper")
         fig.suptitle(f"{indicator.capitalize()}, noise as printed (dotted: published)")
-        files.append(save(fig, context.folder / f"figure_{number}.png"))
+        files.append(save(fig, context.folder / f"figure_6_{number}.png"))
     return files
 
 
@@ -255,14 +219,13 @@ def _agreeing(
     for f in false_stars:
         counts = results[f"{kind}-f{f}-x{scale:g}"][name]
         for ours, published in zip(counts, TABLES[kind, f], strict=True):
-            theirs = 100.0 * getattr(Confusion(*published), indicator)
-            trials = _trials(ours, published, indicator)
-            greatest, _ = sampling(theirs, trials)
-            matches.append(abs(100.0 * getattr(_confusion(ours), indicator) - theirs) <= greatest)
+            theirs = _percent(published, indicator)
+            greatest, _ = sampling(theirs, _trials(ours, published, indicator))
+            matches.append(abs(_percent(ours, indicator) - theirs) <= greatest)
     return matches
 
 
-def _trials(ours: Any, published: tuple[int, int, int, int], indicator: str) -> int:
+def _trials(ours: Any, published: Sequence[int], indicator: str) -> int:
     """Number of independent decisions behind an indicator: the stars of a frame are lost together, so frames for the recall."""
     if indicator == "precision":
         return int(min(ours[0] + ours[1], published[0] + published[1]))
@@ -283,8 +246,7 @@ def _matrix(context: Context, results: Mapping[str, Results], scale: float, indi
             cells = []
             for k in range(len(FACTORS)):
                 counts = (TABLES[kind, f][k], result["any"][k], result["matched"][k])
-                values = [100.0 * getattr(_confusion(c), indicator) for c in counts]
-                cells.append(" / ".join(f"{value:.1f}" for value in values))
+                cells.append(" / ".join(f"{_percent(c, indicator):.1f}" for c in counts))
             number = 3 * f + 1 + KINDS.index(kind)
             label = f"A.{number}: f = {f}, {_KIND_WORDS[kind]}"
             lines.append("| " + " | ".join((label, *cells)) + " |")
@@ -325,12 +287,8 @@ def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         if kind not in context.parameters["kinds"] or f not in context.parameters["false_stars"]:
             continue
         literal, reduced = (results[f"{kind}-f{f}-x{scale:g}"] for scale in (1.0, EQUIVALENT))
-        values: Readings = {
-            "author": 100.0 * getattr(_confusion(literal["matched"][k]), indicator),
-            "printed": 100.0 * getattr(_confusion(literal["any"][k]), indicator),
-            "ours": 100.0 * getattr(_confusion(literal["followed"][k]), indicator),
-        }
-        smaller = 100.0 * getattr(_confusion(reduced["matched"][k]), indicator)
+        printed, author, ours = (_percent(literal[name][k], indicator) for name in _FILTERS)
+        smaller = _percent(reduced["matched"][k], indicator)
         trials = int(context.parameters["frames"])
         quantity = f"{indicator}, {_KIND_WORDS[kind]} noise, μ = {k}, f = {f}"
         rows.append(
@@ -338,7 +296,9 @@ def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 quantity,
                 published=published,
                 tolerance=sampling(published, trials),
-                **values,
+                author=author,
+                printed=printed,
+                ours=ours,
                 unit="%",
                 remark=f"As the author ran it, noise × {EQUIVALENT:g}: {smaller:.2f} %.",
             )
@@ -349,7 +309,7 @@ def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             improvement(
                 f"{quantity}: scalable filter (ours), noise as printed",
                 published=published,
-                ours=values["ours"],
+                ours=ours,
                 larger=True,
                 unit="%",
             )
@@ -406,14 +366,6 @@ def _motion_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     ]
 
 
-def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
-    return [
-        *_table_rows(context, results),
-        *_named_rows(context, results),
-        *_motion_rows(context, results),
-    ]
-
-
 _NOTE: Final = """Seven stars (Hp < 3), circular field of 21°; every moved frame is compared with the first, complete one, which
 has its own false stars but no noise. This reading alone gives the published numbers of true and of false stars in the
 field, about 6 617 and 976 per false star. "In the cluster" is the rule as printed: whoever appears in the main cluster is a
@@ -437,7 +389,8 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     if not context.quick:
         files += _indicator_figures(context, results) + _motion_figures(context, results)
     tables = [_matrix(context, results, scale, "recall") for scale in context.parameters["scales"]]
-    return Outcome(tuple(_rows(context, results)), tuple(files), (_NOTE, *tables))
+    rows = [makes(context, results) for makes in (_table_rows, _named_rows, _motion_rows)]
+    return Outcome(tuple(itertools.chain(*rows)), tuple(files), (_NOTE, *tables))
 
 
 EXPERIMENTS: Final = (

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starid.thesis.experiments.comparison import shown
 from starid.thesis.experiments.experiment import (
@@ -16,11 +15,11 @@ from starid.thesis.experiments.experiment import (
     Parameters,
     Part,
     Results,
-    write_csv,
+    parts_of,
+    write_lines,
 )
-from starid.thesis.experiments.fsf import EQUIVALENT, RADIUS_DEG, first_frame, noise_of
-from starid.thesis.fsf import EPSILON, MIN_SAMPLES_SHARE, pair_count, pair_features
-from starid.thesis.simulation import moved_frames
+from starid.thesis.experiments.fsf import EQUIVALENT, frames_of_seven, noise_of
+from starid.thesis.fsf import EPSILON, MIN_SAMPLES_SHARE, pair_count, pairs_of
 
 _FALSE_STARS: Final = 5
 
@@ -33,37 +32,18 @@ the noise as printed the heap is gone in a growing share of the frames from μ =
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    return [
-        Part(f"m{factor}-x{scale:g}", {"factor": factor, "scale": scale})
-        for scale in parameters["scales"]
-        for factor in parameters["factors"]
-    ]
-
-
-def _pairs(brightness: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    vectors = np.empty((pair_count(brightness.size), 3))
-    pair_features(brightness, positions, vectors, np.empty((len(vectors), 2), dtype=np.int64))
-    return vectors
+    return parts_of("m{factor}-x{scale:g}", scale=parameters["scales"], factor=parameters["factors"])
 
 
 def _work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame()
     noise = noise_of("both", part.values["factor"] * part.values["scale"], 0)
-    frames = moved_frames(
-        context.rng(part.key),
-        brightness,
-        positions,
-        noise,
-        count=int(context.parameters["frames"]),
-        radius_deg=RADIUS_DEG,
-    )
-    reference = next(frames).observed
-    first = _pairs(reference.brightness, reference.positions)
+    whole, frames = frames_of_seven(context.rng(part.key), noise, int(context.parameters["frames"]))
+    first = pairs_of(whole.observed)
     spread, fullest = [], []
     for frame in frames:
-        if frame.observed.brightness.size < brightness.size:
+        if len(frame.observed) < len(whole.observed):
             continue
-        difference = first - _pairs(frame.observed.brightness, frame.observed.positions)
+        difference = first - pairs_of(frame.observed)
         difference[:, 2] -= 180.0 * np.ceil(difference[:, 2] / 180.0 - 0.5)
         middle = np.median(difference, axis=0)
         spread.append(np.median(np.abs(difference - middle), axis=0))
@@ -73,25 +53,17 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    columns: dict[str, list[Any]] = {}
-    rows = []
+    rows, lines = [], []
     for part in _parts(context.parameters):
         spread, fullest = results[part.key]["spread"], results[part.key]["fullest"]
         factor, scale = part.values["factor"], part.values["scale"]
         lost = {f: 100.0 * float(np.mean(fullest < MIN_SAMPLES_SHARE * (7 + f))) for f in (0, _FALSE_STARS)}
         typical = np.median(spread, axis=0)
-        line = {
-            "factor": factor,
-            "scale": scale,
-            "brightness_spread_mag": typical[0],
-            "separation_spread_deg": typical[1],
-            "slope_spread_deg": typical[2],
-            "fullest_mean": float(fullest.mean()),
-            "lost_percent_f0": lost[0],
-            f"lost_percent_f{_FALSE_STARS}": lost[_FALSE_STARS],
-        }
-        for name, value in line.items():
-            columns.setdefault(name, []).append(value)
+        spreads = zip(
+            ("brightness_spread_mag", "separation_spread_deg", "slope_spread_deg"), typical, strict=True
+        )
+        line = {"factor": factor, "scale": scale, **dict(spreads), "fullest_mean": float(fullest.mean())}
+        lines.append(line | {f"lost_percent_f{f}": share for f, share in lost.items()})
         rows.append(
             shown(
                 f"frames without a core among the true pairs, μ = {factor}, noise × {scale:g}: f = 0, f = {_FALSE_STARS}",
@@ -100,8 +72,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 f"{fullest.mean():.1f} of {pair_count(7)}",
             )
         )
-    write_csv(context.folder / "limits.csv", columns)
-    return Outcome(tuple(rows), ("limits.csv",), (_NOTE,))
+    return Outcome(tuple(rows), (write_lines(context.folder / "limits.csv", lines),), (_NOTE,))
 
 
 EXPERIMENTS: Final = (

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from starid.thesis.cme import estimate_motion
+from starid.thesis.cme import estimate_motion, matched_motion
 from starid.thesis.experiments.comparison import Tolerance, agreement, sampled_mean, sampling, shown
 from starid.thesis.experiments.experiment import (
     Context,
@@ -19,17 +19,18 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     row,
-    write_csv,
+    write_lines,
 )
-from starid.thesis.experiments.fsf import RADIUS_DEG, first_frame, noise_of
+from starid.thesis.experiments.fsf import RADIUS_DEG, frames_of_seven, motion_errors, noise_of
 from starid.thesis.experiments.plots import figure, save
-from starid.thesis.false_stars import FilterError, ObservedFrame
+from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.metrics import Confusion
 from starid.thesis.rsi import correlation
 from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
+from starid.thesis.simulation import PIXEL_DEG, NoiseModel, turned
 
 _SPREAD_DEG: Final = 0.1
 _EPSILONS: Final = tuple(round(0.2 * k, 1) for k in range(1, 11))
@@ -51,6 +52,8 @@ _CASE_TABLE: Final[dict[tuple[int, str], tuple[float, float, float, float, float
 }
 """Tables 6.3 and 6.4: accuracy and precision (percent; the recall is 100 % in every row), ε_γ, σ_γ, ε_ρ and σ_ρ (degrees)."""
 
+_CASE_NOTE: Final = """Ten moved frames, noise factor 1. The thesis gives rotation errors of 0.7° in most rows of table 6.4, even without noise: its sign or reference must have differed. Figure 6.13 shows the stars of a frame and the earlier frame's stars moved by the estimated motion, without and with noise."""
+
 _CASE_FRAMES: Final = 10
 _CASE_STARS: Final = 70
 _ROUNDING_ERROR_DEG: Final = 1e-12
@@ -58,83 +61,50 @@ _ROUNDING_ERROR_DEG: Final = 1e-12
 
 _PUBLISHED_CORRELATION: Final = (0.427, 0.680, 0.635, 0.999, 0.997, 0.901)
 _KINDS: Final = ("transient", "stationary", "drifting")
+_CROWD_NOTE: Final = """Counted are the true stars that were in the field in the two frames before as well, since the filter wants three sightings, and all false ones. Drifting stars that move by less than the gate from frame to frame need a few frames more to be told. The time is that of the quickest tenth of the frames, since other work on the machine adds to the rest."""
 
 
 def _choice_parts(parameters: Parameters) -> list[Part]:
-    parts = [Part(f"eps{e:g}", {"epsilon": e, "least": 3.0}) for e in parameters["epsilons"]]
-    for epsilon in (0.4, 0.8):
-        parts += [
-            Part(f"share{s:g}-eps{epsilon:g}", {"epsilon": epsilon, "share": s}) for s in parameters["shares"]
-        ]
-    return parts
+    return [
+        *parts_of("eps{epsilon:g}", epsilon=parameters["epsilons"], least=[3.0]),
+        *parts_of("share{share:g}-eps{epsilon:g}", epsilon=(0.4, 0.8), share=parameters["shares"]),
+    ]
 
 
 def _choice_work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame()
     noise = NoiseModel(position_sigma_px=_SPREAD_DEG / PIXEL_DEG)
     lost, shift_errors = [], []
-    frames = moved_frames(
-        context.rng("frames"),
-        brightness,
-        positions,
-        noise,
-        count=int(context.parameters["frames"]),
-        radius_deg=RADIUS_DEG,
-    )
-    first = next(frames)
+    first, frames = frames_of_seven(context.rng("frames"), noise, int(context.parameters["frames"]))
     for frame in frames:
         least = part.values.get("least") or part.values["share"] * len(frame.observed)
         result = ClusterFilter(part.values["epsilon"], least)(first.observed, frame.observed)
         lost.append(np.count_nonzero(~result.true_now))
-        try:
-            motion = estimate_motion(
-                first.observed.positions[result.matches[:, 0]], frame.observed.positions[result.matches[:, 1]]
-            )
-        except FilterError:
-            continue
-        shift_errors.append(float(np.hypot(*(motion.translation_deg - frame.shift_deg))))
+        motion = matched_motion(first.observed, frame.observed, result.matches)
+        if motion is not None:
+            shift_errors.append(motion_errors(motion, frame)[1])
     return {"lost": np.array(lost, dtype=np.float64), "shift": np.array(shift_errors)}
 
 
 def _choice_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    parts = _choice_parts(context.parameters)
     means = {
-        p.key: (
-            float(results[p.key]["lost"].mean()),
-            float(np.mean(results[p.key]["shift"])) if results[p.key]["shift"].size else math.nan,
+        part.key: (
+            float(results[part.key]["lost"].mean()),
+            float(np.mean(results[part.key]["shift"])) if results[part.key]["shift"].size else math.nan,
         )
-        for p in parts
+        for part in _choice_parts(context.parameters)
     }
-    write_csv(
-        context.folder / "parameter_choice.csv",
-        {
-            "part": [p.key for p in parts],
-            "lost_stars": [means[p.key][0] for p in parts],
-            "shift_error_deg": [means[p.key][1] for p in parts],
-        },
-    )
+    lines = [
+        {"part": key, "lost_stars": lost, "shift_error_deg": error} for key, (lost, error) in means.items()
+    ]
+    table = write_lines(context.folder / "parameter_choice.csv", lines)
+    epsilons, shares = context.parameters["epsilons"], context.parameters["shares"]
     fig, axes = figure(1, 2)
-    axes[0].plot(
-        context.parameters["epsilons"],
-        [means[f"eps{e:g}"][0] for e in context.parameters["epsilons"]],
-        "o-",
-        label="stars lost a frame",
-    )
-    axes[0].plot(
-        context.parameters["epsilons"],
-        [means[f"eps{e:g}"][1] for e in context.parameters["epsilons"]],
-        "s-",
-        label="error of the shift / °",
-    )
+    for i, (style, label) in enumerate((("o-", "stars lost a frame"), ("s-", "error of the shift / °"))):
+        axes[0].plot(epsilons, [means[f"eps{e:g}"][i] for e in epsilons], style, label=label)
     axes[0].set(xlabel="ε (min_samples = 3)")
     for epsilon in (0.4, 0.8):
-        shares = context.parameters["shares"]
-        axes[1].plot(
-            shares,
-            [means[f"share{s:g}-eps{epsilon:g}"][0] for s in shares],
-            "o-",
-            label=f"stars lost a frame, ε = {epsilon:g}",
-        )
+        lost_stars = [means[f"share{s:g}-eps{epsilon:g}"][0] for s in shares]
+        axes[1].plot(shares, lost_stars, "o-", label=f"stars lost a frame, ε = {epsilon:g}")
     axes[1].set(xlabel="min_samples / number of objects")
     for ax in axes:
         ax.legend()
@@ -150,140 +120,74 @@ def _choice_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
         ),
         shown("error of the shift, the same", printed=chosen[1], unit="°", digits=4),
     )
-    return Outcome(rows, ("parameter_choice.csv", name))
+    return Outcome(rows, (table, name))
 
 
 def _case_parts(parameters: Parameters) -> list[Part]:
-    return [
-        Part(f"f{f}-{kind}", {"false_stars": f, "kind": kind})
-        for f in parameters["false_stars"]
-        for kind in _CASES
-    ]
+    return parts_of("f{false_stars}-{kind}", false_stars=parameters["false_stars"], kind=_CASES)
 
 
 def _case_work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame()
-    kind = part.values["kind"]
-    noise = noise_of(
-        "both" if kind == "none" else kind, 0.0 if kind == "none" else 1.0, part.values["false_stars"]
-    )
+    kind, clean = part.values["kind"], part.values["kind"] == "none"
+    noise = noise_of("both" if clean else kind, 0.0 if clean else 1.0, part.values["false_stars"])
     counts = np.zeros(4, dtype=np.int64)
     errors = []
-    frames = moved_frames(
-        context.rng(part.key), brightness, positions, noise, count=_CASE_FRAMES, radius_deg=RADIUS_DEG
-    )
-    first = next(frames)
+    first, frames = frames_of_seven(context.rng(part.key), noise, _CASE_FRAMES)
     for frame in frames:
         result = ClusterFilter()(first.observed, frame.observed)
-        c = Confusion.of(result.true_now, frame.is_star)
-        counts += np.array([c.true_positive, c.false_positive, c.false_negative, c.true_negative])
-        motion = estimate_motion(
-            first.observed.positions[result.matches[:, 0]],
-            frame.observed.positions[result.matches[:, 1]],
-            model="affine",
-        )
-        errors.append(
-            (
-                abs(motion.rotation_deg - frame.rotation_deg),
-                float(np.hypot(*(motion.translation_deg - frame.shift_deg))),
-            )
-        )
+        counts += Confusion.of(result.true_now, frame.is_star).counts
+        motion = matched_motion(first.observed, frame.observed, result.matches, model="affine")
+        errors.append((math.nan, math.nan) if motion is None else motion_errors(motion, frame))
     return {"counts": counts, "errors": np.array(errors)}
 
 
 def _case_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    columns: dict[str, list[Any]] = {
-        k: []
-        for k in (
-            "f",
-            "noise",
-            "accuracy",
-            "precision",
-            "recall",
-            "rotation_error_deg",
-            "rotation_sigma_deg",
-            "shift_error_deg",
-            "shift_sigma_deg",
-            "published_accuracy",
-            "published_precision",
-            "published_rotation_error_deg",
-            "published_shift_error_deg",
-        )
-    }
+    lines = []
     rows: list[Row] = []
     for part in _case_parts(context.parameters):
-        c = Confusion(*(int(v) for v in results[part.key]["counts"]))
+        f, kind = part.values["false_stars"], part.values["kind"]
+        c = Confusion(*results[part.key]["counts"].tolist())
         errors = results[part.key]["errors"]
         mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1)
-        theirs = _CASE_TABLE[part.values["false_stars"], part.values["kind"]]
-        for column, value in zip(
-            columns.values(),
-            (
-                part.values["false_stars"],
-                part.values["kind"],
-                c.accuracy,
-                c.precision,
-                c.recall,
-                mean[0],
-                sigma[0],
-                mean[1],
-                sigma[1],
-                0.01 * theirs[0],
-                0.01 * theirs[1],
-                theirs[2],
-                theirs[4],
-            ),
-            strict=True,
-        ):
-            column.append(value)
-        where = f"f = {part.values['false_stars']}, noise: {part.values['kind']}"
+        accuracy, precision, *published = _CASE_TABLE[f, kind]
+        line = {"f": f, "noise": kind, "accuracy": c.accuracy, "precision": c.precision, "recall": c.recall}
+        line |= {"rotation_error_deg": mean[0], "rotation_sigma_deg": sigma[0]}
+        line |= {"shift_error_deg": mean[1], "shift_sigma_deg": sigma[1]}
+        line |= {"published_accuracy": 0.01 * accuracy, "published_precision": 0.01 * precision}
+        line |= {"published_rotation_error_deg": published[0], "published_shift_error_deg": published[2]}
+        lines.append(line)
+        where = f"f = {f}, noise: {kind}"
         rows += [
             agreement(
                 f"table 6.3, {where}: {name}",
-                published=published,
-                tolerance=sampling(published, _CASE_STARS),
-                printed=100.0 * value,
+                published=theirs,
+                tolerance=sampling(theirs, _CASE_STARS),
+                printed=c.percent(name),
                 unit="%",
             )
-            for name, published, value in (("precision", theirs[1], c.precision), ("recall", 100.0, c.recall))
+            for name, theirs in (("precision", precision), ("recall", 100.0))
         ]
         rows += [
             agreement(
                 f"table 6.4, {where}: {symbol}",
-                published=published,
-                tolerance=sampled_mean(max(spread, _ROUNDING_ERROR_DEG), _CASE_FRAMES),
+                published=published[2 * i],
+                tolerance=sampled_mean(max(published[2 * i + 1], _ROUNDING_ERROR_DEG), _CASE_FRAMES),
                 printed=float(mean[i]),
                 unit="°",
                 digits=4,
             )
-            for i, (symbol, published, spread) in enumerate(
-                (("ε_γ", theirs[2], theirs[3]), ("ε_ρ", theirs[4], theirs[5]))
-            )
+            for i, symbol in enumerate(("ε_γ", "ε_ρ"))
         ]
-    write_csv(context.folder / "tables_6_3_and_6_4.csv", columns)
-    return Outcome(
-        tuple(rows),
-        ("tables_6_3_and_6_4.csv", _reconstruction_figure(context)),
-        (
-            "Ten moved frames, noise factor 1. The thesis gives rotation errors of 0.7° in most rows of table 6.4, even without noise: its sign or reference must have differed. Figure 6.13 shows the stars of a frame and the earlier frame's stars moved by the estimated motion, without and with noise.",
-        ),
-    )
+    table = write_lines(context.folder / "tables_6_3_and_6_4.csv", lines)
+    return Outcome(tuple(rows), (table, _reconstruction_figure(context)), (_CASE_NOTE,))
 
 
 def _reconstruction_figure(context: Context) -> str:
     """The stars of a moved frame and those of the frame before, moved by the estimated motion: figure 6.13."""
-    brightness, positions = first_frame()
     fig, axes = figure(1, 2, width=9.5, height=4.6, sharey=True)
     for factor, ax in zip((0.0, 1.0), axes, strict=True):
-        frames = moved_frames(
-            context.rng("figure 6.13"),
-            brightness,
-            positions,
-            noise_of("both", factor, 0),
-            count=1,
-            radius_deg=RADIUS_DEG,
-        )
-        first, second = (frame.observed for frame in frames)
+        clean, frames = frames_of_seven(context.rng("figure 6.13"), noise_of("both", factor, 0), 1)
+        first, second = clean.observed, next(frames).observed
         matches = ClusterFilter()(first, second).matches
         stars = second.positions[matches[:, 1]]
         motion = estimate_motion(first.positions[matches[:, 0]], stars)
@@ -310,35 +214,19 @@ def _reconstruction_figure(context: Context) -> str:
 
 
 def _correlation_parts(parameters: Parameters) -> list[Part]:
-    return [Part(f"m{m}", {"factor": m}) for m in parameters["factors"]]
+    return parts_of("m{factor}", factor=parameters["factors"])
 
 
 def _correlation_work(context: Context, part: Part) -> Results:
-    brightness, positions = first_frame()
     factor = part.values["factor"]
-    frames = moved_frames(
-        context.rng(part.key),
-        brightness,
-        positions,
-        noise_of("both", float(factor), factor),
-        count=int(context.parameters["frames"]),
-        radius_deg=RADIUS_DEG,
-    )
-    first = next(frames)
+    noise = noise_of("both", float(factor), factor)
+    first, frames = frames_of_seven(context.rng(part.key), noise, int(context.parameters["frames"]))
     values = []
     for frame in frames:
-        result = ClusterFilter()(first.observed, frame.observed)
-        if result.matches.shape[0] < 3:
-            continue
-        try:
-            motion = estimate_motion(
-                first.observed.positions[result.matches[:, 0]],
-                frame.observed.positions[result.matches[:, 1]],
-                model="affine",
-            )
-        except FilterError:
-            continue
-        values.append((motion.mean_distance_deg, motion.sigma_distance_deg))
+        matches = ClusterFilter()(first.observed, frame.observed).matches
+        motion = matched_motion(first.observed, frame.observed, matches, model="affine")
+        if motion is not None:
+            values.append((motion.mean_distance_deg, motion.sigma_distance_deg))
     return {"motion": np.array(values)}
 
 
@@ -349,14 +237,14 @@ def _of_correlation(published: float, trials: int) -> Tolerance:
 
 
 def _correlation_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    rows, table = [], []
+    rows, lines = [], []
     parts = _correlation_parts(context.parameters)
     fig, axes = figure(len(parts), 1, height=1.6 * len(parts), squeeze=False)
     for part, ax in zip(parts, axes[:, 0], strict=True):
         motion = results[part.key]["motion"]
         rho, p = correlation(motion[:, 0], motion[:, 1])
         factor = part.values["factor"]
-        table.append((factor, rho, p))
+        lines.append({"factor": factor, "rho": rho, "p": p})
         published = _PUBLISHED_CORRELATION[factor]
         rows.append(
             agreement(
@@ -374,25 +262,13 @@ def _correlation_finish(context: Context, results: Mapping[str, Results]) -> Out
         ax.legend(loc="upper right")
     axes[-1, 0].set_xlabel("trial")
     name = save(fig, context.folder / "figures_6_31_6_32_d.png")
-    write_csv(
-        context.folder / "table_6_5.csv",
-        dict(zip(("factor", "rho", "p"), zip(*table, strict=True), strict=True)),
-    )
-    return Outcome(
-        tuple(rows),
-        ("table_6_5.csv", name),
-        (
-            "With noise the two rise and fall together as published; coefficients near 1 come from single frames with a wrong match, of which there are few here.",
-        ),
-    )
+    table = write_lines(context.folder / "table_6_5.csv", lines)
+    note = "With noise the two rise and fall together as published; coefficients near 1 come from single frames with a wrong match, of which there are few here."
+    return Outcome(tuple(rows), (table, name), (note,))
 
 
 def _crowd_parts(parameters: Parameters) -> list[Part]:
-    return [
-        Part(f"{kind}-{true}", {"kind": kind, "true_stars": true})
-        for kind in _KINDS
-        for true in parameters["true_stars"]
-    ]
+    return parts_of("{kind}-{true_stars}", kind=_KINDS, true_stars=parameters["true_stars"])
 
 
 def _crowd_work(context: Context, part: Part) -> Results:
@@ -424,42 +300,30 @@ def _crowd_work(context: Context, part: Part) -> Results:
         known = inside & ((before[0] & before[1]) | (np.arange(len(places)) >= total))
         before = (inside, before[0])
         if t >= 4:
-            c = Confusion.of(result.true_now[known[inside]], (np.arange(len(places)) < total)[known])
-            counts += np.array([c.true_positive, c.false_positive, c.false_negative, c.true_negative])
+            is_star = (np.arange(len(places)) < total)[known]
+            counts += Confusion.of(result.true_now[known[inside]], is_star).counts
     return {"counts": counts, "ms": np.array(times[1:])}
 
 
 def _crowd_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows = []
     for part in _crowd_parts(context.parameters):
-        c = Confusion(*(int(v) for v in results[part.key]["counts"]))
+        c = Confusion(*results[part.key]["counts"].tolist())
         true = part.values["true_stars"]
         words = f"{true} true and {true // 3} {part.values['kind']} false stars"
-        rows.append(row(f"scalable filter, recall, {words}", ours=100.0 * c.recall, unit="%", at_least=99.0))
-        rows.append(
-            row(
-                f"scalable filter, precision, {words}",
-                ours=100.0 * c.precision,
-                unit="%",
-                at_least=99.5,
-            )
-        )
-        quick = float(np.percentile(results[part.key]["ms"], 10.0))
+        rows += [
+            row(f"scalable filter, {name}, {words}", ours=c.percent(name), unit="%", at_least=least)
+            for name, least in (("recall", 99.0), ("precision", 99.5))
+        ]
         rows.append(
             row(
                 f"scalable filter, time a frame, {words}",
-                ours=quick,
+                ours=float(np.percentile(results[part.key]["ms"], 10.0)),
                 unit="ms",
                 at_most=5.0 if true == 150 and not context.quick else None,
             )
         )
-    return Outcome(
-        tuple(rows),
-        (),
-        (
-            "Counted are the true stars that were in the field in the two frames before as well, since the filter wants three sightings, and all false ones. Drifting stars that move by less than the gate from frame to frame need a few frames more to be told. The time is that of the quickest tenth of the frames, since other work on the machine adds to the rest.",
-        ),
-    )
+    return Outcome(tuple(rows), (), (_CROWD_NOTE,))
 
 
 EXPERIMENTS: Final = (

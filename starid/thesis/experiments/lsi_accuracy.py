@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starid.thesis.experiments.comparison import Readings, agreement, improvement, sampled_mean, shown
+from starid.arrays import Array
+from starid.thesis.experiments.comparison import agreement, improvement, sampled_mean, shown
 from starid.thesis.experiments.experiment import (
     Context,
     Experiment,
@@ -18,10 +18,21 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     row,
     write_csv,
 )
-from starid.thesis.experiments.lsi_trials import COLUMNS, FRAMES, OFF, ON, ROWS, share, solve_frames
+from starid.thesis.experiments.lsi_trials import (
+    COLUMNS,
+    FRAMES,
+    GRID_WORDS,
+    OFF,
+    ON,
+    ROWS,
+    share,
+    shares,
+    solve_frames,
+)
 from starid.thesis.experiments.plots import colours, figure, precision_curve, save
 from starid.thesis.metrics import error_colours
 
@@ -31,11 +42,11 @@ _POINTS: Final = 1.5
 _PSI: Final = (0.49, 0.54)
 """Mean and deviation of ε_ψ without noise, table H.1."""
 _MAP_SCALES: Final = (0.1, 1.0)
-_GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 _BEST: Final = 99.5
 _COMPARED_FROM: Final = 99.0
 _SAME: Final = 1e-6
 _AGREES: Final = 1e-4
+_TIE_WORDS: Final = "Where several weights ω reconstruct the observation equally well, the last digit of the features decides between them."
 
 _NOTE: Final = """The thesis's frames have their lower-left corner at α = 2° + 5°·k, δ = −88° + 5°·m. With p = 99.5 % the
 grid's step is 0.2°, so that every one of these frames is a frame of the database: the search finds the observation
@@ -57,18 +68,10 @@ more than 0.01° away."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    parts = [
-        Part(f"p{percent:g}-{grid}", {"percent": percent, "grid": grid, "roll": 0.0})
-        for percent in parameters["percent"]
-        for grid in (ON, OFF)
-    ]
-    return parts + [
-        Part(
-            f"p{parameters['roll_percent']:g}-roll{roll:g}-{grid}",
-            {"percent": parameters["roll_percent"], "grid": grid, "roll": roll},
-        )
-        for roll in parameters["rolls"]
-        for grid in (ON, OFF)
+    grids, rolled = (ON, OFF), [parameters["roll_percent"]]
+    return [
+        *parts_of("p{percent:g}-{grid}", percent=parameters["percent"], grid=grids, roll=[0.0]),
+        *parts_of("p{percent:g}-roll{roll:g}-{grid}", percent=rolled, roll=parameters["rolls"], grid=grids),
     ]
 
 
@@ -86,7 +89,7 @@ def _work(context: Context, part: Part) -> Results:
     )
 
 
-def _error_map(axes: Any, errors: NDArray[np.float64], limit: float) -> Any:
+def _error_map(axes: Any, errors: Array, limit: float) -> Any:
     from matplotlib.colors import ListedColormap
 
     scheme = ListedColormap(error_colours(np.linspace(0.0, 1.0, 256), 1.0))
@@ -138,7 +141,7 @@ def _roll_figure(
         axis.set_ylabel("δ / °")
         fig.colorbar(image, ax=axis, label="ε_f / °", extend="max")
     axes[-1, 0].set_xlabel("α of the centre / °")
-    fig.suptitle(f"ε_f (MSE) as the author ran it, p = {percent:g} %, frames {_GRID_WORDS[grid]}")
+    fig.suptitle(f"ε_f (MSE) as the author ran it, p = {percent:g} %, frames {GRID_WORDS[grid]}")
     return save(fig, path)
 
 
@@ -166,7 +169,7 @@ def _precision_figure(
                     color=colour,
                     label=f"p = {percent:g} %",
                 )
-            axes[i, j].set_title(f"{word}, {_GRID_WORDS[grid]}")
+            axes[i, j].set_title(f"{word}, {GRID_WORDS[grid]}")
             axes[i, j].set_xlabel(f"threshold of {symbol} / °")
             if j:
                 axes[i, j].set_ylabel("")
@@ -177,38 +180,25 @@ def _precision_figure(
 def _on_grid_rows(result: Results) -> list[Row]:
     where = f"LSI (MSE), p = {_BEST:g} %, on the grid"
     tolerance = (_POINTS, f"{_POINTS:g} points; the standard error of 1 701 frames is 0.7 to 1.2")
-    rows = []
-    for limit, published in _PUBLISHED.items():
-        values: Readings = {
-            "author": share(result["f_author_mse"], limit),
-            "printed": share(result["f_mse"], limit),
-            "ours": share(result["f_fine"], limit),
-        }
-        rows.append(
+    psi, spread = _PSI
+    return [
+        *(
             agreement(
                 f"{where}: share with ε_f ≤ {limit:g}°",
                 published=published,
                 tolerance=tolerance,
-                **values,
+                **shares(result, limit),
                 unit="%",
             )
-        )
-    gross: Readings = {
-        "author": 100.0 - share(result["f_author_mse"], 1.0),
-        "printed": 100.0 - share(result["f_mse"], 1.0),
-        "ours": 100.0 - share(result["f_fine"], 1.0),
-    }
-    rows.append(
+            for limit, published in _PUBLISHED.items()
+        ),
         agreement(
             f"{where}: share with ε_f > 1°",
             published=0.0,
             tolerance=(0.0, "none: no frame of figure 6.1 exceeds 1°"),
-            **gross,
+            **shares(result, 1.0, beyond=True),
             unit="%",
-        )
-    )
-    psi, spread = _PSI
-    rows.append(
+        ),
         agreement(
             f"{where}: mean ε_ψ",
             published=psi,
@@ -216,67 +206,72 @@ def _on_grid_rows(result: Results) -> list[Row]:
             author=float(result["psi_author"].mean()),
             printed=float(result["psi_mse"].mean()),
             remark="Published of the sequences of table H.1.",
-        )
-    )
-    rows += [
-        shown(
-            f"{where}: share with ε_θ ≤ {limit:g}°",
-            published=words,
-            author=share(result["theta_author_mse"], limit),
-            printed=share(result["theta_mse"], limit),
-            ours=share(result["theta_fine"], limit),
-            unit="%",
-            remark="Published as a curve; here the angle is averaged on the circle.",
-        )
-        for limit, words in ((0.2, "hardly over 60 %"), (1.0, "nearly 70 %"))
+        ),
+        *(
+            shown(
+                f"{where}: share with ε_θ ≤ {limit:g}°",
+                published=words,
+                **shares(result, limit, "theta"),
+                unit="%",
+                remark="Published as a curve; here the angle is averaged on the circle.",
+            )
+            for limit, words in ((0.2, "hardly over 60 %"), (1.0, "nearly 70 %"))
+        ),
     ]
-    return rows
 
 
 def _off_grid_rows(result: Results) -> list[Row]:
     where = f"p = {_BEST:g} %, off the grid"
-    rows = [
-        shown(
-            f"LSI (MSE) and sub-cell (ours), {where}: share with ε_f ≤ {limit:g}°",
-            author=share(result["f_author_mse"], limit),
-            printed=share(result["f_mse"], limit),
-            ours=share(result["f_fine"], limit),
-            unit="%",
-        )
-        for limit in _PUBLISHED
-    ]
-    rows += [
-        improvement(
-            f"stars compared (ours), {where}: share with ε_f ≤ {limit:g}°",
-            published=published,
-            ours=share(result["f_stars"], limit),
-            larger=True,
-            unit="%",
-            remark="Published on the grid, where it is easier.",
-        )
-        for limit, published in _PUBLISHED.items()
-    ]
-    rows += [
-        row(
-            f"{name} (ours), {where}: share with ε_f ≤ {limit:g}°, against LSI on the same frames",
-            ours=share(result[key], limit),
-            unit="%",
-            passed=share(result[key], limit) >= share(result["f_mse"], limit),
-            target="≥ LSI as printed on the same frames",
-        )
-        for name, key in (("sub-cell", "f_fine"), ("stars compared", "f_stars"))
-        for limit in (0.3, 0.1)
-    ]
-    rows.append(
+    return [
+        *(
+            shown(
+                f"LSI (MSE) and sub-cell (ours), {where}: share with ε_f ≤ {limit:g}°",
+                **shares(result, limit),
+                unit="%",
+            )
+            for limit in _PUBLISHED
+        ),
+        *(
+            improvement(
+                f"stars compared (ours), {where}: share with ε_f ≤ {limit:g}°",
+                published=published,
+                ours=share(result["f_stars"], limit),
+                larger=True,
+                unit="%",
+                remark="Published on the grid, where it is easier.",
+            )
+            for limit, published in _PUBLISHED.items()
+        ),
+        *(
+            row(
+                f"{name} (ours), {where}: share with ε_f ≤ {limit:g}°, against LSI on the same frames",
+                ours=share(result[key], limit),
+                unit="%",
+                passed=share(result[key], limit) >= share(result["f_mse"], limit),
+                target="≥ LSI as printed on the same frames",
+            )
+            for name, key in (("sub-cell", "f_fine"), ("stars compared", "f_stars"))
+            for limit in (0.3, 0.1)
+        ),
         shown(
             f"LSI (MSE) and stars compared (ours), {where}: share with ε_f > 1°",
-            author=100.0 - share(result["f_author_mse"], 1.0),
-            printed=100.0 - share(result["f_mse"], 1.0),
-            ours=100.0 - share(result["f_stars"], 1.0),
+            **shares(result, 1.0, ours="stars", beyond=True),
             unit="%",
-        )
+        ),
+    ]
+
+
+def _listed(
+    quantity: str, sets: Sequence[Results], conditions: Sequence[float], published: str | None, digits: int
+) -> Row:
+    """A row with the share within 0.3° under each of several conditions, in all readings."""
+    found = [shares(one, 0.3) for one in sets]
+    author, printed, ours = (
+        ", ".join(f"{one[reading]:.{digits}f}" for one in found) + " %"
+        for reading in ("author", "printed", "ours")
     )
-    return rows
+    quantity = quantity.format(", ".join(f"{condition:g}" for condition in conditions))
+    return shown(quantity, published=published, author=author, printed=printed, ours=ours)
 
 
 def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
@@ -284,38 +279,25 @@ def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
     if _BEST in percents:
         rows += _on_grid_rows(results[f"p{_BEST:g}-{ON}"]) + _off_grid_rows(results[f"p{_BEST:g}-{OFF}"])
         rows.append(_order_row(results, percents))
-    order = ", ".join(f"{percent:g}" for percent in percents)
     for grid, published in ((ON, "grows up to 99.5 %"), (OFF, None)):
-        listed = {
-            kind: ", ".join(
-                f"{share(results[f'p{percent:g}-{grid}'][f'f_{kind}'], 0.3):.1f}" for percent in percents
-            )
-            for kind in ("author_mse", "mse", "fine")
-        }
-        rows.append(
-            shown(
-                f"LSI (MSE), {_GRID_WORDS[grid]}: share with ε_f ≤ 0.3° for p = {order} %",
-                published=published,
-                author=listed["author_mse"] + " %",
-                printed=listed["mse"] + " %",
-                ours=listed["fine"] + " %",
-            )
-        )
+        quantity = f"LSI (MSE), {GRID_WORDS[grid]}: share with ε_f ≤ 0.3° for p = {{}} %"
+        sets = [results[f"p{percent:g}-{grid}"] for percent in percents]
+        rows.append(_listed(quantity, sets, percents, published, 1))
     return rows
 
 
 def _order_row(results: Mapping[str, Results], percents: list[float]) -> Row:
-    best = {
-        kind: max(percents, key=lambda percent: share(results[f"p{percent:g}-{ON}"][f"f_{kind}"], 0.3))
+    author, printed, ours = (
+        max(percents, key=lambda percent: share(results[f"p{percent:g}-{ON}"][f"f_{kind}"], 0.3))
         for kind in ("author_mse", "mse", "fine")
-    }
+    )
     return agreement(
         "on the grid: the overlap p with most frames within 0.3°",
         published=_BEST,
         tolerance=(0.0, "none"),
-        author=best["author_mse"],
-        printed=best["mse"],
-        ours=best["fine"],
+        author=author,
+        printed=printed,
+        ours=ours,
         unit="%",
         digits=1,
         remark="The finer database of 99.6 % does worse because the test frames are not on its grid: that the thesis, too, finds "
@@ -328,47 +310,31 @@ def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float
     for grid in (ON, OFF):
         sets = [results[f"p{percent:g}-roll{roll:g}-{grid}"] for roll in rolls]
         frames = sets[0]["f_mse"].size
-        where = f"p = {percent:g} %, {_GRID_WORDS[grid]}: frames of {frames}"
-
-        def changed(name: str, sets: list[Results] = sets) -> int:
-            return max(int(np.sum(np.abs(other[name] - sets[0][name]) > _SAME)) for other in sets[1:])
-
-        for what, author, printed in (
-            ("ε_ψ", "psi_author", "psi_mse"),
-            ("ε_f", "f_author_mse", "f_mse"),
+        where = f"p = {percent:g} %, {GRID_WORDS[grid]}: frames of {frames}"
+        for what, names, remark in (
+            ("ε_ψ", ("psi_author", "psi_mse"), ""),
+            ("ε_f", ("f_author_mse", "f_mse"), _TIE_WORDS),
         ):
-            counted: Readings = {"author": float(changed(author)), "printed": float(changed(printed))}
-            quantity = f"{where} whose {what} changes when the camera is turned"
-            remark = (
-                "Where several weights ω reconstruct the observation equally well, the last digit of the features decides between them."
-                if what == "ε_f"
-                else ""
+            author, printed = (
+                float(max(np.sum(np.abs(other[name] - sets[0][name]) > _SAME) for other in sets[1:]))
+                for name in names
             )
+            quantity = f"{where} whose {what} changes when the camera is turned"
             rows.append(
                 agreement(
                     quantity,
                     published=0.0,
                     tolerance=(0.0, "none: the maps are called exactly identical"),
-                    **counted,
+                    author=author,
+                    printed=printed,
                     digits=0,
                     remark=remark,
                 )
                 if grid == ON
-                else shown(quantity, **counted, digits=0)
+                else shown(quantity, author=author, printed=printed, digits=0)
             )
-        listed = {
-            kind: ", ".join(f"{share(one[f'f_{kind}'], 0.3):.2f}" for one in sets) + " %"
-            for kind in ("author_mse", "mse", "fine")
-        }
-        rows.append(
-            shown(
-                f"p = {percent:g} %, {_GRID_WORDS[grid]}: share with ε_f ≤ 0.3° at roll {', '.join(f'{r:g}' for r in rolls)}°",
-                published="equal",
-                author=listed["author_mse"],
-                printed=listed["mse"],
-                ours=listed["fine"],
-            )
-        )
+        quantity = f"p = {percent:g} %, {GRID_WORDS[grid]}: share with ε_f ≤ 0.3° at roll {{}}°"
+        rows.append(_listed(quantity, sets, rolls, "equal", 2))
     return rows
 
 
@@ -377,11 +343,11 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     rolls = [float(roll) for roll in context.parameters["rolls"]]
     roll_percent = float(context.parameters["roll_percent"])
     folder = context.folder
-    mapped = [percent for percent in percents if percent in (99.1, 99.2, 99.3, 99.4, 99.5)] or percents[-1:]
+    mapped = [percent for percent in percents if 99.1 <= percent <= 99.5] or percents[-1:]
     files = []
     for number, kind, word in ((1, "author_mse", "MSE"), (2, "author_1se", "1SE")):
         for grid in (ON, OFF):
-            title = f"ε_f of the {word} solution as the author ran it, frames {_GRID_WORDS[grid]}"
+            title = f"ε_f of the {word} solution as the author ran it, frames {GRID_WORDS[grid]}"
             path = folder / f"figure_6_{number}_{grid}.png"
             files.append(_map_figure(path, results, mapped, kind, grid, title))
     for grid in (ON, OFF) if "every" not in context.parameters else ():
@@ -415,15 +381,11 @@ def _tables(folder: Path, results: Mapping[str, Results], percents: list[float])
                     ordered = np.sort(results[f"p{percent:g}-{grid}"][f"{quantity}_{kind}"])
                     rate = 100.0 * np.searchsorted(ordered, thresholds, side="right") / ordered.size
                     columns[f"p{percent:g}_{grid}_{kind}_percent"] = rate
-        name = f"figure_6_{4 if quantity == 'f' else 5}.csv"
-        write_csv(folder / name, columns)
-        names.append(name)
+        names.append(write_csv(folder / f"figure_6_{4 if quantity == 'f' else 5}.csv", columns))
     for key, result in results.items():
-        name = f"errors_{key}.csv"
         columns = {"ra_deg": result["frames"][:, 0], "dec_deg": result["frames"][:, 1]}
-        columns.update({f"{n}": v for n, v in result.items() if n != "frames"})
-        write_csv(folder / name, columns)
-        names.append(name)
+        columns.update({name: values for name, values in result.items() if name != "frames"})
+        names.append(write_csv(folder / f"errors_{key}.csv", columns))
     return names
 
 

@@ -18,9 +18,10 @@ from starid.thesis.experiments.experiment import (
     Results,
     Row,
     write_csv,
+    write_lines,
 )
 from starid.thesis.experiments.lsi_patterns import complete, pattern_files, pattern_rows
-from starid.thesis.experiments.lsi_trials import OFF, ON, share, solve_frames
+from starid.thesis.experiments.lsi_trials import GRID_WORDS, OFF, ON, count_words, share, solve_frames
 from starid.thesis.experiments.plots import colours, figure, precision_curve, save
 from starid.thesis.simulation import NoiseModel
 
@@ -34,7 +35,6 @@ _ROOT: Final = 0.25
 """As the author ran it, by the published shares: a noise "σ" has the standard deviation 0.25·√σ pixels and units."""
 _UNIT_RANGE: Final = (11.5, 12.5)
 """Reading (i): the 255 steps of intensity span one magnitude."""
-_GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 _KIND_WORDS: Final = {
     "position": "positional noise / px",
     "brightness": "brightness noise / intensity units",
@@ -170,7 +170,7 @@ def _noise_figure(
                 precision_curve(
                     axes[i, j], errors, limit, color=colour, label=label, ls="--" if "mean" in key else "-"
                 )
-            axes[i, j].set_title(f"{_KIND_WORDS[kind]}, {_GRID_WORDS[grid]}")
+            axes[i, j].set_title(f"{_KIND_WORDS[kind]}, {GRID_WORDS[grid]}")
             axes[i, j].set_xlabel(f"threshold of ε_{'f' if quantity == 'f' else 'θ'} (MSE) / °")
         axes[i, 0].legend(loc="lower right")
     number = 6 if quantity == "f" else 7
@@ -186,9 +186,9 @@ def _false_figure(context: Context, results: Mapping[str, Results]) -> str:
             for count, colour in zip(range(4), ["black", *colours(3)], strict=True):
                 key = f"{kind}-{count}-{grid}" if count else f"none-{grid}"
                 if key in results:
-                    label = f"{count} {kind} star{'s' if count > 1 else ''}" if count else "no noise"
+                    label = count_words(count, kind) if count else "no noise"
                     precision_curve(axes[i, j], results[key]["f_mse"], 1.0, color=colour, label=label)
-            axes[i, j].set_title(f"{kind} stars, {_GRID_WORDS[grid]}")
+            axes[i, j].set_title(f"{kind} stars, {GRID_WORDS[grid]}")
             axes[i, j].set_xlabel("threshold of ε_f (MSE) / °")
             axes[i, j].legend(loc="center right")
     return save(fig, context.folder / "figure_6_8.png")
@@ -214,39 +214,28 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
     for number, kind, label in cases:
         if f"{kind}-1-{ON}" not in results:
             continue
-        columns: dict[str, list[Any]] = {"level": [], "grid": [], "method": [], "rate_percent": []}
+        lines: list[dict[str, Any]] = []
         fig, axis = figure(width=6.0, height=4.0)
         for grid, style in ((ON, "-"), (OFF, "--")):
             for method, word, colour, head in _curves(kind):
-                keys = {
-                    level: f"{head}{kind}-{level}-{grid}" if level else f"none-{grid}" for level in range(4)
-                }
-                rates = {
-                    level: share(results[key][f"f_{method}"], IDENTIFIED_DEG)
-                    for level, key in keys.items()
-                    if key in results
-                }
-                axis.plot(
-                    list(rates),
-                    list(rates.values()),
-                    style,
-                    marker="o",
-                    color=colour,
-                    label=f"{word}, {_GRID_WORDS[grid]}",
-                )
-                for level, rate in rates.items():
-                    for name, value in zip(columns, (level, grid, method, rate), strict=True):
-                        columns[name].append(value)
+                rates = {}
+                for level in range(4):
+                    key = f"{head}{kind}-{level}-{grid}" if level else f"none-{grid}"
+                    if key in results:
+                        rates[level] = share(results[key][f"f_{method}"], IDENTIFIED_DEG)
+                        line = {"level": level, "grid": grid, "method": method, "rate_percent": rates[level]}
+                        lines.append(line)
+                words = f"{word}, {GRID_WORDS[grid]}"
+                axis.plot(list(rates), list(rates.values()), style, marker="o", color=colour, label=words)
         published = _RATES.get(kind)
         if published:
             axis.plot(list(published), list(published.values()), "rx", ms=8, label="published (on the grid)")
         axis.set(xlabel=label, ylabel=f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %", xticks=range(4))
-        axis.set_ylim((0, 102) if kind == "false" else (min(50.0, min(columns["rate_percent"]) - 3.0), 101))
+        lowest = min(line["rate_percent"] for line in lines)
+        axis.set_ylim((0, 102) if kind == "false" else (min(50.0, lowest - 3.0), 101))
         axis.legend()
         files.append(save(fig, context.folder / f"figure_6_{number}.png"))
-        name = f"figure_6_{number}.csv"
-        write_csv(context.folder / name, columns)
-        files.append(name)
+        files.append(write_lines(context.folder / f"figure_6_{number}.csv", lines))
     return files
 
 
@@ -329,9 +318,7 @@ def _object_rows(results: Mapping[str, Results], grid: str) -> list[Row]:
                 continue
             result = results[key]
             author, printed = share(result["f_author_mse"], 1.0), share(result["f_mse"], 1.0)
-            quantity = (
-                f"{count} {kind} star{'s' if count > 1 else ''}, {_GRID_WORDS[grid]}: share with ε_f ≤ 1°"
-            )
+            quantity = f"{count_words(count, kind)}, {GRID_WORDS[grid]}: share with ε_f ≤ 1°"
             if count == 1 and grid == ON:
                 rows.append(
                     same(
@@ -343,33 +330,22 @@ def _object_rows(results: Mapping[str, Results], grid: str) -> list[Row]:
                         target=f"as the author ran it < {most:g} %",
                     )
                 )
-            else:
-                rows.append(
-                    shown(
-                        quantity,
-                        published="less" if count > 1 and grid == ON else None,
-                        author=author,
-                        printed=printed,
-                        unit="%",
-                    )
-                )
+                continue
+            less = "less" if grid == ON else None
+            rows.append(shown(quantity, published=less, author=author, printed=printed, unit="%"))
     return rows
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    rows: list[Row] = []
-    files: list[str] = []
-    rows += _noise_rows(results)
-    for grid in (ON, OFF):
-        rows += _object_rows(results, grid)
-    for quantity in ("f", "theta"):
-        for grid in (ON, OFF):
-            for author in (True, False):
-                name = _noise_figure(context, results, grid, quantity, author=author)
-                if name is not None:
-                    files.append(name)
-    files.append(_false_figure(context, results))
-    files += _rate_figures(context, results)
+    rows = _noise_rows(results) + _object_rows(results, ON) + _object_rows(results, OFF)
+    drawn = (
+        _noise_figure(context, results, grid, quantity, author=author)
+        for quantity in ("f", "theta")
+        for grid in (ON, OFF)
+        for author in (True, False)
+    )
+    files = [name for name in drawn if name is not None]
+    files += [_false_figure(context, results), *_rate_figures(context, results)]
     if complete(results):
         files += pattern_files(context, results)
         rows += pattern_rows(results)
@@ -382,8 +358,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             ]
     table["theta_mse_within_1_deg_percent"] = [share(r["theta_mse"], 1.0) for r in results.values()]
     table["psi_mse_median"] = [float(np.median(r["psi_mse"])) for r in results.values()]
-    write_csv(context.folder / "shares.csv", table)
-    files.append("shares.csv")
+    files.append(write_csv(context.folder / "shares.csv", table))
     database = context.database(_OVERLAP)
     unit = database.scale[1] * NoiseModel().magnitude_per_unit
     counts = [context.sky().features(ra % 360.0, dec).n for ra, dec in results[f"none-{ON}"]["frames"]]

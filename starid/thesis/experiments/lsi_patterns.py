@@ -6,30 +6,22 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import Readings, agreement, same, shown
 from starid.thesis.experiments.experiment import Context, Results, Row, write_csv
-from starid.thesis.experiments.lsi_trials import OFF, ON
+from starid.thesis.experiments.lsi_trials import GRID_WORDS, OFF, ON, count_words
 from starid.thesis.experiments.plots import colours, figure, save
 
 _CASES: Final = {
     "none": "no noise",
-    "root-both-1": "μ = 1",
-    "root-both-2": "μ = 2",
-    "root-both-3": "μ = 3",
-    "false-1": "1 false star",
-    "false-2": "2 false stars",
-    "false-3": "3 false stars",
-    "missing-1": "1 missing star",
-    "missing-2": "2 missing stars",
-    "missing-3": "3 missing stars",
+    **{f"root-both-{n}": f"μ = {n}" for n in (1, 2, 3)},
+    **{f"{kind}-{n}": count_words(n, kind) for kind in ("false", "missing") for n in (1, 2, 3)},
 }
 _GROUPS: Final = (("root-both", "noise"), ("false", "false stars"), ("missing", "missing stars"))
 _TRIALS: Final = slice(559, 600)
 _LEAST: Final = 1e-6
 _STEP: Final = 0.01
-_GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 
 
 def complete(results: Mapping[str, Results]) -> bool:
@@ -37,7 +29,7 @@ def complete(results: Mapping[str, Results]) -> bool:
     return all(f"{case}-{grid}" in results for case in _CASES for grid in (ON, OFF))
 
 
-def _logarithm(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _logarithm(errors: Array) -> Array:
     return np.asarray(1.0 + np.log10(np.maximum(errors, _LEAST)), dtype=np.float64)
 
 
@@ -54,13 +46,11 @@ def _patterns(context: Context, results: Mapping[str, Results], grid: str) -> st
     for j in range(2):
         axes[0, j].legend(loc="upper right")
         axes[-1, j].set_xlabel("trial")
-    fig.suptitle(f"LSI (MSE) as the author ran it, trials 560 to 600, frames {_GRID_WORDS[grid]}")
+    fig.suptitle(f"LSI (MSE) as the author ran it, trials 560 to 600, frames {GRID_WORDS[grid]}")
     return save(fig, context.folder / f"figures_6_20_to_6_27_and_b_{grid}.png")
 
 
-def _below_thresholds(
-    errors: NDArray[np.float64], psi: NDArray[np.float64], thresholds: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _below_thresholds(errors: Array, psi: Array, thresholds: Array) -> tuple[Array, Array]:
     """Mean and standard deviation of the errors whose ε_ψ is below each threshold; NaN where there are none."""
     order = np.argsort(psi)
     counts = np.searchsorted(psi[order], thresholds)
@@ -86,15 +76,14 @@ def _thresholds(context: Context, results: Mapping[str, Results], quantity: str)
                 for k, (values, name) in enumerate(zip(pair, ("mean", "deviation"), strict=True)):
                     axis = axes[i, 2 * g + k]
                     axis.plot(thresholds, values, color=colour, label=_CASES[case])
-                    axis.set_title(f"{words}, {_GRID_WORDS[grid]}")
+                    axis.set_title(f"{words}, {GRID_WORDS[grid]}")
                     axis.set_ylabel(f"{name} of {symbol} / °")
                     columns[f"{case}_{grid}_{name}_deg"] = values
         axes[i, 0].legend()
     for axis in axes[-1]:
         axis.set_xlabel("threshold of ε_ψ")
     name = "figures_6_28_to_6_30" if quantity == "f" else "figures_c"
-    write_csv(context.folder / f"{name}.csv", columns)
-    return [save(fig, context.folder / f"{name}.png"), f"{name}.csv"]
+    return [save(fig, context.folder / f"{name}.png"), write_csv(context.folder / f"{name}.csv", columns)]
 
 
 def pattern_files(context: Context, results: Mapping[str, Results]) -> list[str]:
@@ -136,7 +125,7 @@ def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
                 if kept.size
                 else ""
             )
-            quantity = f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {_GRID_WORDS[grid]}"
+            quantity = f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {GRID_WORDS[grid]}"
             remark = f"As the author ran it ε_ψ < 1 in {100.0 * kept.size / below.size:.0f} % of the frames{beyond}."
             if grid == OFF:
                 rows.append(shown(quantity, **rank, remark=remark))

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
+from starid.thesis.experiments.classics import SHORT, TABLE_6_2
 from starid.thesis.experiments.comparison import improvement, shown
 from starid.thesis.experiments.experiment import (
     Context,
@@ -18,7 +19,8 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
-    write_csv,
+    parts_of,
+    write_lines,
 )
 from starid.thesis.experiments.lsi_trials import OFF, ON, frames_under_test
 
@@ -40,17 +42,6 @@ _STAGES: Final = ("extraction", "search", "dictionary", "lasso", "estimation", "
 _WORDS: Final = ("feature extraction", "1NN search", "dictionary", "LASSO", "estimation", "total")
 _PASSES: Final = 3
 _COMPARED: Final = ("1NN search", "LASSO", "total")
-_RIVALS: Final = {
-    "PA": (130.57, 27.5),
-    "MGA": (7380.0, 394.6),
-    "LPT": (665.89, 73.8),
-    "VP": (280.72, 7.8),
-    "GA": (331.0, 185.6),
-    "SVD": (1483.0, 13.4),
-    "OSV": (145.0, 35.2),
-    "the thesis's LSI": (6300.0, 46.1),
-}
-"""Table 6.2: database, kB, and run time, ms."""
 _BEST: Final = 99.5
 _LARGEST: Final = 99.75
 
@@ -61,14 +52,10 @@ linear path. The rivals of table 6.2 are quoted by the thesis from their papers,
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    return [
-        Part(f"p{percent:g}-{grid}", {"percent": percent, "grid": grid})
-        for percent in parameters["percent"]
-        for grid in (ON, OFF)
-    ]
+    return parts_of("p{percent:g}-{grid}", percent=parameters["percent"], grid=(ON, OFF))
 
 
-def _milliseconds(count: int, work: Callable[[int], object]) -> NDArray[np.float64]:
+def _milliseconds(count: int, work: Callable[[int], object]) -> Array:
     """Least time of each of `count` calls in several passes, ms."""
     best = np.full(count, np.inf)
     for _ in range(_PASSES):
@@ -159,35 +146,26 @@ def _rows(results: Mapping[str, Results], percents: list[float], *, checked: boo
                         ("sub-cell search (ours)", "subcell"),
                     )
                 ]
+    names = {**SHORT, "lsi": "the thesis's LSI"}
     return rows + [
-        shown(f"table 6.2, quoted by the thesis: {name}", published=f"{size:g} kB, {time_ms:g} ms")
-        for name, (size, time_ms) in _RIVALS.items()
+        shown(f"table 6.2, quoted by the thesis: {names[name]}", published=f"{size:g} kB, {time_ms:g} ms")
+        for name, (size, time_ms) in TABLE_6_2.items()
     ]
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+    lines: list[dict[str, Any]] = []
+    for part in _parts(context.parameters):
+        published = (*_PUBLISHED[part.values["percent"]], "")
+        for stage, mean in zip(_STAGES, published, strict=True):
+            times = results[part.key][stage]
+            line = {**part.values, "stage": stage, "published_mean_ms": mean}
+            line |= {"median_ms": float(np.median(times)), "mean_ms": float(np.mean(times))}
+            line |= {"p99_ms": float(np.percentile(times, 99)), "worst_ms": float(np.max(times))}
+            lines.append(line)
     percents = [float(percent) for percent in context.parameters["percent"]]
-    columns: dict[str, list[Any]] = {"percent": [], "grid": [], "stage": []}
-    columns |= {"published_mean_ms": [], "median_ms": [], "mean_ms": [], "p99_ms": [], "worst_ms": []}
-    for percent in percents:
-        for grid in (ON, OFF):
-            for i, stage in enumerate(_STAGES):
-                times = results[f"p{percent:g}-{grid}"][stage]
-                values = (
-                    percent,
-                    grid,
-                    stage,
-                    _PUBLISHED[percent][i] if i < len(_WORDS) else "",
-                    float(np.median(times)),
-                    float(np.mean(times)),
-                    float(np.percentile(times, 99)),
-                    float(np.max(times)),
-                )
-                for name, value in zip(columns, values, strict=True):
-                    columns[name].append(value)
-    write_csv(context.folder / "table_6_1_times.csv", columns)
     rows = _rows(results, percents, checked=bool(context.parameters["checked"]))
-    return Outcome(tuple(rows), ("table_6_1_times.csv",), (_NOTE,))
+    return Outcome(tuple(rows), (write_lines(context.folder / "table_6_1_times.csv", lines),), (_NOTE,))
 
 
 EXPERIMENTS: Final = (

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
+from starid.thesis.experiments.comparison import Readings
 from starid.thesis.experiments.experiment import Context, Results
 from starid.thesis.features import extract_features
 from starid.thesis.lsi import LsiEstimate
@@ -34,8 +35,15 @@ _COMPARED_NEIGHBOURS: Final = 256
 ON, OFF = "on", "off"
 """The frames as they are, and moved off the grid."""
 
+GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
 
-def centres(every: int = 1) -> NDArray[np.float64]:
+
+def count_words(count: int, kind: str) -> str:
+    """How many false or missing stars, in words."""
+    return f"{count} {kind} star{'s' if count > 1 else ''}"
+
+
+def centres(every: int = 1) -> Array:
     """Centres of the test frames, (n, 2) degrees, row by row; only every so-many-th if asked for."""
     ra = 2.0 + 5.0 * np.arange(COLUMNS) + HALF_FRAME_DEG
     dec = -88.0 + 5.0 * np.arange(ROWS) + HALF_FRAME_DEG
@@ -43,9 +51,7 @@ def centres(every: int = 1) -> NDArray[np.float64]:
     return np.asarray(grid[::every], dtype=np.float64)
 
 
-def frames_under_test(
-    rng: np.random.Generator, grid: str, step_deg: float, every: int
-) -> NDArray[np.float64]:
+def frames_under_test(rng: np.random.Generator, grid: str, step_deg: float, every: int) -> Array:
     """Centres of the test frames; `grid` "off" moves each by its own random fraction of the grid step, both ways."""
     places = centres(every)
     if grid == OFF:
@@ -145,6 +151,17 @@ def solve_frames(
     }
 
 
-def share(errors: NDArray[np.float64], limit: float) -> float:
+def share(errors: Array, limit: float) -> float:
     """Share of errors within a limit, percent."""
     return float(100.0 * np.mean(errors <= limit))
+
+
+def shares(
+    result: Results, limit: float, quantity: str = "f", ours: str = "fine", *, beyond: bool = False
+) -> Readings:
+    """Share of errors within a limit, or beyond it, of LSI (MSE) in both readings and of a search of ours, percent."""
+    author, printed, best = (
+        100.0 - within if beyond else within
+        for within in (share(result[f"{quantity}_{kind}"], limit) for kind in ("author_mse", "mse", ours))
+    )
+    return {"author": author, "printed": printed, "ours": best}

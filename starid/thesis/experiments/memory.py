@@ -18,8 +18,9 @@ from starid.thesis.experiments.experiment import (
     Part,
     ReproduceError,
     Results,
+    parts_of,
     row,
-    write_csv,
+    write_lines,
 )
 
 _LIMIT_MB: Final = 400.0
@@ -31,7 +32,7 @@ file included. The compiled code is there before: the process is run twice, and 
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    return [Part(f"p{percent:g}", {"percent": percent}) for percent in parameters["percent"]]
+    return parts_of("p{percent:g}", percent=parameters["percent"])
 
 
 def _work(context: Context, part: Part) -> Results:
@@ -48,31 +49,24 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    percents = context.parameters["percent"]
-    megabytes = {
-        percent: {name: float(value) / 1e6 for name, value in results[f"p{percent:g}"].items()}
-        for percent in percents
-    }
-    write_csv(
-        context.folder / "memory.csv",
-        {
-            "percent": percents,
-            "loaded_mb": [megabytes[p]["loaded"] for p in percents],
-            "peak_mb": [megabytes[p]["peak"] for p in percents],
-        },
-    )
+    lines = []
+    for percent in context.parameters["percent"]:
+        sizes = results[f"p{percent:g}"]
+        lines.append(
+            {"percent": percent, **{f"{name}_mb": float(sizes[name]) / 1e6 for name in ("loaded", "peak")}}
+        )
     rows = tuple(
         row(
-            f"greatest memory of the process, database of {percent:g} %",
-            ours=megabytes[percent]["peak"],
+            f"greatest memory of the process, database of {line['percent']:g} %",
+            ours=line["peak_mb"],
             unit="MB",
             digits=0,
             at_most=_LIMIT_MB,
-            remark=f"{megabytes[percent]['loaded']:.0f} MB when the database is loaded and its tree is made",
+            remark=f"{line['loaded_mb']:.0f} MB when the database is loaded and its tree is made",
         )
-        for percent in percents
+        for line in lines
     )
-    return Outcome(rows, ("memory.csv",), (_NOTE,))
+    return Outcome(rows, (write_lines(context.folder / "memory.csv", lines),), (_NOTE,))
 
 
 EXPERIMENTS: Final = (

@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starid.thesis.cme import estimate_motion
+from starid.arrays import Array
+from starid.thesis.cme import matched_motion
 from starid.thesis.database import DatabaseParameters, build_database
 from starid.thesis.experiments.comparison import shown
 from starid.thesis.experiments.experiment import (
@@ -23,10 +23,10 @@ from starid.thesis.experiments.experiment import (
     Row,
     row,
     star_catalog,
-    write_csv,
+    write_lines,
 )
-from starid.thesis.experiments.lsi_trials import OFF, frames_under_test, share
-from starid.thesis.false_stars import FilterError, ObservedFrame
+from starid.thesis.experiments.lsi_trials import OFF, count_words, frames_under_test, share
+from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.features import FeatureError, FeatureVector, extract_features
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.lsi import LostInSpace
@@ -46,8 +46,7 @@ _CASES: Final = ("none", "missing-1", "missing-2", "missing-3", "false-1", "fals
 _WORDS: Final = {
     "none": "nothing missing",
     "covered": f"a body covers the field beyond {_COVERED_FROM_DEG:g}° on one side",
-    **{f"missing-{n}": f"{n} missing star{'s' if n > 1 else ''}" for n in (1, 2, 3)},
-    **{f"false-{n}": f"{n} false star{'s' if n > 1 else ''}" for n in (1, 2, 3)},
+    **{f"{kind}-{n}": count_words(n, kind) for kind in ("missing", "false") for n in (1, 2, 3)},
 }
 
 _NOTE: Final = f"""*Divided field*: nine circles of {_FRAME_DEG:g}° in the field of 40°, each searched in a database of that width (step
@@ -70,9 +69,7 @@ def _divided() -> DividedField:
     return DividedField(LostInSpace(database), half_width_deg=_HALF_WIDTH_DEG)
 
 
-def _spoiled(
-    rng: np.random.Generator, case: str, brightness: NDArray[np.float64], places: NDArray[np.float64]
-) -> ObservedFrame:
+def _spoiled(rng: np.random.Generator, case: str, brightness: Array, places: Array) -> ObservedFrame:
     """A frame with what a case takes from it or adds to it."""
     if case == "covered":
         seen = places[:, 0] < _COVERED_FROM_DEG
@@ -135,11 +132,8 @@ def _put_back(context: Context) -> Results:
         kept = np.delete(np.arange(len(whole)), rng.choice(inside))
         now = ObservedFrame(whole.brightness[kept], whole.positions[kept])
         result = cluster(before.observed, now)
-        try:
-            motion = estimate_motion(
-                before.observed.positions[result.matches[:, 0]], now.positions[result.matches[:, 1]]
-            )
-        except FilterError:
+        motion = matched_motion(before.observed, now, result.matches)
+        if motion is None:
             continue
         mended = restore_missing(
             before.observed,
@@ -167,20 +161,14 @@ def _work(context: Context, part: Part) -> Results:
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows: list[Row] = []
-    columns: dict[str, list[Any]] = {
-        "case": [],
-        "method": [],
-        "within_0.3": [],
-        "within_1": [],
-        "no_answer": [],
-    }
+    lines = []
     for part in _parts(context.parameters):
         errors = results[part.key]["errors"]
         names = ("as seen", "put back") if part.key == "put-back" else ("whole field", "divided field")
         for name, one in zip(names, errors, strict=True):
-            line = (part.key, name, share(one, 0.3), share(one, 1.0), 100.0 * float(np.mean(np.isnan(one))))
-            for column, value in zip(columns.values(), line, strict=True):
-                column.append(value)
+            within = {f"within_{limit:g}": share(one, limit) for limit in (0.3, 1.0)}
+            lost = 100.0 * float(np.mean(np.isnan(one)))
+            lines.append({"case": part.key, "method": name, **within, "no_answer": lost})
         words = _WORDS.get(part.key, "one star missing, put back from the frame before")
         rows.append(
             row(
@@ -202,8 +190,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 unit="%",
             )
         )
-    write_csv(context.folder / "missing_stars.csv", columns)
-    return Outcome(tuple(rows), ("missing_stars.csv",), (_NOTE,))
+    return Outcome(tuple(rows), (write_lines(context.folder / "missing_stars.csv", lines),), (_NOTE,))
 
 
 EXPERIMENTS: Final = (

@@ -10,9 +10,9 @@ import numpy as np
 
 from starid.thesis.experiments.experiment import Context, Experiment, Outcome, Part, Results
 from starid.thesis.experiments.fsf import EQUIVALENT
+from starid.thesis.experiments.published import printed_of
 from starid.thesis.experiments.rsi_figures import rsi_figures
 from starid.thesis.experiments.rsi_parts import BY_EQUATION, BY_TABLE, FIELDS, LSI_ONLY, rsi_parts
-from starid.thesis.experiments.rsi_published import REGIONS
 from starid.thesis.experiments.rsi_tables import rsi_notes, rsi_rows, rsi_tables
 from starid.thesis.metrics import boresight_error, rotation_error
 from starid.thesis.rsi import RecursiveIdentification, RsiSettings, RsiStep
@@ -28,7 +28,7 @@ def _settings(values: Mapping[str, Any]) -> RsiSettings:
         return RsiSettings(tau=1.0, gamma_lsi_deg=1e-9)
     settings = RsiSettings(tau=values["tau"], memory=values["memory"])
     if values["side"] == BY_TABLE:
-        side = REGIONS[values["overlap"], values["factor"], values["tau"]][0]
+        side = printed_of(values)["side_mean"]
         return RsiSettings(tau=values["tau"], gamma_min_deg=side, gamma_scale=0.0)
     return settings
 

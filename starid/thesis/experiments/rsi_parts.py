@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +34,14 @@ LSI_ONLY: Final = 0.0
 
 BY_EQUATION, BY_TABLE = "equation", "table"
 """Side of the region of search by eq. 6.5 as read here, or as table 6.8 has it."""
+
+
+_MEASURES: Final[dict[str, Callable[..., Any]]] = {
+    "": np.nanmean,
+    "mean": np.nanmean,
+    "sigma": np.nanstd,
+    "median": np.nanmedian,
+}
 
 
 def rsi_parts(parameters: Parameters) -> list[Part]:
@@ -85,28 +93,24 @@ def statistics(result: Results) -> dict[str, float]:
     settled = dict(zip(FIELDS, result["numbers"][:, SETTLING:], strict=True))
     side = settled["side"][np.isfinite(settled["side"])]
     error = settled["error"]
+
+    def average(name: str, field: str, *measures: str) -> dict[str, float]:
+        return {f"{name}_{what}".strip("_"): float(_MEASURES[what](settled[field])) for what in measures}
+
     return {
-        "error_mean": float(np.nanmean(error)),
-        "error_sigma": float(np.nanstd(error)),
-        "error_median": float(np.nanmedian(error)),
+        **average("error", "error", "mean", "sigma", "median"),
         "gross_percent": 100.0 * float(np.nanmean(error > 1.0)),
-        "roll_mean": float(np.nanmean(settled["roll_error"])),
-        "roll_sigma": float(np.nanstd(settled["roll_error"])),
-        "roll_median": float(np.nanmedian(settled["roll_error"])),
-        "psi_mean": float(np.nanmean(settled["psi"])),
-        "psi_sigma": float(np.nanstd(settled["psi"])),
+        **average("roll", "roll_error", "mean", "sigma", "median"),
+        **average("psi", "psi", "mean", "sigma"),
         "trigger_percent": 100.0 * float(np.mean(settled["triggered"])),
         "exceeded_percent": 100.0 * float(np.mean(settled["exceeded"])),
         "invalid_percent": 100.0 * float(np.mean(settled["valid"] == 0.0)),
         "region_percent": 100.0 * float(side.size / error.size),
         "side_mean": float(side.mean()) if side.size else math.nan,
         "side_sigma": float(side.std()) if side.size else math.nan,
-        "search_ms": float(np.nanmean(settled["search_ms"])),
-        "search_ms_sigma": float(np.nanstd(settled["search_ms"])),
-        "search_ms_median": float(np.nanmedian(settled["search_ms"])),
+        **average("search_ms", "search_ms", "", "sigma", "median"),
         "lasso_ms_median": float(np.nanmedian(settled["lasso_ms"])),
-        "lasso_ms": float(np.nanmean(settled["lasso_ms"])),
-        "lasso_ms_sigma": float(np.nanstd(settled["lasso_ms"])),
+        **average("lasso_ms", "lasso_ms", "", "sigma"),
         "mean_distance_deg": float(np.nanmean(settled["mean_distance"])),
         "sigma_distance_deg": float(np.nanmean(settled["sigma_distance"])),
     }

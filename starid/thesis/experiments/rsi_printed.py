@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starid.thesis.cme import MotionModel, estimate_motion
+from starid.arrays import Array
+from starid.thesis.cme import MotionModel, matched_motion
 from starid.thesis.experiments.comparison import agreement, sampling
 from starid.thesis.experiments.experiment import (
     Context,
@@ -20,14 +21,15 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
-    write_csv,
+    parts_of,
+    write_lines,
 )
 from starid.thesis.experiments.fsf import EQUIVALENT
 from starid.thesis.experiments.lsi_trials import OFF, frames_under_test
+from starid.thesis.experiments.published import RECURSION
 from starid.thesis.experiments.rsi import START, measured_step
 from starid.thesis.experiments.rsi_parts import FIELDS, LSI_ONLY
-from starid.thesis.experiments.rsi_published import ERRORS, REGIONS, UPDATES
-from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
+from starid.thesis.false_stars import FilterResult, ObservedFrame
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.lsi import Solver
 from starid.thesis.metrics import boresight_error, rotation_error
@@ -72,13 +74,9 @@ class _Replayed:
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
         """The next result; matched, only objects that name each other are true stars."""
-        del before
+        del before, now
         result = next(self._results)
-        if not self._matched:
-            return result
-        chosen = np.zeros(len(now), dtype=np.bool_)
-        chosen[result.matches[:, 1]] = True
-        return FilterResult(result.true_before, chosen, result.matches)
+        return dataclasses.replace(result, true_now=result.matched) if self._matched else result
 
 
 def _settings(reading: str, tau: float, side: float) -> RsiSettings:
@@ -102,18 +100,16 @@ def _solver(reading: str) -> Solver:
 
 def _parts(parameters: Parameters) -> list[Part]:
     clean = [Part(f"clean-p{100 * p:g}", {"overlap": p}) for p in parameters["clean"]]
-    return clean + [
-        Part(f"m{m}-{reading}", {"factor": m, "reading": reading})
-        for m in parameters["factors"]
-        for reading in ("author", "printed")
-    ]
+    return clean + parts_of(
+        "m{factor}-{reading}", factor=parameters["factors"], reading=("author", "printed")
+    )
 
 
 def _clean(context: Context, part: Part) -> Results:
     """ε_f, ε_θ and ε_ψ of frames off the grid, searched in the region of table 6.8 about their true places."""
     overlap = part.values["overlap"]
     found: Results = {}
-    frames: NDArray[np.float64] | None = None
+    frames: Array | None = None
     for reading in ("author", "printed"):
         lsi = context.lost_in_space(overlap, _solver(reading))
         if frames is None:
@@ -142,16 +138,13 @@ def _filtered(frames: Sequence[SimulatedFrame]) -> list[FilterResult]:
     return [cluster(before.observed, now.observed) for before, now in itertools.pairwise(frames)]
 
 
-def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]) -> NDArray[np.float64]:
+def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]) -> Array:
     """μ_d and σ_d of the matches, and of all survivors to their nearest neighbours, degrees, (n, 4)."""
     found = np.full((len(results), 4), math.nan)
     for i, (before, now, result) in enumerate(zip(frames[:-1], frames[1:], results, strict=True)):
         first, second = before.observed.positions, now.observed.positions
-        try:
-            motion = estimate_motion(
-                first[result.matches[:, 0]], second[result.matches[:, 1]], model="affine"
-            )
-        except FilterError:
+        motion = matched_motion(before.observed, now.observed, result.matches, model="affine")
+        if motion is None:
             continue
         away = nearest_distances(motion.apply(first[result.true_before]), second[result.true_now])
         found[i] = motion.mean_distance_deg, motion.sigma_distance_deg, away.mean(), away.std(ddof=1)
@@ -179,7 +172,7 @@ def _work(context: Context, part: Part) -> Results:
         for reading in ("author",) if author else ("printed", "rigid"):
             lsi = context.lost_in_space(overlap, _solver(reading))
             for tau in _TAUS:
-                side = REGIONS.get((overlap, m, tau), (_SIDE_DEG,))[0]
+                side = RECURSION[overlap, m, tau].get("side_mean", _SIDE_DEG)
                 recursion = RecursiveIdentification(
                     lsi, _Replayed(results, matched=author), _settings(reading, tau, side)
                 )
@@ -188,7 +181,7 @@ def _work(context: Context, part: Part) -> Results:
     return found
 
 
-def _means(numbers: NDArray[np.float64]) -> dict[str, float]:
+def _means(numbers: Array) -> dict[str, float]:
     """Statistics of a run after its first frame, which has no filter."""
     settled = dict(zip(FIELDS, numbers[:, _FIRST:], strict=True))
     side = settled["side"][np.isfinite(settled["side"])]
@@ -210,11 +203,12 @@ def _clean_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     rows = []
     for overlap in context.parameters["clean"]:
         result = results[f"clean-p{100 * overlap:g}"]
-        published = ERRORS[overlap, 0, 0.5]
+        published = RECURSION[overlap, 0, 0.5]
         table = "H.1" if overlap == context.parameters["clean"][0] else "H.2"
-        for i, (symbol, unit) in enumerate((("ε_f", "°"), ("ε_θ", "°"), ("ε_ψ", ""))):
-            mean, sigma = published[2 * i : 2 * i + 2]
-            author, printed = (result[name][i] for name in ("author", "printed"))
+        quantities = (("error", "ε_f", "°"), ("roll", "ε_θ", "°"), ("psi", "ε_ψ", ""))
+        for i, (name, symbol, unit) in enumerate(quantities):
+            mean, sigma = published[f"{name}_mean"], published[f"{name}_sigma"]
+            author, printed = (result[reading][i] for reading in ("author", "printed"))
             rows.append(
                 agreement(
                     f"table {table}, no noise, τ = 0.5: mean {symbol}",
@@ -230,8 +224,8 @@ def _clean_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         rows.append(
             agreement(
                 f"table 6.7, p = {100 * overlap:g} %, no noise: share with ε_ψ > 0.5",
-                published=UPDATES[overlap, 0, 0.5][1],
-                tolerance=sampling(UPDATES[overlap, 0, 0.5][1], result["author"].shape[1]),
+                published=published["exceeded_percent"],
+                tolerance=sampling(published["exceeded_percent"], result["author"].shape[1]),
                 author=shares[0],
                 printed=shares[1],
                 unit="%",
@@ -251,14 +245,15 @@ def _sequence_rows(context: Context, results: Mapping[str, Results]) -> list[Row
                     reading: _means(results[f"m{m}-{run}"][f"{reading}-{key}"])
                     for reading, run in (("author", "author"), ("printed", "printed"), ("rigid", "printed"))
                 }
-                published = ERRORS[overlap, m, tau]
+                published = RECURSION[overlap, m, tau]
+                mean, sigma = published["error_mean"], published["error_sigma"]
                 method = "FSF-aided LSI" if tau == LSI_ONLY else f"RSI, τ = {tau:g}"
                 where = f"p = {100 * overlap:g} %, μ = f = {m}: {method}"
                 rows.append(
                     agreement(
                         f"{where}: mean ε_f",
-                        published=published[0],
-                        tolerance=(published[1], f"one published standard deviation, {published[1]:g}°"),
+                        published=mean,
+                        tolerance=(sigma, f"one published standard deviation, {sigma:g}°"),
                         author=found["author"]["f_mean"],
                         printed=found["printed"]["f_mean"],
                         unit="°",
@@ -267,14 +262,14 @@ def _sequence_rows(context: Context, results: Mapping[str, Results]) -> list[Row
                         f"{found['rigid']['f_mean']:.2f}°.",
                     )
                 )
-                update = UPDATES.get((overlap, m, tau))
-                if update is None:
+                if "trigger_percent" not in published:
                     continue
+                triggers = published["trigger_percent"]
                 rows.append(
                     agreement(
                         f"table 6.7, {where}: triggers",
-                        published=update[0],
-                        tolerance=sampling(update[0], int(context.parameters["frames"])),
+                        published=triggers,
+                        tolerance=sampling(triggers, int(context.parameters["frames"])),
                         author=found["author"]["trigger_percent"],
                         printed=found["printed"]["trigger_percent"],
                         unit="%",
@@ -299,7 +294,7 @@ def _gamma_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         rows.append(
             agreement(
                 f"table 6.8: side Γ of the region, μ = f = {m}",
-                published=REGIONS[0.995, m, 0.5][0],
+                published=RECURSION[0.995, m, 0.5]["side_mean"],
                 tolerance=(0.05, "one published standard deviation, 0.05°"),
                 author=least + math.sqrt(float(smaller[2] * smaller[3])),
                 printed=readings[0],
@@ -311,28 +306,20 @@ def _gamma_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
 
 
 def _table(context: Context, results: Mapping[str, Results]) -> str:
-    columns: dict[str, list[Any]] = {}
-    for part in _parts(context.parameters):
-        if "overlap" in part.values:
-            continue
-        for name, numbers in results[part.key].items():
-            if name == "distances":
-                continue
-            line = {"factor": part.values["factor"], "method": name, **_means(numbers)}
-            for column, value in line.items():
-                columns.setdefault(column, []).append(value)
-    write_csv(context.folder / "rsi_as_printed.csv", columns)
-    return "rsi_as_printed.csv"
+    lines = [
+        {"factor": part.values["factor"], "method": name, **_means(numbers)}
+        for part in _parts(context.parameters)
+        if "overlap" not in part.values
+        for name, numbers in results[part.key].items()
+        if name != "distances"
+    ]
+    return write_lines(context.folder / "rsi_as_printed.csv", lines)
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    rows = [
-        *_clean_rows(context, results),
-        *_sequence_rows(context, results),
-        *_gamma_rows(context, results),
-    ]
+    rows = [makes(context, results) for makes in (_clean_rows, _sequence_rows, _gamma_rows)]
     notes = (_NOTE.format(equivalent=EQUIVALENT), _GAMMA_NOTE)
-    return Outcome(tuple(rows), (_table(context, results),), notes)
+    return Outcome(tuple(itertools.chain(*rows)), (_table(context, results),), notes)
 
 
 EXPERIMENTS: Final = (

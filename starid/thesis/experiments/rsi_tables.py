@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from starid.thesis.experiments.comparison import improvement, shown
-from starid.thesis.experiments.experiment import Context, Part, Results, Row, write_csv
+from starid.thesis.experiments.experiment import Context, Part, Results, Row, write_lines
 from starid.thesis.experiments.fsf import EQUIVALENT
+from starid.thesis.experiments.published import printed_of
 from starid.thesis.experiments.rsi_parts import (
     BY_TABLE,
     LSI_ONLY,
@@ -18,7 +19,6 @@ from starid.thesis.experiments.rsi_parts import (
     set_words,
     statistics,
 )
-from starid.thesis.experiments.rsi_published import ERRORS, REGIONS, TIMES, UPDATES
 from starid.thesis.rsi import RsiSettings, region_cells, region_side
 from starid.thesis.rsi_readings import side_as_printed
 
@@ -31,76 +31,59 @@ _NAMES: Final = (
     *("trigger_percent", "exceeded_percent", "side_mean", "side_sigma"),
     *("search_ms", "search_ms_sigma", "lasso_ms", "lasso_ms_sigma"),
 )
+_UPDATE_COLUMNS: Final = (
+    ("trigger_percent", "trigger_percent", 1),
+    ("exceeded_percent", "exceeded_percent", 1),
+    ("side_mean", "side_mean", 2),
+    ("side_sigma", "side_sigma", 3),
+    ("region_kB", "region_kB", 2),
+    ("search_ms", "search_ms_median", 3),
+    ("lasso_ms", "lasso_ms_median", 3),
+)
+"""Columns of tables 6.7 to 6.9: name of the published number and of ours, and decimals."""
 _FILE: Final = "tables_6_7_6_8_6_9_h_1_h_2.csv"
 
 
-def _published(values: Mapping[str, Any]) -> dict[str, float | str]:
-    """What the thesis has for a part; empty where its tables have no such row."""
-    found: dict[str, float | str] = dict.fromkeys(_NAMES, "")
-    if values["false_stars"] == values["factor"] and not values["memory"] and values["side"] != BY_TABLE:
-        key = values["overlap"], values["factor"], values["tau"]
-        blank = ("", "")
-        numbers = (*ERRORS[key], *UPDATES.get(key, blank), *REGIONS.get(key, blank)[:2], *TIMES[key])
-        found = dict(zip(_NAMES, numbers, strict=True))
-    return {f"published_{name}": value for name, value in found.items()}
+def _published(values: Mapping[str, Any]) -> dict[str, float]:
+    """What the thesis prints of a set with as many false stars as noise; empty where its tables have no such row."""
+    unknown = values["false_stars"] != values["factor"] or values["memory"] or values["side"] == BY_TABLE
+    return {} if unknown else printed_of(values)
+
+
+def _region_kilobytes(values: Mapping[str, Any], side_deg: float) -> float:
+    return 1e-3 * _BYTES_PER_CELL * region_cells(side_deg, _FIELD_DEG, values["overlap"])
 
 
 def rsi_tables(context: Context, results: Mapping[str, Results]) -> list[str]:
     """Write every set and method, ours and published, as one CSV, and the readings of eq. 6.5 as another."""
-    columns: dict[str, list[Any]] = {}
+    lines = []
     for part in rsi_parts(context.parameters):
-        v = part.values
-        measured = statistics(results[part.key])
-        cells = region_cells(measured["side_mean"], _FIELD_DEG, v["overlap"])
-        line = {**v, "method": method_of(v), **measured, "region_kB": 1e-3 * _BYTES_PER_CELL * cells}
-        for name, value in {**line, **_published(v)}.items():
-            columns.setdefault(name, []).append(value)
-    write_csv(context.folder / _FILE, columns)
+        v, measured = part.values, statistics(results[part.key])
+        published = {f"published_{name}": _published(v).get(name, "") for name in _NAMES}
+        size = _region_kilobytes(v, measured["side_mean"])
+        lines.append({**v, "method": method_of(v), **measured, "region_kB": size, **published})
+    files = [write_lines(context.folder / _FILE, lines)]
     readings = _readings(context, results)
-    if not readings:
-        return [_FILE]
-    names = (
-        "factor",
-        "scale",
-        "mu_d_deg",
-        "sigma_d_deg",
-        "as_printed_deg",
-        "square_root_deg",
-        "published_deg",
-    )
-    write_csv(
-        context.folder / "equation_6_5.csv",
-        dict(zip(names, zip(*readings, strict=True), strict=True)),
-    )
-    return [_FILE, "equation_6_5.csv"]
+    if readings:
+        files.append(write_lines(context.folder / "equation_6_5.csv", readings))
+    return files
 
 
-def _readings(context: Context, results: Mapping[str, Results]) -> list[tuple[float, ...]]:
-    """μ, noise scale, μ_d, σ_d, Γ as printed, Γ with the square root, and Γ of table 6.8, for the first RSI method."""
-    lines: list[tuple[float, ...]] = []
-    for part in _diagonal(rsi_parts(context.parameters)):
-        v = part.values
-        key = v["overlap"], v["factor"], v["tau"]
-        if v["overlap"] != context.parameters["overlaps"][0] or key not in REGIONS or v["memory"]:
-            continue
-        if v["side"] == BY_TABLE or v["tau"] != min(
-            t for t, *_ in context.parameters["methods"] if t != LSI_ONLY
-        ):
+def _readings(context: Context, results: Mapping[str, Results]) -> list[dict[str, float]]:
+    """The side Γ as printed, with the square root, and of table 6.8, with the μ_d and σ_d it is made of, for the first RSI method."""
+    parameters = context.parameters
+    tau = min(t for t, *_ in parameters["methods"] if t != LSI_ONLY)
+    lines = []
+    for part in _diagonal(rsi_parts(parameters)):
+        v, published = part.values, _published(part.values)
+        if v["overlap"] != parameters["overlaps"][0] or v["tau"] != tau or not published:
             continue
         s = statistics(results[part.key])
         mean, sigma = s["mean_distance_deg"], s["sigma_distance_deg"]
-        root = region_side(mean, sigma, RsiSettings())
-        lines.append(
-            (
-                v["factor"],
-                v["scale"],
-                mean,
-                sigma,
-                side_as_printed(mean, sigma, _GAMMA_MIN_DEG),
-                root,
-                REGIONS[key][0],
-            )
-        )
+        line = {"factor": v["factor"], "scale": v["scale"], "mu_d_deg": mean, "sigma_d_deg": sigma}
+        line["as_printed_deg"] = side_as_printed(mean, sigma, _GAMMA_MIN_DEG)
+        line["square_root_deg"] = region_side(mean, sigma, RsiSettings())
+        lines.append(line | {"published_deg": published["side_mean"]})
     return lines
 
 
@@ -122,13 +105,9 @@ def _pair(theirs: float | None, ours: float, digits: int) -> str:
 def _error_table(context: Context, results: Mapping[str, Results]) -> str:
     lines = []
     for part in _diagonal(rsi_parts(context.parameters)):
-        v = part.values
-        s = statistics(results[part.key])
-        key = v["overlap"], v["factor"], v["tau"]
-        theirs = None if v["memory"] or v["side"] == BY_TABLE else ERRORS.get(key)
-        names = ("error_mean", "error_sigma", "roll_mean", "roll_sigma", "psi_mean", "psi_sigma")
-        cells = [_pair(None if theirs is None else theirs[i], s[name], 2) for i, name in enumerate(names)]
-        lines.append((f"{set_words(v)}: {method_of(v)}", *cells))
+        s, theirs = statistics(results[part.key]), _published(part.values)
+        cells = [_pair(theirs.get(name), s[name], 2) for name in _NAMES[:6]]
+        lines.append((f"{set_words(part.values)}: {method_of(part.values)}", *cells))
     head = ("tables H.1 and H.2: published / ours", "ε_f mean / °", "σ", "ε_θ mean / °", "σ", "ε_ψ mean", "σ")
     return _wide(head, lines)
 
@@ -136,25 +115,10 @@ def _error_table(context: Context, results: Mapping[str, Results]) -> str:
 def _update_table(context: Context, results: Mapping[str, Results]) -> str:
     lines = []
     for part in _diagonal(rsi_parts(context.parameters)):
-        v = part.values
-        s = statistics(results[part.key])
-        key = v["overlap"], v["factor"], v["tau"]
-        known = not v["memory"] and v["side"] != BY_TABLE
-        update = UPDATES.get(key) if known else None
-        side, times = REGIONS.get(key) if known else None, TIMES.get(key) if known else None
-        kilobytes = 1e-3 * _BYTES_PER_CELL * region_cells(s["side_mean"], _FIELD_DEG, v["overlap"])
-        lines.append(
-            (
-                f"{set_words(v)}: {method_of(v)}",
-                _pair(update[0] if update else None, s["trigger_percent"], 1),
-                _pair(update[1] if update else None, s["exceeded_percent"], 1),
-                _pair(side[0] if side else None, s["side_mean"], 2),
-                _pair(side[1] if side else None, s["side_sigma"], 3),
-                _pair(side[2] if side else None, kilobytes, 2),
-                _pair(times[0] if times else None, s["search_ms_median"], 3),
-                _pair(times[2] if times else None, s["lasso_ms_median"], 3),
-            )
-        )
+        v, s, theirs = part.values, statistics(results[part.key]), _published(part.values)
+        s["region_kB"] = _region_kilobytes(v, s["side_mean"])
+        cells = [_pair(theirs.get(name), s[ours], digits) for name, ours, digits in _UPDATE_COLUMNS]
+        lines.append((f"{set_words(v)}: {method_of(v)}", *cells))
     head = (
         "tables 6.7, 6.8 and 6.9: published / ours",
         "triggers / %",
@@ -188,29 +152,21 @@ def rsi_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     rows = []
     parts = rsi_parts(context.parameters)
     for part in _diagonal(parts):
-        v = part.values
-        s = statistics(results[part.key])
+        v, s = part.values, statistics(results[part.key])
         quantity = f"mean ε_f, {set_words(v)}: {method_of(v)}"
         remark = (
             f"Median {s['error_median']:.3f}°, {s['gross_percent']:.1f} % beyond 1°; ε_θ {s['roll_median']:.1f}° "
             f"in the median; invalid {s['invalid_percent']:.1f} %."
         )
+        ours, published = s["error_mean"], printed_of(v)["error_mean"]
         if v["memory"]:
-            published = ERRORS[v["overlap"], v["factor"], v["tau"]][0]
-            rows.append(
-                improvement(
-                    quantity,
-                    published=published,
-                    ours=s["error_mean"],
-                    larger=False,
-                    unit="°",
-                    digits=3,
-                    remark=remark,
-                )
+            made = improvement(
+                quantity, published=published, ours=ours, larger=False, unit="°", digits=3, remark=remark
             )
-            continue
-        known = ERRORS[v["overlap"], v["factor"], v["tau"]][0] if v["side"] != BY_TABLE else None
-        rows.append(shown(quantity, published=known, ours=s["error_mean"], unit="°", digits=3, remark=remark))
+        else:
+            known = published if v["side"] != BY_TABLE else None
+            made = shown(quantity, published=known, ours=ours, unit="°", digits=3, remark=remark)
+        rows.append(made)
     for overlap in context.parameters["overlaps"]:
         chosen = [
             p
@@ -274,18 +230,10 @@ def rsi_notes(context: Context, results: Mapping[str, Results]) -> list[str]:
             "table 6.8",
             "√(μ_d·σ_d) it needs",
         )
-        lines = [
-            (
-                f"μ = f = {m:g}, × {scale:g}",
-                f"{mean:.2g}",
-                f"{sigma:.2g}",
-                f"{printed:.2f}",
-                f"{root:.2f}",
-                f"{theirs:.2f}",
-                f"{theirs - _GAMMA_MIN_DEG:.2f}°",
-            )
-            for m, scale, mean, sigma, printed, root, theirs in readings
-        ]
+        lines = []
+        for m, scale, mean, sigma, *sides in (line.values() for line in readings):
+            cells = [f"{mean:.2g}", f"{sigma:.2g}", *(f"{side:.2f}" for side in sides)]
+            lines.append((f"μ = f = {m:g}, × {scale:g}", *cells, f"{sides[-1] - _GAMMA_MIN_DEG:.2f}°"))
         notes += [_REGION_NOTE, _wide(head, lines)]
     return notes
 

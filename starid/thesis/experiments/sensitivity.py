@@ -18,10 +18,11 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     star_catalog,
     write_csv,
 )
-from starid.thesis.experiments.fsf import RADIUS_DEG, first_frame, noise_of
+from starid.thesis.experiments.fsf import frames_of_seven, noise_of
 from starid.thesis.experiments.lsi_trials import OFF, frames_under_test, share
 from starid.thesis.experiments.plots import figure, save
 from starid.thesis.frame_sky import SkyError
@@ -30,7 +31,6 @@ from starid.thesis.lasso import LAMBDAS, lasso_path
 from starid.thesis.lsi import LostInSpace
 from starid.thesis.matlab_lasso import matlab_path
 from starid.thesis.metrics import Confusion, boresight_error
-from starid.thesis.simulation import moved_frames
 
 _OVERLAP: Final = 0.995
 _TAU: Final = 0.5
@@ -45,14 +45,12 @@ and recall of the filter on the seven stars with three false ones, at noise fact
 
 def _parts(parameters: Parameters) -> list[Part]:
     return [
-        *(Part(f"kappa-{value:g}", {"kappa": value}) for value in parameters["kappa"]),
+        *parts_of("kappa-{kappa:g}", kappa=parameters["kappa"]),
         Part("lambda"),
-        *(Part(f"gamma-{value:g}", {"gamma": value}) for value in parameters["gamma"]),
+        *parts_of("gamma-{gamma:g}", gamma=parameters["gamma"]),
         Part("validity"),
-        *(
-            Part(f"epsilon-{value:g}-share-{part:g}", {"epsilon": value, "share": part})
-            for value in parameters["epsilon"]
-            for part in parameters["share"]
+        *parts_of(
+            "epsilon-{epsilon:g}-share-{share:g}", epsilon=parameters["epsilon"], share=parameters["share"]
         ),
     ]
 
@@ -125,13 +123,8 @@ def _validity(context: Context) -> Results:
 
 
 def _filter(context: Context, epsilon: float, part: float) -> Results:
-    brightness, positions = first_frame()
     noise = noise_of("both", 1.0, 3)
-    count = int(context.parameters["frames"])
-    frames = moved_frames(
-        context.rng("filter"), brightness, positions, noise, count=count, radius_deg=RADIUS_DEG
-    )
-    first = next(frames)
+    first, frames = frames_of_seven(context.rng("filter"), noise, int(context.parameters["frames"]))
     total = Confusion()
     for frame in frames:
         chosen = ClusterFilter(epsilon, part * len(frame.observed))(first.observed, frame.observed)
@@ -202,8 +195,9 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 )
             )
     names = ("parameter", "value", "measure", "as_the_author_ran_it", "as_printed")
-    write_csv(context.folder / "sensitivity.csv", dict(zip(names, zip(*lines, strict=True), strict=True)))
-    return Outcome(tuple(rows), ("sensitivity.csv", _draw(context, results)), (_NOTE,))
+    columns = dict(zip(names, zip(*lines, strict=True), strict=True))
+    table = write_csv(context.folder / "sensitivity.csv", columns)
+    return Outcome(tuple(rows), (table, _draw(context, results)), (_NOTE,))
 
 
 def _draw(context: Context, results: Mapping[str, Results]) -> str:

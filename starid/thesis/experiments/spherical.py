@@ -19,8 +19,9 @@ from starid.thesis.experiments.experiment import (
     Results,
     Row,
     row,
-    write_csv,
+    write_lines,
 )
+from starid.thesis.experiments.lsi_trials import share
 
 _WRONG_ARCSEC: Final = 300.0
 _LIMIT: Final = 6.0
@@ -113,52 +114,40 @@ def _words(noise: Mapping[str, Any]) -> str:
 def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     rows = []
     for part in _parts(context.parameters):
-        numbers = results[part.key]["numbers"]
+        found = dict(zip(_COLUMNS, results[part.key]["numbers"].T, strict=True))
         name, words = part.values["algorithm"].upper(), _words(part.values["noise"])
-        valid = numbers[:, 2] > 0.0
-        wrong = int(np.count_nonzero(numbers[valid, 3] > _WRONG_ARCSEC))
-        nominal = part.values["noise"]["false"] <= 5
+        valid = found["valid"] > 0.0
+        errors = found["cross_arcsec"][valid]
         if name == "LSI":
-            for limit in (0.3, 1.0, 2.0):
-                share = 100.0 * float(np.mean(numbers[:, 0] <= limit))
-                rows.append(
-                    row(
-                        f"one neighbour and LASSO, boresight within {limit:g}°, {words}",
-                        ours=share,
-                        unit="%",
-                        digits=1,
-                    )
+            rows += [
+                row(
+                    f"one neighbour and LASSO, boresight within {limit:g}°, {words}",
+                    ours=share(found["coarse_deg"], limit),
+                    unit="%",
+                    digits=1,
                 )
+                for limit in (0.3, 1.0, 2.0)
+            ]
         rows.append(
             row(
                 f"{name} verified and valid, {words}",
                 ours=100.0 * float(valid.mean()),
                 unit="%",
                 digits=1,
-                at_least=98.0 if nominal else None,
+                at_least=98.0 if part.values["noise"]["false"] <= 5 else None,
             )
         )
-        rows.append(row(f"{name} valid but wrong, {words}", ours=float(wrong), digits=0, at_most=0.0))
+        wrong = float(np.count_nonzero(errors > _WRONG_ARCSEC))
+        rows.append(row(f"{name} valid but wrong, {words}", ours=wrong, digits=0, at_most=0.0))
         if valid.any():
-            rows.append(
-                row(
-                    f"{name} median cross-boresight error, {words}",
-                    ours=float(np.median(numbers[valid, 3])),
-                    unit="″",
-                )
-            )
+            middle = float(np.median(errors))
+            rows.append(row(f"{name} median cross-boresight error, {words}", ours=middle, unit="″"))
         rows.append(
-            row(f"{name} median time a frame, {words}", ours=float(np.median(numbers[:, 6])), unit="ms")
+            row(f"{name} median time a frame, {words}", ours=float(np.median(found["ms"])), unit="ms")
         )
         if name == "RSI":
-            rows.append(
-                row(
-                    f"RSI answered from the region, {words}",
-                    ours=100.0 * float(numbers[1:, 7].mean()),
-                    unit="%",
-                    digits=1,
-                )
-            )
+            inside = 100.0 * float(found["tracking"][1:].mean())
+            rows.append(row(f"RSI answered from the region, {words}", ours=inside, unit="%", digits=1))
     return rows
 
 
@@ -171,15 +160,17 @@ are paired, and the attitude is verified. What is not verified is invalid; none 
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
-    columns: dict[str, list[Any]] = {"algorithm": [], "noise": [], **{name: [] for name in _COLUMNS}}
-    for part in _parts(context.parameters):
-        for line in results[part.key]["numbers"]:
-            columns["algorithm"].append(part.values["algorithm"])
-            columns["noise"].append(_words(part.values["noise"]))
-            for name, value in zip(_COLUMNS, line, strict=True):
-                columns[name].append(value)
-    write_csv(context.folder / "frames.csv", columns)
-    return Outcome(tuple(_rows(context, results)), ("frames.csv",), (_NOTE,))
+    lines = [
+        {
+            "algorithm": part.values["algorithm"],
+            "noise": _words(part.values["noise"]),
+            **dict(zip(_COLUMNS, numbers, strict=True)),
+        }
+        for part in _parts(context.parameters)
+        for numbers in results[part.key]["numbers"]
+    ]
+    table = write_lines(context.folder / "frames.csv", lines)
+    return Outcome(tuple(_rows(context, results)), (table,), (_NOTE,))
 
 
 _NOISES: Final = [

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.thesis.experiments.comparison import agreement, improvement, rounding, same
 from starid.thesis.experiments.experiment import (
     Context,
@@ -154,9 +154,7 @@ def _work(context: Context, part: Part) -> Results:
     return {**results, **_author(context)}
 
 
-def _within(
-    ours: NDArray[np.float64], published: Sequence[float], tolerance: float = _HALF_DIGIT
-) -> list[bool]:
+def _within(ours: Array, published: Sequence[float], tolerance: float = _HALF_DIGIT) -> list[bool]:
     return [bool(close) for close in np.abs(ours - np.asarray(published, dtype=float)) <= tolerance]
 
 
@@ -167,8 +165,8 @@ def _list(values: Any, digits: int = 2) -> str:
 def _numbers(
     quantity: str,
     published: Sequence[float],
-    author: NDArray[np.float64],
-    printed: NDArray[np.float64] | None = None,
+    author: Array,
+    printed: Array | None = None,
     *,
     digits: int = 2,
     unit: str = "",
@@ -298,17 +296,15 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
         *_estimate_rows(result, "one_se"),
     ]
     table: dict[str, Any] = {"cell": result["cells"] + 1}
-    table.update({name: vectors[:, i] for i, name in enumerate(("n", "A", "r", "sigma_A", "sigma_r"))})
-    table["theta_deg"] = result["thetas"]
-    for i, name in enumerate(("n", "A", "r", "sigma_A", "sigma_r")):
-        table[f"published_{name}"] = [values[i] for values in _DICTIONARY]
-    table["published_theta_deg"] = _THETAS
-    for kind in ("mse", "one_se"):
-        table[f"author_omega_{kind}"] = result[f"author_omega_{kind}"]
-        table[f"omega_{kind}"] = result[f"omega_{kind}"]
-        table[f"published_omega_{kind}"] = _OMEGA[kind]
-    write_csv(context.folder / "dictionary.csv", table)
-    return Outcome(tuple(rows), ("dictionary.csv", _draw(context, result)), (_NOTE,))
+    for head, features, thetas in (("", vectors, result["thetas"]), ("published_", _DICTIONARY, _THETAS)):
+        names = (f"{head}{name}" for name in ("n", "A", "r", "sigma_A", "sigma_r"))
+        table |= dict(zip(names, zip(*features, strict=True), strict=True))
+        table[f"{head}theta_deg"] = thetas
+    for kind, published in _OMEGA.items():
+        table |= {name: result[name] for name in (f"author_omega_{kind}", f"omega_{kind}")}
+        table[f"published_omega_{kind}"] = published
+    files = (write_csv(context.folder / "dictionary.csv", table), _draw(context, result))
+    return Outcome(tuple(rows), files, (_NOTE,))
 
 
 def _draw(context: Context, result: Results) -> str:

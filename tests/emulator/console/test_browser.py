@@ -11,7 +11,7 @@ import urllib.request
 import pytest
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
-from starhil.hil_tests.private_can_bus import PrivateCanBus
+from starhil.hil_tests.private_can_bus import private_can_bus
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WITHIN_MS = 30_000
@@ -27,7 +27,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def emulator():
     settings = [f"parameters.update_rate={UPDATE_RATE_HZ}"]
-    with PrivateCanBus() as bus:
+    with private_can_bus() as bus:
         command = emulator_command(
             profile="ideal", serial="off", can=bus, seed=1, settings=settings, extra=["--view", "auto"]
         )
@@ -218,12 +218,14 @@ def test_nothing_leaves_the_window_at_any_size(page):
 
 
 def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
-    """Frames as of eight hours at 5 Hz pass through the page's store."""
+    """Frames as of eight hours at 5 Hz pass through a store of the page's kind, which nobody draws from."""
     kept = page.evaluate(
         """() => {
-            const { store } = starhil;
+            const { hello } = starhil.store;
+            const store = new starhil.store.constructor();
+            store.message(hello);
             const blob = new Blob([new Uint8Array(16)]);
-            const width = store.hello.columns.length;
+            const width = hello.columns.length;
             const begin = store.now + 1;
             let most = 0;
             for (let number = 0; number < 8 * 3600 * 5; number++) {
@@ -242,8 +244,24 @@ def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
     assert kept["rows"] == 36_000
     assert kept["numbers"] == 72_000
     assert kept["most"] <= 62 + 721
-    page.reload()
-    page.wait_for_selector("#link[data-state=connected]")
+
+
+def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    said, painted = page.evaluate(
+        """async () => {
+            const { store, sky } = starhil;
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            const { time, head } = store.image;
+            store.images.push({ time: time + 1e-6, head, blob: new Blob([new Uint8Array(16)]) });
+            await sky.show();
+            return [sky.notice.innerText, sky.painted];
+        }"""
+    )
+    assert said == "this image cannot be decoded"
+    page.wait_for_function("painted => starhil.sky.painted > painted", arg=painted)
+    assert not page.locator("#no-frame").is_visible()
 
 
 def test_a_wrong_token_and_another_origin_get_403(emulator):

@@ -112,3 +112,17 @@ def test_the_same_seed_and_image_number_give_the_same_noise() -> None:
         assert first.tobytes() == digitize(mean, digitizer, 7, 5).tobytes()
         assert first.tobytes() != digitize(mean, digitizer, 7, 6).tobytes()
         assert first.tobytes() != digitize(mean, digitizer, 8, 5).tobytes()
+
+
+def test_light_that_saturates_changes_no_count_beside_it() -> None:
+    """Pixels that no deviate can bring below the largest count are not drawn, and the noise of the others is the same."""
+    sky = np.full(SHAPE, 50.0, dtype=np.float32)
+    lit = sky.copy()
+    lit[100:300] = 8_000.0
+    lit[200, 7] = 0.0
+    plain, bright = (digitize(mean, BYTES, 3, 4) for mean in (sky, lit))
+    mask = lit == 8_000.0
+    assert np.all(bright[mask] == BYTES.max_dn)
+    mask[200, 7] = True
+    assert np.array_equal(bright[~mask], plain[~mask])
+    assert bright[200, 7] < 20

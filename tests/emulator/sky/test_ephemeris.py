@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import erfa
 import numpy as np
 import pytest
 
@@ -21,7 +22,7 @@ from starid.aberration import aberrated
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
-from starid.earth import earth_velocity
+from starid.earth import earth_and_sun, earth_velocity, in_metres, terrestrial_time
 
 NEW_YEAR = unix_time("2026-01-01")
 BY_DATE = Sky({"bodies": "ephemeris"})
@@ -50,6 +51,22 @@ def test_bodies_are_where_jpl_has_them(date, values):
         expected = icrs_vector(values[2 * k], values[2 * k + 1])
         assert angle(icrs_vector(body.ra_deg, body.dec_deg), expected) < limit * ARCSEC
     assert earth_velocity(unix_time(date)) == pytest.approx(values[18:], abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "date", ["2016-12-31T23:59:59.5", "2017-01-01", "2026-03-01T00:05", "2031-07-09T12:07:31.7"]
+)
+def test_interpolated_places_are_those_of_the_series(date):
+    """Within 1 m and 20 µm/s for the Earth and the Sun, and 0.001″ for the Moon, in the middle of a slot and at a leap second."""
+    unix_s = unix_time(date)
+    observer = Observer(unix_s)
+    earth, velocity, sun = earth_and_sun(unix_s)
+    np.testing.assert_allclose(observer.position_m, earth, atol=1.0, rtol=0.0)
+    np.testing.assert_allclose(observer.velocity_m_s, velocity, atol=2e-5, rtol=0.0)
+    np.testing.assert_allclose(observer.sun, sun, atol=1.0, rtol=0.0)
+    offset, motion = in_metres(erfa.moon98(*terrestrial_time(unix_s)))
+    seen = earth + offset - np.linalg.norm(offset) / 299_792_458.0 * (velocity + motion)
+    assert np.linalg.norm(observer.moon - seen) < 0.001 * ARCSEC * np.linalg.norm(offset)
 
 
 @pytest.mark.parametrize(

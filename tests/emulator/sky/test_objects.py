@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sky.directions import icrs_vector
-from starhil.emulator.sky.light import AreaPainter, add_area
-from starhil.emulator.sky.light_grid import add_glare
+from starhil.emulator.sky.light import AreaPainter
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
-from starhil.emulator.sky.wide_earth import add_earth
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
@@ -88,32 +84,47 @@ def test_the_earth_covers_what_is_behind_it(renderer: Renderer, electrons_s: flo
 
 @pytest.mark.parametrize("sun", [None, (60.0, 20.0), (150.0, -40.0)])
 @pytest.mark.parametrize("radius_deg", [64.0, 20.0])
-def test_a_wide_earth_is_that_of_every_pixel(radius_deg: float, sun: tuple[float, float] | None) -> None:
+def test_a_wide_earth_is_that_of_every_pixel(
+    radius_deg: float, sun: tuple[float, float] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Within 1.2 % of full daylight and 0.8 % of the stars' light of the computation pixel by pixel, up to the limb."""
     camera = Camera.from_fov(20.0, width=440, height=440)
     lit = {} if sun is None else {"sun_ra_deg": sun[0], "sun_dec_deg": sun[1]}
     earth = EarthLimb(83.8, -1.0 - radius_deg, radius_deg=radius_deg, atmosphere_deg=0.2, **lit)
     objects = SkyObjects(earth=earth, sun=SunGlare(83.8, 60.0, 2000.0))
-    no_cover = Obstruction(0.0, softness_px=0.0)  # brings the Earth of every pixel
-    painter = AreaPainter(camera, 1.8e6, 0.8)
     flat = np.ones((camera.height, camera.width), dtype=np.float32)
-    exact = painter.paint(replace(objects, obstructions=(no_cover,)), ORION)
-    assert exact.electrons_s is not None
-    assert exact.transmission is not None
-    expected = flat.copy()
-    add_area(expected, exact.electrons_s, exact.transmission, flat, 1.0, 1.0)
     pixels = np.argwhere(flat)[::97, ::-1].astype(np.float64)
-    visible, share = exact.seen_at(pixels), exact.covered_share
-    wide = painter.paint(objects, ORION)
-    assert wide.earth is not None
-    assert wide.glare is not None
-    mean = flat.copy()
-    add_glare(mean, flat, flat, wide.glare, 1.0)
-    add_earth(mean, flat, flat, wide.earth, 1.0, 1.0)
+
+    def painted(wide_from_deg: float) -> tuple[np.ndarray, np.ndarray, float]:
+        monkeypatch.setattr("starhil.emulator.sky.light._WIDE_EARTH_DEG", wide_from_deg)
+        light = AreaPainter(camera, 1.8e6, 0.8).paint(objects, ORION)
+        assert (light.earth is None) == (wide_from_deg > radius_deg)
+        mean = np.empty_like(flat)
+        light.draw(mean, flat, flat, 1.0, 1.0, 0.0, np.inf)
+        return mean, light.seen_at(pixels), light.covered_share
+
+    mean, visible, share = painted(0.0)
+    expected, expected_visible, expected_share = painted(90.0)
     np.testing.assert_allclose(mean, expected, atol=0.012 * earth.electrons_s)
-    np.testing.assert_allclose(wide.seen_at(pixels), visible, atol=0.008)
-    assert wide.covered_share == pytest.approx(share, abs=0.02)
+    np.testing.assert_allclose(visible, expected_visible, atol=0.008)
+    assert share == pytest.approx(expected_share, abs=0.02)
     assert 0.3 < share < 0.7
+
+
+def test_glare_around_a_source_in_the_field_is_that_of_every_pixel(renderer: Renderer) -> None:
+    """Within 0.2 electrons, 2 % of the read noise, of strength/(chord² + softness²) in every pixel."""
+    camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
+    light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
+    zero = np.zeros((camera.height, camera.width), dtype=np.float32)
+    mean = np.empty_like(zero)
+    light.draw(mean, zero, np.ones_like(zero), 0.0, 0.2, 0.0, np.inf)
+    x, y = np.meshgrid(np.arange(0, 937, 3), np.arange(0, 937, 3))
+    seen = camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+    chord2 = np.sum((seen - ORION.to_sensor(icrs_vector(80.0, 2.0))) ** 2, axis=1)
+    total = renderer.sensor.electrons(-12.7, 0.2) * moon.glare_share * camera.pixel_scale_rad**2
+    expected = total / (2.0 * np.pi * np.log(100.0)) / (chord2 + np.radians(0.3) ** 2)
+    outside = chord2 > np.radians(0.8) ** 2
+    np.testing.assert_allclose(mean[y.ravel(), x.ravel()][outside], expected[outside], atol=0.5)
 
 
 def test_a_straight_edge_covers_the_share_asked_for(renderer: Renderer) -> None:

@@ -151,7 +151,7 @@ def test_identification_boot_and_acknowledge():
 
 def test_unknown_identifiers_are_refused():
     def scenario(unit: Emulated) -> None:
-        assert command(unit, 99, b"") == 1
+        assert command(unit, 98, b"") == 1
         (frame,) = unit.ask_can(can_id(REQUEST, 250, OBC, ADCS))
         assert (frame.id, frame.data) == (can_id(REQUEST_NACK, 250, ADCS, OBC), b"\x01")
 

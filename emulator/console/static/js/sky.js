@@ -13,6 +13,7 @@ export class Sky {
     this.overlay = document.getElementById("overlay");
     this.stage = this.image.parentElement;
     this.hover = document.getElementById("hover");
+    this.notice = document.getElementById("no-frame");
     this.layers = { detections: true, identified: true, missing: true, bodies: true };
     this.zoom = 1;
     this.offset = [0, 0]; // image pixels at the top left
@@ -22,6 +23,7 @@ export class Sky {
     this.decoding = false;
     this.painted = 0; // images drawn since the page was opened
     store.on("shown", () => this.show());
+    store.on("status", () => this.show());
     onTheme(() => this.draw());
     new ResizeObserver(() => this.resize()).observe(this.stage);
     this.listen();
@@ -105,21 +107,25 @@ export class Sky {
   // Decode the image to show; while one is decoded, later ones wait and only the newest is taken.
   async show() {
     if (this.decoding) return;
-    const image = this.store.image;
-    document.getElementById("no-frame").hidden = Boolean(image);
+    const { image, hello, stepping } = this.store;
+    if (!image) this.say(hello && hello.clock === "stepped" && !stepping ? "no image: the clock is stopped, step it to take one" : "no image");
     if (!image || image === this.shown) return;
     this.decoding = true;
-    try {
-      const bitmap = await createImageBitmap(image.blob);
-      if (this.bitmap) this.bitmap.close();
-      this.bitmap = bitmap;
-      this.shown = image;
-      this.painted += 1;
-      this.draw();
-    } finally {
-      this.decoding = false;
-    }
+    const bitmap = await createImageBitmap(image.blob).catch(() => null);
+    this.decoding = false;
+    if (this.bitmap) this.bitmap.close();
+    this.bitmap = bitmap;
+    this.shown = image;
+    this.painted += bitmap ? 1 : 0;
+    this.say(bitmap ? "" : "this image cannot be decoded");
+    this.draw();
     if (this.store.image !== image) this.show();
+  }
+
+  // Say why there is no image.
+  say(text) {
+    setText(this.notice, text);
+    this.notice.hidden = !text;
   }
 
   limitOffset(head, scale) {

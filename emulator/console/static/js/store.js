@@ -63,6 +63,7 @@ export class Store {
     this.images = []; // {time, head, blob}, oldest first
     this.status = null;
     this.truth = null;
+    this.stepping = 0;
     this.events = [];
     this.cursor = null; // run time shown; null: live
     this.listeners = new Map();
@@ -90,6 +91,7 @@ export class Store {
       case "status":
         this.status = message.status;
         this.truth = message.truth;
+        this.stepping = message.stepping; // speed of a stepped clock; 0: it is stopped
         break;
       case "event":
         this.events.push(message);
