@@ -184,8 +184,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         directions = self.camera.back_project(xy[usable])
         ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0.0)
         usable = usable[ahead]
-        place = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
-        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), place)
+        positions = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
+        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), positions)
         before, self._before = self._before, frame
         if before is None:
             return everything, self._settings.gamma_min_deg
@@ -218,11 +218,11 @@ class RsiIdentifier(SingleCameraIdentifier):
         cell, distance, _ = lsi.lost_in_space.nearest_in_region(
             observation, predicted.ra_deg, predicted.dec_deg, side_deg
         )
-        places = _spots(predicted, side_deg)
+        centres = _spots(predicted, side_deg)
         if cell >= 0:
             answer = lsi.lost_in_space.estimate(observation, cell, distance).mse
-            places = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], places])
-        for attitude, _ in lsi.attitudes(chosen, places):
+            centres = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], centres])
+        for attitude, _ in lsi.attitudes(chosen, centres):
             if attitude is None:
                 continue
             solution = lsi.verify(measured, attitude, WINDOW_PX)
