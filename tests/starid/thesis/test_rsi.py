@@ -155,7 +155,7 @@ def test_the_memory_follows_the_camera():
     assert predicted.roll_deg == pytest.approx(now.roll_deg)
 
 
-def test_the_memory_forgets_what_is_too_old_and_all_when_cleared():
+def test_the_memory_drops_old_answers_and_all_when_cleared():
     memory = AnswerMemory(2, 0.5)
     for ra in (10.0, 10.1, 50.0, 50.1):
         memory.add(ra, 0.0, 0.0)
