@@ -192,7 +192,7 @@ class TimingConfig(Strict):
     readout_s: FrameSeconds = 0.020
     """Read-out of the detector."""
     detect_s: FrameSeconds = 0.040
-    """Detection, whatever the number of stars."""
+    """Detection, for any number of stars."""
     detect_per_star_s: Annotated[float, Field(ge=0.0, le=0.01)] = 0.00005
     """Detection, in addition for each star."""
     identify_lost_s: FrameSeconds = 0.020

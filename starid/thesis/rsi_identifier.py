@@ -56,7 +56,7 @@ class RsiStatistics:
 
 @dataclass(frozen=True)
 class RsiOptions(LsiOptions):
-    """Settings of an RSI identifier: those of the LSI one, and these.
+    """Settings of an RSI identifier, in addition to the LSI identifier's.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class RsiIdentifier(SingleCameraIdentifier):
     camera, catalog
         As in `LsiIdentifier`.
     options
-        Default: those of `RsiOptions`.
+        Default: `RsiOptions()`.
     **changes
         Fields of `RsiOptions` that are to differ from it.
     """
@@ -154,7 +154,7 @@ class RsiIdentifier(SingleCameraIdentifier):
     def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
         """Attitude from the region of search about a predicted one, or from the whole sky if that fails.
 
-        A prediction serves to place the region; neither its roll nor what it is off by within the region matters. Where the
+        A prediction only places the region; its roll, and its error within the region, do not matter. Where the
         window is wider than the region, the region is widened to it, up to the field of view.
         """
         true_stars, side = self._follow(measured.xy, measured.flux)

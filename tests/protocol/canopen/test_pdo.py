@@ -209,7 +209,9 @@ def test_object_that_cannot_be_read_is_not_sent(quiet):
         (0x1600, 0, 0, 1, AbortCode.UNSUPPORTED_ACCESS),
     ],
 )
-def test_writes_to_an_enabled_pdo_are_answered_with_their_abort_code(bench, index, subindex, value, size, code):
+def test_writes_to_an_enabled_pdo_are_answered_with_their_abort_code(
+    bench, index, subindex, value, size, code
+):
     assert bench.write(index, subindex, value, size) == code
 
 
