@@ -157,7 +157,7 @@ class Emulation:
         return ThreadImager(setup)
 
     async def open(self) -> None:
-        """Open truth and links and switch the device on; its time stands still until `begin`.
+        """Open truth and links and switch the device on; its time is stopped until `begin`.
 
         Raises
         ------

@@ -237,7 +237,7 @@ class Run:
         return line
 
     async def close(self) -> None:
-        """Close control channel, console, emulations and logs, whatever fails to close."""
+        """Close control channel, console, emulations and logs, even if one fails to close."""
         closers: list[Callable[[], object]] = [*reversed(self._closers)]
         self._closers.clear()
         closers += [head.emulation.close for head in reversed(self.heads)]

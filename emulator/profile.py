@@ -77,7 +77,7 @@ class CameraConfig(Strict):
     focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
     """Focal length along x and y, instead of `fov_deg`."""
     centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
-    """Where the optical axis meets the pixel array; the middle if left out."""
+    """Where the optical axis meets the pixel array; default: the middle."""
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
     """Projection of the lens."""
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)

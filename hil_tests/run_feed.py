@@ -88,7 +88,7 @@ class RunFeed:
         try:
             self._waiting.put_nowait({"event": "result", "result": content})
         except queue.Full:
-            log.debug("console: a result was left out")
+            log.debug("console: a result was dropped")
 
     def close(self) -> None:
         """Report the end, once everything before it was sent."""
@@ -96,7 +96,7 @@ class RunFeed:
             self._waiting.put({"event": "end"}, timeout=ENDED_WITHIN_S)
             self._waiting.put(None, timeout=ENDED_WITHIN_S)
         except queue.Full:
-            log.debug("console: the end of the run was left out")
+            log.debug("console: the end of the run was dropped")
         self._thread.join(ENDED_WITHIN_S)
         self._connection.close()
 

@@ -130,7 +130,7 @@ class InterfaceDefinition:
         return next((row for row in found if row is not None and row.kind == "telemetry"), None)
 
     def kind_of_id(self, row_id: int) -> RequestKind:
-        """Return what an id stands for where no class says so; an unknown one is taken for a telecommand."""
+        """Return the kind of an ID in a unit without classes; an unknown ID is taken as a telecommand."""
         first = self.first_telemetry_id
         telemetry = row_id in self.telemetry_by_id if first is None else row_id >= first
         return RequestKind.TELEMETRY if telemetry else RequestKind.TELECOMMAND

@@ -1,4 +1,4 @@
-"""The two ends of a serial link: what an emulator and an OBC use, whatever the unit."""
+"""The two ends of a serial link, for emulator and OBC of any unit."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class CubeSpaceStack(SerialStack):
     Attributes
     ----------
     dialect
-        The only dialect of the unit, whatever the style; None if it has all.
+        The unit's only dialect, for any style; None if it has all.
     """
 
     def __init__(self, link: SerialLinkModel) -> None:

@@ -145,7 +145,7 @@ def measure_centroids(
     Returns
     -------
     list of CentroidRow
-        By rate and magnitude; bins without stars are left out.
+        By rate and magnitude; bins without stars are omitted.
     """
     if frames < 1 or not rates_deg_s:
         raise EmulatorError(

@@ -279,7 +279,7 @@ class _Field:
     def add(
         self, names: Sequence[str], made: list[dict[str, Any]], skipped: dict[str, str], *, raw: bool
     ) -> None:
-        """Make solvers; append what they take to `made`, and why others are left out to `skipped`."""
+        """Make solvers; append their costs to `made`, and the reasons why others are skipped to `skipped`."""
         camera = self.maker.camera
         warm = self.maker.scene(SceneSettings(float(self.known.v[-1]), 0.5), np.random.default_rng(1))
         for name in names:

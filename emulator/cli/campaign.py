@@ -62,7 +62,7 @@ def campaigns(
     """
     if context.invoked_subcommand is not None:
         if ecss:
-            raise typer.BadParameter(f"--ecss takes no subcommand; leave out {context.invoked_subcommand}")
+            raise typer.BadParameter(f"--ecss takes no subcommand; remove {context.invoked_subcommand}")
         return
     if not ecss:
         typer.echo(context.get_help())

@@ -97,7 +97,7 @@ class WireFault(Strict):
 
 
 class FaultRequest(Strict):
-    """One `fault` request; levels that are left out keep their faults."""
+    """One `fault` request; omitted levels keep their faults."""
 
     optical: SkyValues | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""

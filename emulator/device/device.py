@@ -50,7 +50,7 @@ PIPELINE_ENDED: Final = "pipeline_ended"
 
 
 def outcome(work: Callable[[], None]) -> EmulatorError | None:
-    """Do some work and return its error, whatever it was, or None."""
+    """Do some work and return the error that it raised, or None."""
     try:
         work()
     except EmulatorError as error:

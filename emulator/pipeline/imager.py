@@ -266,7 +266,7 @@ class ThreadImager(_RequestQueue):
     def _run_thread(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
         try:
             self._serve(requests)
-        except BaseException as error:  # noqa: BLE001 (whatever ends the thread, its pending requests must fail)
+        except BaseException as error:  # noqa: BLE001 (its pending requests must fail)
             self._in_loop(self._pipeline_ended, f"pipeline thread: ended: {one_line(error)}")
 
     def _serve(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:

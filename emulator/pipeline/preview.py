@@ -92,7 +92,7 @@ def make_preview(
     found: Detections | None = None,
     solution: Solution | None = None,
 ) -> Preview:
-    """Make the preview of a frame; detections are left out of one that was not solved.
+    """Make the preview of a frame; without detections if it was not solved.
 
     Raises
     ------

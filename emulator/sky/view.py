@@ -119,7 +119,7 @@ class Sky:
         return SkyView(objects, observer if self._moving else None)
 
     def _with_bodies(self, objects: SkyObjects, observer: Observer) -> SkyObjects:
-        """Add the bodies of the date, but those that are typed in; what the Earth hides is left out."""
+        """Add the bodies of the date, except given ones and bodies hidden by the Earth."""
         changes: dict[str, Any] = {"planets": objects.planets + planets_seen_by(observer)}
         earth = objects.earth or earth_seen_by(observer, self._styles["earth"])
         changes["earth"] = earth

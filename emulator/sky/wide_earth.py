@@ -21,7 +21,7 @@ GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
 
 _LEAST_E: Final = 0.05
-"""Light of the atmosphere that is left out, electrons."""
+"""Light of the atmosphere that is neglected, electrons."""
 
 _ERROR_E: Final = 1.0
 """Largest error of light that is interpolated in a cell, electrons."""

@@ -83,7 +83,7 @@ class AttitudeConfig(Strict):
     dec_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
     """Declination of the boresight."""
     roll_deg: Turn | None = None
-    """Angle by which celestial north is turned counter-clockwise in the image; 0 if left out."""
+    """Angle by which celestial north is turned counter-clockwise in the image; default: 0."""
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     """Unit quaternion, ICRS to sensor, scalar last; instead of the angles."""
 
@@ -96,7 +96,7 @@ class AttitudeConfig(Strict):
             if abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
                 raise ValueError("quaternion_xyzw is not of length 1")
         elif self.ra_deg is None or self.dec_deg is None:
-            raise ValueError("give ra_deg and dec_deg (roll_deg is 0 if left out), or quaternion_xyzw")
+            raise ValueError("give ra_deg and dec_deg (roll_deg defaults to 0), or quaternion_xyzw")
         return self
 
     def build(self) -> Attitude:
@@ -300,9 +300,9 @@ class LiveConfig(Strict):
     convention: Literal["rotation", "attitude"] = "rotation"
     """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42, Basilisk and most textbooks."""
     order: Literal["xyzw", "wxyz"] = "xyzw"
-    """Where the scalar of `q` stands: last or first."""
+    """Position of the scalar in `q`: last or first."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
-    """Silence after which the attitude stands still and is flagged `stale`."""
+    """Silence after which the attitude is held and flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
     """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds of simulation time."""
     lockstep: bool = False
@@ -349,7 +349,7 @@ class Config42(Strict):
     orbit: Annotated[int, Field(ge=0, le=999)] = 0
     """Number of its reference orbit, i of `Orb[i]`."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
-    """Silence after which the attitude stands still and is flagged `stale`."""
+    """Silence after which the attitude is held and flagged `stale`."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude before the first message."""
     mount: MountConfig | None = None

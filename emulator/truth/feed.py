@@ -145,7 +145,7 @@ class LiveFeed:
             writer.close()
 
     async def _answer(self, data: bytes, writer: asyncio.StreamWriter) -> None:
-        """Process one message from a connection, and answer it if its sender waits for that."""
+        """Process one message from a connection, and answer it if its sender expects an answer."""
         fault = await self.process(data)
         if self._lock_step is not None or self.truth.format.always_answers:
             writer.write(self.truth.format.answer(self._now_s(), fault))

@@ -94,7 +94,7 @@ class FeedFormat(Protocol):
 
     @property
     def always_answers(self) -> bool:
-        """Whether the sender waits for an answer without lock-step too."""
+        """Whether the sender expects an answer even without lock-step."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class Format42:
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)
-        """Return what 42 waits for."""
+        """Return the answer that 42 expects."""
         return ACKNOWLEDGE
 
 

@@ -275,7 +275,7 @@ class CanopenProbe:
     def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
         """Fail unless an SDO answer is an abort with one of the codes.
 
-        An empty multiplexer stands for any.
+        An empty multiplexer matches any.
         """
         expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
         if seen is None:

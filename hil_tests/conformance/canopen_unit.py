@@ -322,9 +322,7 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         entry.command.name: entry.command for entry in found if entry.command and entry.part
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
-        title = (
-            f"each entry of {command.name} keeps what was written to it, whatever is written to the others"
-        )
+        title = f"each entry of {command.name} keeps the value written to it when others are written"
         yield _case("records", command.name, title, _kept(command, members), clause_of_row(command))
 
 

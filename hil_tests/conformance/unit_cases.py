@@ -352,7 +352,7 @@ def _settings(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
     for row in icd.telemetry.values():
         source = next((field.telecommand for field in row.named_fields.values() if field.telecommand), None)
         if source is not None and icd.telecommands[source].action in (None, "nothing"):
-            title = f"{row.name} reports what {source} has set, whatever the bytes"
+            title = f"{row.name} reports the bytes that {source} has set"
             run = _read_back(icd.telecommands[source], row, used)
             yield _case("settings", row.name, title, run, clause_of_row(row), intrusive=True)
 

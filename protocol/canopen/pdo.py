@@ -25,7 +25,7 @@ class ReceivePdo:
         self.next_deadline: float | None = None
 
     def configure(self) -> None:
-        """Apply the current records; drop what waits for SYNC."""
+        """Apply the current records; drop messages that wait for SYNC."""
         self.records.changed = False
         self._objects = self.records.mapped()
         self._size = sum(mapped.size for mapped in self._objects)
@@ -243,7 +243,7 @@ class PdoService:
             transmitting.start()
 
     def stop(self) -> None:
-        """Leave OPERATIONAL: drop all that waits."""
+        """Leave OPERATIONAL: drop all pending messages."""
         for receiving in self.receiving:
             receiving.configure()
         for transmitting in self.transmitting:

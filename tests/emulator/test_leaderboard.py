@@ -98,7 +98,7 @@ def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
         "| one | 10 | 100.0 | 0 (0) |",
         "| two | 10 | 30.0 | 2 (1) |",
         "| one | 42° | 5.5 | 120 |",
-        "three: left out",
+        "three: skipped",
     ):
         assert words in text
     paths = write_leaderboard(answer, tmp_path / "out", "a command")
